@@ -1,0 +1,20 @@
+"""What can go wrong with what a user gives us: one class, one line."""
+from __future__ import annotations
+
+
+class RigError(Exception):
+    """Something the user can mend; the command shows it as one line and exits with `status`."""
+
+    status = 2
+
+
+class InputError(RigError):
+    """A value that cannot be used: where it stands, which field, what was expected.
+
+    >>> str(InputError("model.toml", "spool.mass", "a number above 0 kg, not -1"))
+    'model.toml: spool.mass: expected a number above 0 kg, not -1'
+    """
+
+    def __init__(self, where: object, field: str, expected: str) -> None:
+        self.where, self.field, self.expected = str(where), field, expected
+        super().__init__(f"{where}: {field}: expected {expected}" if field else f"{where}: expected {expected}")
