@@ -1,0 +1,50 @@
+"""Pytest plugin: says how many tests ran on which bus; leaves the socketcan ones to the guest where there is one.
+
+A test belongs to a bus when its parameters name one (the `bus_kind` fixture). On a kernel without vcan0, but with the
+User-Mode-Linux guest at hand, the socketcan tests are taken out here and run once, all together, inside the guest by
+vcan/test_vcan_guest.py; it notes their number in `GUEST_TESTS`.
+"""
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+import pytest
+from vcan.support import APT_LINE, guest_missing, kernel_has_vcan0
+
+BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
+GUEST_TESTS = pytest.StashKey[int]()  # socketcan tests that passed in the guest
+LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
+RUNNER = "tests/vcan/test_vcan_guest.py"
+
+
+def bus_of(nodeid: str) -> str | None:
+    """The bus named in a test's parameters, e.g. 'virtual' for 'test_bus.py::test_order[virtual]'."""
+    parameters = nodeid.partition("[")[2]
+    return next((bus for bus in BUSES if re.search(rf"(?<![a-z_]){bus}(?![a-z_])", parameters)), None)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Take the socketcan tests out if the guest is going to run them."""
+    runner_there = any(item.nodeid.startswith(RUNNER) for item in items)
+    if not runner_there or kernel_has_vcan0() or guest_missing():
+        return
+    left = [item for item in items if bus_of(item.nodeid) == "socketcan"]
+    config.stash[LEFT_TO_GUEST] = len(left)
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if bus_of(item.nodeid) != "socketcan"]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """One line: tests passed per bus; and what it takes where none ran on a real CAN interface."""
+    passed = terminalreporter.stats.get("passed", [])
+    counts = Counter(bus for report in passed if (bus := bus_of(report.nodeid)))
+    in_guest = config.stash.get(GUEST_TESTS, 0)
+    if not counts and not in_guest:
+        return
+    words = [f"{bus} {counts[bus]}" for bus in BUSES[:-1]]
+    words.append(f"socketcan {in_guest} (in the guest)" if in_guest else f"socketcan {counts['socketcan']}")
+    terminalreporter.write_line("tests per bus: " + ", ".join(words))
+    if not in_guest and not counts["socketcan"] and guest_missing():
+        terminalreporter.write_line(f"no test ran on a real CAN interface; to get one on this machine: {APT_LINE}")

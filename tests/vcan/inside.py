@@ -1,0 +1,81 @@
+"""What runs where a vcan0 is: the bus tests, and one whole preflight run by three processes with candump listening.
+
+    python tests/vcan/inside.py OUT bus|preflight ...
+
+Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+TESTS = Path(__file__).parent.parent
+BUS = "socketcan:vcan0"
+RIG = Path(sys.executable).with_name("rig")
+
+
+def bus_tests(out: Path) -> int:
+    """Every test that takes a `bus_kind`, on socketcan; pytest's exit status."""
+    files = sorted(str(path) for path in TESTS.glob("test_*.py") if "bus_kind" in path.read_text())
+    words = ["-m", "pytest", *files, "-k", "socketcan", f"--junitxml={out / 'bus.xml'}", "-p", "no:cacheprovider"]
+    return subprocess.run([sys.executable, *words, f"--basetemp={out / 'tmp'}"], cwd=TESTS.parent).returncode
+
+
+@contextlib.contextmanager
+def background(out: Path, name: str, *command: str | Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process beside the run, its output in NAME.log, interrupted (as by Ctrl-C) at the end."""
+    with (out / f"{name}.log").open("wb") as log:
+        errors = subprocess.STDOUT if name != "candump" else None  # candump's log must hold frames only
+        process = subprocess.Popen([str(word) for word in command], stdout=log, stderr=errors, stdin=subprocess.DEVNULL)
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def preflight(out: Path) -> int:
+    """The preflight sequence with plant, controller and sequencer as processes of their own; the run's exit status."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(background(out, "candump", "candump", "-L", "-r", "16777216", "vcan0"))
+        time.sleep(0.5)  # candump says nothing when it is ready
+        nodes = {}
+        for name in ("plant", "controller"):
+            nodes[name] = stack.enter_context(background(out, name, RIG, "node", name, "--bus", BUS))
+        words = ["run", "preflight", "--bus", BUS, "--controller", "external", "--pace", "lockstep", "--seed", "1"]
+        with (out / "run.json").open("wb") as answer, (out / "run.log").open("wb") as log:
+            begin = time.monotonic()
+            words += ["--json", "--out", str(out / "run")]
+            run = subprocess.run([RIG, *words], stdout=answer, stderr=log, stdin=subprocess.DEVNULL)
+            seconds = time.monotonic() - begin
+        alive = {name: process.poll() for name, process in nodes.items()}
+        time.sleep(0.5)  # the last frames still go to candump
+    ended = {name: process.returncode for name, process in nodes.items()}
+    facts = {"status": run.returncode, "seconds": seconds, "before_interrupt": alive, "after_interrupt": ended}
+    (out / "facts.json").write_text(json.dumps(facts))
+    return run.returncode
+
+
+def main() -> int:
+    """Run the parts asked for, all of them even if one fails; the first status that is not 0."""
+    out = Path(sys.argv[1]).resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    os.chdir(TESTS.parent)
+    parts = {"bus": bus_tests, "preflight": preflight}
+    statuses = [parts[name](out) for name in sys.argv[2:]]
+    return next((status for status in statuses if status), 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,116 @@
+"""A real SocketCAN interface: the bus tests, and a whole preflight run by three processes, read again by Wireshark.
+
+Runs on this kernel's vcan0 or else in a User-Mode-Linux guest, booted once for the whole file. Without either it is
+skipped, saying how to get it; with EHA_RIG_REQUIRE_VCAN=1 (as in CI) it fails instead.
+"""
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST
+from vcan import dissect
+from vcan.support import APT_LINE, FOLDER, REQUIRED, guest_missing, in_guest, kernel_has_vcan0
+
+CYCLIC = (0x080, 0x182, 0x183, 0x202, 0x283)
+HEARTBEATS = {0x701: "heartbeat of 1", 0x702: "heartbeat of 2", 0x703: "heartbeat of 3"}
+SERVICES = {0x000: "NMT", 0x080: "SYNC", 0x603: "SDO request", 0x583: "SDO answer", **HEARTBEATS}
+
+
+def unavailable(reason: str) -> None:
+    """Skip, or fail where CI must not skip."""
+    message = f"{reason}; {APT_LINE}"
+    if REQUIRED:
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the bus tests and the preflight run left what they found."""
+    if not kernel_has_vcan0() and guest_missing():
+        unavailable(guest_missing())
+    if shutil.which("candump") is None:
+        unavailable("candump is missing")
+    folder = tmp_path_factory.mktemp("vcan")
+    parts = ["preflight"] if kernel_has_vcan0() else ["bus", "preflight"]  # with a vcan0 here the bus tests ran here
+    done = in_guest(sys.executable, FOLDER / "inside.py", folder, *parts)
+    (folder / "output.txt").write_text(done.stdout)
+    return folder
+
+
+def test_bus_tests_pass_on_a_real_can_interface(out: Path, pytestconfig: pytest.Config) -> None:
+    """All of them, none skipped, and no fewer than were left to the guest."""
+    if kernel_has_vcan0():
+        return  # they are part of this very session, see the summary's 'tests per bus'
+    report = out / "bus.xml"
+    assert report.exists(), (out / "output.txt").read_text()
+    cases = ElementTree.parse(report).iter("testcase")
+    outcomes = [{child.tag for child in case} & {"failure", "error", "skipped"} for case in cases]
+    pytestconfig.stash[GUEST_TESTS] = sum(not bad for bad in outcomes)
+    assert outcomes
+    assert not any(outcomes), (out / "output.txt").read_text()
+    assert len(outcomes) >= pytestconfig.stash.get(LEFT_TO_GUEST, 0)
+
+
+@pytest.fixture(scope="module")
+def frames(out: Path) -> list[tuple[int, bytes]]:
+    """What candump heard of the preflight run: (COB-ID, data)."""
+    assert (out / "facts.json").exists(), (out / "output.txt").read_text()
+    return dissect.candump_frames(out / "candump.log")
+
+
+def test_preflight_passes_with_three_processes(out: Path, frames: list[tuple[int, bytes]]) -> None:
+    """Plant, controller and sequencer are processes that share nothing but vcan0."""
+    facts = json.loads((out / "facts.json").read_text())
+    logs = "\n".join(f"{name}: {(out / f'{name}.log').read_text()}" for name in ("plant", "controller", "run"))
+    assert facts["status"] == 0, f"{facts}\n{logs}\n{(out / 'run.json').read_text()}"
+    answer = json.loads((out / "run.json").read_text())
+    assert answer["verdict"] == "PASS"
+    assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
+    counts = Counter(cob_id for cob_id, _ in frames)
+    assert counts[0x080] >= answer["timing"]["cycles"] > 1000
+    print(f"\npreflight on vcan0, three processes: {counts[0x080]} cycles in {facts['seconds']:.1f} s")
+
+
+def test_cyclic_frames_are_in_order(frames: list[tuple[int, bytes]]) -> None:
+    """Each PDO has its eight bytes, and each SYNC is empty: another firmware could rely on it."""
+    lengths = {cob_id: {len(data) for other, data in frames if other == cob_id} for cob_id in CYCLIC}
+    assert lengths == {0x080: {0}, 0x182: {8}, 0x183: {8}, 0x202: {8}, 0x283: {8}}
+
+
+def test_log_holds_what_was_on_the_bus(out: Path, frames: list[tuple[int, bytes]]) -> None:
+    """The run's own log and candump count the same cyclic frames; boot-ups may come before the log is open."""
+    heard = Counter(cob_id for cob_id, _ in frames)
+    logged = dissect.mcap_counts(out / "run" / "trace.mcap")
+    assert {cob_id: logged[cob_id] for cob_id in CYCLIC} == {cob_id: heard[cob_id] for cob_id in CYCLIC}
+    assert all(logged[cob_id] <= heard[cob_id] for cob_id in logged)
+
+
+def test_wireshark_decodes_every_frame(out: Path, frames: list[tuple[int, bytes]]) -> None:
+    """tshark's CANopen dissector finds every service, counts the same frames, and calls none malformed."""
+    if shutil.which("tshark") is None:
+        unavailable("tshark is missing")
+    rows = dissect.tshark(out / "candump.log")
+    assert [row for row in rows if row.malformed or not row.canopen] == []
+    counts = Counter(row.cob_id for row in rows)
+    assert counts == Counter(cob_id for cob_id, _ in frames)
+    assert {cob_id: name for cob_id, name in SERVICES.items() if not counts[cob_id]} == {}
+    named = ", ".join(f"{cob_id:03X}: {number}" for cob_id, number in sorted(counts.items()))
+    print(f"\ntshark decoded {len(rows)} CANopen frames, none malformed: {named}")
+
+
+def test_dissector_tells_a_broken_frame(tmp_path: Path) -> None:
+    """The check above can fail: a cut SDO request is called malformed, a good heartbeat is not."""
+    if shutil.which("tshark") is None:
+        unavailable("tshark is missing")
+    log = tmp_path / "broken.log"
+    log.write_text("(1.000000) vcan0 703#05\n(1.000100) vcan0 603#400010000000\n")
+    good, bad = dissect.tshark(log)
+    assert (good.cob_id, good.function, good.canopen, good.malformed) == (0x703, 0xE, True, False)
+    assert bad.malformed
