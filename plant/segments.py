@@ -1,0 +1,226 @@
+"""The kinds of segment a command is made of: hold, step, ramp, sine, chirp, multisine, points, csv.
+
+A segment starts from the demand that the one before it reached at its end (the value it would take in the cycle after
+its last), so a list of them is continuous except where a step, a CSV file or a wave with given phases says otherwise.
+The same segments describe a load on the ram: read N for m. The waves are those of physics.md section 4.
+"""
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Annotated, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from plant.errors import InputError
+
+Array = npt.NDArray[np.float64]
+Level = Annotated[float, "m (N for a load)"]
+Second = Annotated[float, "s"]
+Hertz = Annotated[float, "Hz"]
+Radian = Annotated[float, "rad"]
+PerSecond = Annotated[float, "1/s"]
+
+RATE = 1000  # cycles a second; times are k / RATE because k * 1e-3 is not exact
+LONGEST = 3600.0  # s, of one segment or file: beyond it, somebody wrote milliseconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment(ABC):
+    """One piece of a command. `name` is what checks call its section; without one it is kind_number."""
+
+    kind: ClassVar[str]
+    name: str = ""
+
+    @property
+    @abstractmethod
+    def duration(self) -> float:
+        """Length, s."""
+
+    @abstractmethod
+    def demand(self, t: Array, last: float) -> Array:
+        """The demand at times `t` (s, from the segment's start), after one that ended at `last`."""
+
+    def __post_init__(self) -> None:
+        cycles = self.duration * RATE
+        require(0.5 < cycles <= LONGEST * RATE, "time", f"{1 / RATE} to {LONGEST:g} s, not {self.duration:g}")
+        require(abs(cycles - round(cycles)) < 1e-6, "time", f"whole cycles of {1 / RATE} s, not {self.duration:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timed(Segment):
+    """A segment that says how long it lasts."""
+
+    time: Second
+
+    @property
+    def duration(self) -> float:
+        return self.time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hold(Timed):
+    """Stay at the last demand."""
+
+    kind = "hold"
+
+    def demand(self, t: Array, last: float) -> Array:
+        return np.full_like(t, last)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Timed):
+    """Jump to a demand and hold it."""
+
+    kind = "step"
+    to: Level
+
+    def demand(self, t: Array, last: float) -> Array:
+        return np.full_like(t, self.to)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp(Timed):
+    """A straight line from the last demand; `to` is reached at the segment's end."""
+
+    kind = "ramp"
+    to: Level
+
+    def demand(self, t: Array, last: float) -> Array:
+        return last + (self.to - last) * (t / self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sine(Timed):
+    """A sine about the last demand."""
+
+    kind = "sine"
+    amplitude: Level
+    frequency: Hertz
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_frequency("frequency", self.frequency)
+
+    def demand(self, t: Array, last: float) -> Array:
+        return last + self.amplitude * _sine(self.frequency * t)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chirp(Timed):
+    """A sine about the last demand whose frequency grows linearly from f0 to f1, faded in by 1 - exp(-fade t)."""
+
+    kind = "chirp"
+    amplitude: Level
+    f0: Hertz
+    f1: Hertz
+    fade: PerSecond = 0.0  # 0: full amplitude from the start
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_frequency("f0", self.f0)
+        _require_frequency("f1", self.f1)
+        require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
+
+    def demand(self, t: Array, last: float) -> Array:
+        cycles = self.f0 * t + (self.f1 - self.f0) / (2 * self.time) * t**2
+        return last + self.amplitude * _sine(cycles) * _fade_in(t, self.fade)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multisine(Timed):
+    """Sines of one amplitude each about the last demand; Schroeder phases (low crest factor) unless given.
+
+    Schroeder, "Synthesis of low-peak-factor signals", IEEE Trans. Inf. Theory 16 (1970): phase_n = -pi n (n - 1) / N.
+    A sum of phases does not start at zero, so it is faded in; fade = 0 lets it jump.
+    """
+
+    kind = "multisine"
+    amplitude: Level
+    frequencies: tuple[Hertz, ...]
+    phases: tuple[Radian, ...] = ()
+    fade: PerSecond = 20.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(bool(self.frequencies), "frequencies", "at least one frequency in Hz")
+        for frequency in self.frequencies:
+            _require_frequency("frequencies", frequency)
+        require(len(self.phases) in (0, len(self.frequencies)), "phases",
+                 f"{len(self.frequencies)} phases in rad, one a frequency, not {len(self.phases)}")
+        require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
+
+    def demand(self, t: Array, last: float) -> Array:
+        lines = len(self.frequencies)
+        phases = self.phases or [-np.pi * n * (n - 1) / lines for n in range(1, lines + 1)]
+        wave = np.zeros_like(t)
+        for frequency, phase in zip(self.frequencies, phases, strict=True):
+            wave += _sine(frequency * t + phase / (2 * np.pi))
+        return last + self.amplitude * wave * _fade_in(t, self.fade)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points(Segment):
+    """Straight lines through breakpoints [t, demand], t in s from the segment's start.
+
+    The first line starts from the last demand, unless a breakpoint at t = 0 says where.
+    """
+
+    kind = "points"
+    points: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        times = [t for t, _ in self.points]
+        require(bool(times) and times[0] >= 0 and all(a < b for a, b in pairwise(times)), "points",
+                 "[t, demand] pairs with t from 0 s and increasing")
+        super().__post_init__()
+
+    @property
+    def duration(self) -> float:
+        return self.points[-1][0]
+
+    def demand(self, t: Array, last: float) -> Array:
+        points = self.points if self.points[0][0] == 0 else ((0.0, last), *self.points)
+        return np.interp(t, [p[0] for p in points], [p[1] for p in points])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Csv(Segment):
+    """A recorded demand, columns t and com (or value). Whoever reads the file fills in `values`, one a cycle."""
+
+    kind = "csv"
+    file: str
+    values: tuple[float, ...] = field(default=(0.0,), repr=False, metadata={"key": False})
+
+    @property
+    def duration(self) -> float:
+        return len(self.values) / RATE
+
+    def demand(self, t: Array, last: float) -> Array:
+        return np.array((*self.values, self.values[-1]))
+
+
+KINDS: dict[str, type[Segment]] = {
+    kind.kind: kind for kind in (Hold, Step, Ramp, Sine, Chirp, Multisine, Points, Csv)
+}
+
+
+def _sine(cycles: Array) -> Array:
+    """sin(2 pi cycles), exactly zero after whole cycles so that a wave ends where it says it does."""
+    return np.sin(2 * np.pi * np.mod(cycles, 1.0))
+
+
+def _fade_in(t: Array, fade: float) -> Array:
+    return 1 - np.exp(-fade * t) if fade else np.ones_like(t)
+
+
+def require(holds: bool, key: str, expected: str) -> None:
+    """Refuse a segment; whoever read it knows the file and the line and adds them."""
+    if not holds:
+        raise InputError("segment", key, expected)
+
+
+def _require_frequency(key: str, frequency: float) -> None:
+    require(0 < frequency < RATE / 2, key, f"a frequency above 0 and below {RATE / 2:g} Hz, not {frequency:g}")
