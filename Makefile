@@ -1,37 +1,60 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
+#   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
+#   make bench    the project's benchmarks     make clean                everything that was made here
 PYTHON ?= python3
 VENV   ?= .venv
+ARGS   ?=
 BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet
+MADE   := $(VENV)/.made
 
-.PHONY: env env-test preflight test lint bench clean
+.PHONY: env env-test preflight lint pytest test bench clean help
+.DELETE_ON_ERROR:
 
+preflight: env
+	@$(BIN)/rig run preflight
+
+test: lint
+	@$(MAKE) --no-print-directory pytest
+
+pytest: env-test
+	@echo "== pytest"
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: env-test
+	@echo "== ruff, then mypy --strict"
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+
+bench: env-test
+	@$(BIN)/rig bench
+
+clean:
+	rm -rf $(VENV) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:
+	@sed -n '1,/^[^#]/{s/^# \{0,1\}//p}' Makefile
+
+# Each stamp is written last, so an interrupted step is simply done again.
 env: $(VENV)/.run
 env-test: $(VENV)/.test
 
-$(BIN)/python:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "make: Python 3.11 or newer is needed (PYTHON=path names another)"; exit 2; }
-	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "make: no venv in this Python; on Debian: apt-get install python3-venv"; exit 2; }
-
-$(VENV)/.run: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+$(MADE):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "make: Python 3.11 or newer is needed; make PYTHON=/path/to/python names another"; exit 2; }
+	@echo "== making the virtual environment $(VENV)"
+	@rm -rf $(VENV)
+	@$(PYTHON) -m venv $(VENV) >/dev/null || $(PYTHON) -m virtualenv --quiet $(VENV) 2>/dev/null || \
+	  { rm -rf $(VENV); echo "make: this Python cannot make a virtual environment; on Debian: apt-get install python3-venv"; exit 2; }
 	@touch $@
 
-$(VENV)/.test: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,view]'
+$(VENV)/.run: pyproject.toml $(MADE)
+	@echo "== installing what the bench needs into $(VENV) (once, about a minute)"
+	@$(PIP) -e .
+	@touch $@
+
+$(VENV)/.test: pyproject.toml $(MADE)
+	@echo "== installing what the tests and the viewer need into $(VENV) (once, about two minutes)"
+	@$(PIP) -e '.[dev,view]'
 	@touch $@ $(VENV)/.run
-
-preflight: env
-	$(BIN)/rig run preflight
-
-lint: env-test
-	$(BIN)/ruff check .
-	$(BIN)/mypy
-
-test: lint
-	$(BIN)/python -m pytest
-
-bench: env-test
-	$(BIN)/rig bench
-
-clean:
-	rm -rf $(VENV) runs
