@@ -1,1 +1,5 @@
-"""."""
+"""The log: MCAP with protobuf channels, written off the loop's thread, salvaged after a crash."""
+from rig.recorder.schema import U32, CanFrame, Check, Event, NmtState, Record, Signals, Timing
+from rig.recorder.writer import Recorder, RecorderError
+
+__all__ = ["U32", "CanFrame", "Check", "Event", "NmtState", "Record", "Recorder", "RecorderError", "Signals", "Timing"]

@@ -1,0 +1,94 @@
+"""What a command asks for, piece by piece: hold, step, ramp or dynamic (sine, chirp, noise), read from itself."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+RESOLUTION = 0.6e-7  # m; the bus carries 1e-7 m, so a ramp is a staircase of this half-height
+SHORTEST = 0.15  # s; a sine of 0.05 Hz and 1 mm leaves its tangent by RESOLUTION within this time
+JUMP = 2e-6  # m; least step
+
+
+class Section(NamedTuple):
+    """Rows start..stop-1 of the command."""
+
+    kind: str  # "hold", "step" (the jump and the rest after it), "ramp", "dynamic"
+    start: int
+    stop: int
+    first: float  # m, demand before the section
+    last: float  # m, demand at its end
+    rate: float  # m/s, of a ramp; 0 otherwise
+
+
+def sections(command: Floats, period: float = 1e-3) -> list[Section]:
+    """Cut a command, shape (n,) in m, one row per `period` s, into sections that cover it without overlap.
+
+    Straight lines are found greedily within the resolution of the bus; what is not straight for 0.15 s is dynamic.
+    Missing rows (NaN) continue the last demand.
+    """
+    com = _filled(command)
+    shortest = max(3, round(SHORTEST / period))
+    out: list[Section] = []
+    for start, stop, slope in _lines(com):
+        before = com[start - 1] if start else com[0]
+        if stop - start < shortest:
+            kind, rate = "dynamic", 0.0
+        elif abs(slope) * (stop - start) <= 2 * RESOLUTION:
+            kind, rate = ("step" if _jumps(com, start) else "hold"), 0.0
+        else:
+            kind, rate = "ramp", slope / period
+        if out and kind == out[-1].kind == "dynamic":
+            out[-1] = out[-1]._replace(stop=stop, last=float(com[stop - 1]))
+        else:
+            out.append(Section(kind, start, stop, float(before), float(com[stop - 1]), rate))
+    return _tidy(out, shortest)
+
+
+def _filled(command: Floats) -> Floats:
+    com = np.asarray(command, float)
+    index = np.where(np.isnan(com), 0, np.arange(len(com)))
+    filled: Floats = np.nan_to_num(com[np.maximum.accumulate(index)])
+    return filled
+
+
+def _lines(com: Floats) -> list[tuple[int, int, float]]:
+    """(start, stop, slope per row): from each start the longest piece that a line through its first value fits."""
+    values, out, start = com.tolist(), [], 0
+    while start < len(values):
+        origin, low, high, stop = values[start], -np.inf, np.inf, start + 1
+        while stop < len(values):
+            n, rise = stop - start, values[stop] - origin
+            narrow_low, narrow_high = max(low, (rise - 2 * RESOLUTION) / n), min(high, (rise + 2 * RESOLUTION) / n)
+            if narrow_low > narrow_high:
+                break
+            low, high, stop = narrow_low, narrow_high, stop + 1
+        n = stop - start
+        out.append((start, stop, (values[stop - 1] - origin) / (n - 1) if n > 1 else 0.0))
+        start = stop
+    return out
+
+
+def _jumps(com: Floats, row: int) -> bool:
+    """True when the demand jumps into `row` by much more than it moved in the rows before."""
+    if row == 0:
+        return False
+    before = np.abs(np.diff(com[max(0, row - 4):row]))
+    return bool(abs(com[row] - com[row - 1]) > JUMP + 3 * (before.max() if len(before) else 0.0))
+
+
+def _tidy(parts: list[Section], shortest: int) -> list[Section]:
+    """Scraps between lines go to the neighbour before; a ramp that only bends is a slow curve, hence dynamic."""
+    out: list[Section] = []
+    for part in parts:
+        scrap = part.kind == "dynamic" and part.stop - part.start < shortest // 10
+        if (out and scrap and out[-1].kind != "hold") or (out and out[-1].kind == part.kind == "dynamic"):
+            out[-1] = out[-1]._replace(stop=part.stop, last=part.last)
+        elif out and part.kind == "ramp" and out[-1].kind == "ramp" and 0.5 < part.rate / out[-1].rate < 2:
+            out[-1] = out[-1]._replace(kind="dynamic", stop=part.stop, last=part.last, rate=0.0)
+        else:
+            out.append(part)
+    return out
