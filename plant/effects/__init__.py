@@ -1,1 +1,149 @@
-"""."""
+"""The catalogue: physical effects that a model may have or lack.
+
+An effect is a law at one port of the signal path (`plant.state.Ports`): it gets the port's signal, the state at the
+start of the step, the inputs and the parameters, and returns the signal changed. Several effects at one port act in the
+order of the catalogue. A law that remembers something also gets and returns its memory, a NamedTuple of floats.
+
+    class NullBias(NamedTuple):
+        current: Annotated[float, Quantity("A")] = 0.0  # default = off value: the law then changes nothing
+
+    @effect("current", NullBias, law="i = i + i0")
+    def null_bias(x, s, u, p):
+        return x + p.null_bias.current
+
+The effects marked as fitted (`base`) are parameters of the reference model itself; they have no law of their own.
+"""
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from plant.compile import Function, rebind
+from plant.errors import InputError
+from plant.parameters import GROUPS
+from plant.quantity import Quantity, quantities
+from plant.state import Memory, Ports
+from plant.step import through
+
+Law = Function
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue."""
+
+    name: str
+    port: str  # where it acts; "" for parameters of the reference model
+    law: str  # the formula, for people
+    symptoms: str  # what tells it apart
+    parameters: Mapping[str, Quantity]  # "group.field" to meaning
+    off: Mapping[str, float]  # values at which it is absent; empty for `base` effects (there: the nominal)
+    group: type[Any] | None = None
+    function: Law | None = None
+    memory: type[Any] | None = None
+    disturbance: bool = False  # noise of the bench rather than physics of the actuator
+
+    @property
+    def base(self) -> bool:
+        """True when the reference model has it already, so that "missing" means off its nominal value."""
+        return self.function is None
+
+
+CATALOGUE: dict[str, Effect] = {}
+
+
+def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory: type[Any] | None = None,
+           disturbance: bool = False) -> Callable[[Law], Law]:
+    """Register a law at `port` with the parameters `group`; the function's name is the effect's.
+
+    Raises:
+        ValueError: unknown port, a parameter without default, or a name already taken.
+    """
+    if port not in Ports._fields:
+        raise ValueError(f"no port {port!r}; there are {', '.join(Ports._fields)}")
+
+    def register(function: Law) -> Law:
+        function = getattr(function, "py_func", function)  # an @njit function is welcome too
+        name = function.__name__
+        if name in GROUPS or (name in CATALOGUE and _file(CATALOGUE[name]) != Path(function.__code__.co_filename)):
+            raise ValueError(f"{name}: the name is taken")
+        if set(group._fields) - set(group._field_defaults):
+            raise ValueError(f"{name}: every parameter needs a default, its off value")
+        meaning = {f"{name}.{field}": q for field, q in quantities(group).items()}
+        off = {f"{name}.{field}": float(value) for field, value in group._field_defaults.items()}
+        CATALOGUE[name] = Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance)
+        return function
+
+    return register
+
+
+def base(name: str, *fields: str, law: str, symptoms: str) -> None:
+    """Register an effect that the reference model has already, by the parameters that carry it."""
+    meaning = {field: quantities(GROUPS[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
+    CATALOGUE[name] = Effect(name, "", law, symptoms, meaning, {})
+
+
+def load_effects(path: Path) -> list[str]:
+    """Run a user's effect file; the names of the effects it registered.
+
+    Raises:
+        InputError: unreadable, not Python, or it registers nothing.
+    """
+    spec = importlib.util.spec_from_file_location(f"effects_of_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise InputError(path, "", "a Python file with effects")
+    try:
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    except Exception as error:
+        raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
+    new = [name for name, entry in CATALOGUE.items() if _file(entry) == path]
+    if not new:
+        raise InputError(path, "", "at least one function marked @effect(...)")
+    return new
+
+
+def _file(entry: Effect) -> Path | None:
+    return Path(entry.function.__code__.co_filename) if entry.function else None
+
+
+def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
+    """All of the named effects that act at `port` as one function, with their initial memory."""
+    chain: Law = through
+    remembered: Memory = 0.0
+    for entry in (CATALOGUE[name] for name in names):
+        if entry.port != port:
+            continue
+        law, own = _with_memory(entry)
+        if chain is not through:
+            law, own = rebind(_then, first=chain, second=law), (remembered, own)
+        chain, remembered = law, own
+    return chain, remembered
+
+
+def _with_memory(entry: Effect) -> tuple[Law, Memory]:
+    assert entry.function is not None
+    if entry.memory is None:
+        return rebind(_forgetful, law=entry.function), 0.0
+    return entry.function, entry.memory()
+
+
+def _forgetful(x: Any, m: Memory, s: Any, u: Any, p: Any) -> tuple[Any, Memory]:
+    return law(x, s, u, p), m
+
+
+def _then(x: Any, m: Memory, s: Any, u: Any, p: Any) -> tuple[Any, Memory]:
+    x, a = first(x, m[0], s, u, p)
+    x, b = second(x, m[1], s, u, p)
+    return x, (a, b)
+
+
+law: Law = through
+first: Law = through
+second: Law = through  # these three are bound for each chain
+
+for _family in ("base", "servovalve", "jack", "sensors"):
+    importlib.import_module(f"plant.effects.{_family}")

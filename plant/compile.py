@@ -1,0 +1,116 @@
+"""Plain Python physics made fast: the only file that knows numba.
+
+The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls, puts
+the model's effects in place of the port functions, and compiles the lot as one. The result is kept on disk under
+a hash of all the sources that went in, so a changed effect is never served by stale code: numba's own cache looks at one
+file only.
+"""
+from __future__ import annotations
+
+import dis
+import hashlib
+import inspect
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numba
+
+Function = Any  # a plain function, or numba's dispatcher of one
+
+
+def cache_folder() -> Path:
+    """Where compiled code is kept: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
+    named = os.environ.get("EHA_RIG_CACHE")
+    home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eha-rig"
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=home):
+            return home
+    except OSError:
+        return Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}"
+
+
+def rebind(function: Function, **names: Any) -> Function:
+    """A copy of `function` that sees `names` in place of its module's globals."""
+    there = function.__globals__ | names
+    return FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
+
+
+def interpreted(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
+    """`function` with `ports` in place, in plain Python: for debuggers, and for the test that compiled equals it."""
+    return _link(function, ports or {}, lambda f: f)
+
+
+def compiled(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
+    """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
+    root = _link(function, ports or {}, lambda f: f)
+    linked = _link(function, ports or {}, lambda f: numba.njit(f, error_model="numpy"))
+    plain = rebind(linked.py_func)
+    settings: Any = numba.config
+    before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
+    try:
+        return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
+    finally:
+        settings.CACHE_DIR = before
+
+
+def _link(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function]) -> Function:
+    """Copy the call graph below `function`, names in `ports` replaced by theirs, each copy through `make`."""
+    made: dict[Function, Function] = {}
+
+    def link(f: Function) -> Function:
+        f = getattr(f, "py_func", f)  # an @njit function is welcome too
+        if f not in made:
+            made[f] = make(rebind(f, **{name: link(ports.get(name, g)) for name, g in _calls(f).items()}))
+        return made[f]
+
+    return link(function)
+
+
+def _globals(function: Function) -> dict[str, Any]:
+    """The module-level names `function` reads, with their values."""
+    function = getattr(function, "py_func", function)
+    names = {i.argval for i in dis.get_instructions(function) if i.opname == "LOAD_GLOBAL"}
+    there = function.__globals__
+    return {name: there[name] for name in sorted(names) if name in there}
+
+
+def _calls(function: Function) -> dict[str, Function]:
+    return {name: value for name, value in _globals(function).items()
+            if isinstance(value, FunctionType) or hasattr(value, "py_func")}
+
+
+def fingerprint(function: Function) -> str:
+    """Changes when the source of `function` or of anything it calls changes, or a constant or field that they name."""
+    seen: dict[Function, str] = {}
+
+    def text(f: Function) -> str:
+        if f not in seen:
+            seen[f] = ""
+            calls = _calls(f)
+            below = [f"{name}={text(g)}" for name, g in calls.items()]
+            constants = [f"{name}={_constant(value)}" for name, value in _globals(f).items() if name not in calls]
+            whole = "\n".join([_source(f), *below, *constants])
+            seen[f] = hashlib.sha256(whole.encode()).hexdigest()
+        return seen[f]
+
+    return text(function)[:20]
+
+
+def _source(f: Function) -> str:
+    try:
+        return inspect.getsource(f)
+    except OSError:  # typed in at a prompt: its code stands for it
+        code: CodeType = f.__code__
+        return f"{code.co_code.hex()} {code.co_consts} {code.co_names}"
+
+
+def _constant(value: Any) -> str:
+    if isinstance(value, ModuleType):
+        return value.__name__
+    fields = getattr(value, "_fields", None)
+    return f"{fields}" if fields else repr(value)

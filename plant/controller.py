@@ -1,0 +1,29 @@
+"""The position law of the reference firmware: PID on the sensed error, limited (P only by default)."""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from plant.friction import clip
+
+
+class Loop(NamedTuple):
+    """What the law remembers from cycle to cycle."""
+
+    integral: float = 0.0  # A, the integral part of the current
+    error: float = 0.0  # m, of the cycle before
+    cycles: float = 0.0  # cycles since it was enabled
+
+
+def answer(c: Loop, demand: float, position: float, p: Any) -> tuple[float, Loop]:
+    """Current for the next cycle, A, from demand and sensed position, m; `p` has the fields of `Controller`.
+
+    The integral part waits while the output is at its limit and the error would drive it further (anti-windup);
+    the derivative is the backward difference of the error, none in the first cycle.
+    """
+    error = demand - position
+    rate = (error - c.error) / p.period if c.cycles > 0.0 else 0.0
+    integral = c.integral + p.integral_gain * error * p.period
+    wanted = p.proportional_gain * error + integral + p.derivative_gain * rate
+    current = clip(wanted, p.current_limit)
+    winding = current != wanted and wanted * error > 0.0
+    return current, Loop(c.integral if winding else integral, error, c.cycles + 1.0)

@@ -1,0 +1,42 @@
+"""A body pushed by a saturating pressure against dry and viscous friction: one exact implicit step.
+
+Dry friction after Karnopp, without his velocity band (Borello): a body at rest stays at rest while the net force is
+within the static level; one that moves is resisted by the dynamic level and stops where its velocity would change sign.
+"""
+from __future__ import annotations
+
+
+def clip(x: float, limit: float) -> float:
+    """`x` within +-`limit`, as two selects."""
+    x = x if x < limit else limit
+    return x if x > -limit else -limit
+
+
+def soften(x: float, band: float) -> float:
+    """`x` with [-band, band] taken out: what dry friction leaves of an impulse."""
+    return x - clip(x, band)
+
+
+def slide(v0: float, impulse: float, push: float, line: float, slope: float, limit: float, dry: float,
+          free: float, coupled: float) -> float:
+    """Velocity after the step of  m v' = F + A clip(p0 - s v, +-limit) - c v - dry(v), implicit in v.
+
+    The right side falls with v, so there is one root. It lies on the sloping part of the pressure or on the side of
+    the limit that the sloping root points to; each is a soft threshold. No iteration, no branch.
+
+    Args:
+        v0: velocity before, m/s.
+        impulse: m v0 + h F, N s.
+        push: h A, N s/Pa.
+        line: p0, pressure at standstill, Pa.
+        slope: s, fall of the pressure with v, Pa s/m.
+        limit: saturation pressure, Pa.
+        dry: h times the dry friction level, N s.
+        free: 1/(m + h c), one over the body's effective mass at the limit, 1/kg.
+        coupled: 1/(m + h c + h A s), the same on the sloping part, 1/kg.
+    """
+    v = soften(impulse + push * line, dry) * coupled
+    wanted = line - slope * v
+    held = clip(wanted, limit)
+    v = v if held == wanted else soften(impulse + push * held, dry) * free
+    return 0.0 if v * v0 < 0.0 else v

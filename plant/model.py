@@ -1,0 +1,151 @@
+"""A model: the reference plant, its parameter values, and the effects it has. Data; it becomes code when it is run."""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant import solve
+from plant import step as step_module
+from plant.compile import Function, compiled, interpreted
+from plant.effects import CATALOGUE, Effect, at
+from plant.errors import InputError
+from plant.parameters import GROUPS, accept, flatten, nominal, read_toml, resolve, sensible
+from plant.quantity import Quantity
+from plant.state import Ports, State
+
+STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
+
+
+def known_groups(effects: Iterable[str] | None = None) -> dict[str, type[Any]]:
+    """Every parameter group: the reference model's and those of `effects` (default: all in the catalogue)."""
+    chosen = [CATALOGUE[name] for name in effects] if effects is not None else list(CATALOGUE.values())
+    return GROUPS | {e.name: e.group for e in chosen if e.group is not None}
+
+
+def meaning(name: str, where: object = "--set") -> Quantity:
+    """What the parameter "group.field" means, whichever effect it belongs to.
+
+    Raises:
+        InputError: there is no such parameter.
+    """
+    return resolve(where, name, known_groups())
+
+
+@dataclass(frozen=True)
+class Model:
+    """The reference plant with parameter `values` ("group.field" to SI number) and `effects`, in catalogue order."""
+
+    name: str = "eha"
+    values: Mapping[str, float] = field(default_factory=nominal)
+    effects: tuple[str, ...] = ()
+
+    def replace(self, changes: Mapping[str, object], where: object = "--set") -> Model:
+        """The model with some parameters changed; naming an effect's parameter gives the model that effect.
+
+        Raises:
+            InputError: an unknown name, an impossible value, or values that contradict each other.
+        """
+        values = {name: accept(where, name, meaning(name, where), value) for name, value in changes.items()}
+        model = self.having(name.partition(".")[0] for name in changes)
+        merged = {**model.values, **values}
+        sensible(where, merged)
+        return Model(model.name, merged, model.effects)
+
+    def having(self, groups: Iterable[str]) -> Model:
+        """The model with the effects among `groups` added at their off values."""
+        wanted = set(groups) | set(self.effects)
+        effects = tuple(e.name for e in CATALOGUE.values() if e.name in wanted and not e.base)
+        off = {name: value for e in effects if e not in self.effects for name, value in CATALOGUE[e].off.items()}
+        return Model(self.name, {**self.values, **off}, effects)
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[name]
+
+    def differences(self) -> dict[str, float]:
+        """What is not nominal: changed parameters, and all parameters of the effects it has."""
+        base = nominal()
+        return {name: value for name, value in self.values.items() if base.get(name) != value}
+
+    def to_toml(self) -> str:
+        """The model file that `load_model` reads back."""
+        effects = ", ".join(f'"{e}"' for e in self.effects)
+        lines = [f'name = "{self.name}"', f"effects = [{effects}]"]
+        group = ""
+        for name, value in self.differences().items():
+            head, _, tail = name.partition(".")
+            if head != group:
+                group = head
+                lines += ["", f"[{group}]"]
+            quantity = meaning(name)
+            word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
+            lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
+        return "\n".join(lines) + "\n"
+
+    def record(self) -> NDArray[Any]:
+        """The values as a one-row record array, fields group.field: what compiled code reads, live."""
+        groups = known_groups(self.effects)
+        inner = {group: np.dtype((np.record, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
+        row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
+        return np.array([row], np.dtype((np.record, list(inner.items()))))
+
+    def state(self) -> State:
+        """The centred actuator at rest, with the memory of this model's effects."""
+        return State(memory=Ports(*(at(port, self.effects)[1] for port in Ports._fields)))
+
+
+def load_model(source: str | Path = "eha") -> Model:
+    """The nominal model ("eha") or the model in a TOML file: what differs from nominal, by group.
+
+    Raises:
+        InputError: no such file, or an unknown group, field, effect or impossible value in it.
+    """
+    if str(source) == "eha":
+        return Model()
+    path = Path(source)
+    if not path.is_file():
+        raise InputError(source, "", 'a model file, or "eha" for the nominal model')
+    return parse_model(read_toml(path), path, path.stem)
+
+
+def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> Model:
+    """The model from the tables of a model file."""
+    tables = dict(tables)
+    name, effects = tables.pop("name", name), tables.pop("effects", [])
+    tables.pop("provenance", None)
+    if not isinstance(name, str) or not name:
+        raise InputError(where, "name", f"a text, not {name!r}")
+    if not isinstance(effects, list) or any(e not in CATALOGUE for e in effects):
+        unknown = next((e for e in effects if e not in CATALOGUE), effects) if isinstance(effects, list) else effects
+        raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown!r}")
+    return Model(name).having(effects).replace(flatten(where, tables, known_groups()), where)
+
+
+def entry(name: str) -> Effect:
+    """An effect of the catalogue by name.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    if name not in CATALOGUE:
+        raise InputError("effect", name, f"one of {', '.join(CATALOGUE)}")
+    return CATALOGUE[name]
+
+
+def kernel(name: str, effects: tuple[str, ...], fast: bool = True) -> Function:
+    """The function `plant.solve.<name>` for a model with `effects`, compiled once per set, or interpreted."""
+    laws = tuple(CATALOGUE[e].function for e in effects)
+    return _kernel(name, effects, laws, fast)
+
+
+@cache
+def _kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool) -> Function:
+    ports = {f"at_{port}": at(port, effects)[0] for port in Ports._fields}
+    if any(CATALOGUE[e].port == "supply" for e in effects):
+        ports["supplied"] = step_module.changing_supply
+    return (compiled if fast else interpreted)(getattr(solve, name), ports)

@@ -1,0 +1,203 @@
+"""What the actuator is made of: one NamedTuple a component, every field with unit, symbol and range.
+
+The numbers themselves are data (nominal.toml); this file says what they mean and refuses what cannot be.
+"""
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from difflib import get_close_matches
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from plant.errors import InputError
+from plant.quantity import Quantity, quantities
+
+FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
+"""Exponent of (1 - Kintas) on the pilot flow gain; pressures scale with (1 - Kintas) in all three.
+
+"sqrt": an orifice bridge fed through a filter; "linear": flow in proportion; "pressure": flow gain untouched.
+"""
+
+
+def _q(unit: str, symbol: str = "", **more: Any) -> Quantity:
+    return Quantity(unit, symbol, **more)
+
+
+class Controller(NamedTuple):
+    """The position loop of the reference firmware: a PID law on the sensed error, limited."""
+
+    proportional_gain: Annotated[float, _q("A/m", "GAP", low=0)]
+    integral_gain: Annotated[float, _q("A/(m s)", low=0)]
+    derivative_gain: Annotated[float, _q("A s/m", low=0)]
+    current_limit: Annotated[float, _q("A", "Imax", above=0)]
+    period: Annotated[float, _q("s", low=1e-4, high=0.1)]
+
+
+class TorqueMotor(NamedTuple):
+    """Current to torque on the flapper."""
+
+    gain: Annotated[float, _q("N m/A", "GM", above=0, tolerance=0.015)]
+
+
+class Flapper(NamedTuple):
+    """The armature and flapper, between two inelastic stops."""
+
+    inertia: Annotated[float, _q("N m s2/m", "JF", above=0, tolerance=0.015)]
+    damping: Annotated[float, _q("N m s/m", "BF", low=0, tolerance=0.015)]
+    stiffness: Annotated[float, _q("N m/m", "KF", above=0, tolerance=0.015)]
+    travel: Annotated[float, _q("m", "XFM", above=0)]
+
+
+class FeedbackSpring(NamedTuple):
+    """The wire from spool to flapper."""
+
+    stiffness: Annotated[float, _q("N m/m", "KSF", above=0, tolerance=0.015)]
+
+
+class Filter(NamedTuple):
+    """The pilot stage's filter."""
+
+    clogging: Annotated[float, _q("1", "Kintas", low=0, below=1)]
+    law: Annotated[float, _q("1", words=FILTER_LAWS)]
+
+
+class Pilot(NamedTuple):
+    """The double nozzle with a clean filter."""
+
+    flow_gain: Annotated[float, _q("m2/s", "GQF", above=0, tolerance=0.015)]
+    pressure_gain: Annotated[float, _q("Pa/m", "GPF", above=0, tolerance=0.015)]
+
+
+class Spool(NamedTuple):
+    """The second stage."""
+
+    end_area: Annotated[float, _q("m2", "ASV", above=0)]
+    mass: Annotated[float, _q("kg", "MS", above=0)]
+    damping: Annotated[float, _q("N s/m", "CS", low=0)]
+    static_friction: Annotated[float, _q("N", "FSS", low=0)]
+    dynamic_friction: Annotated[float, _q("N", "FDS", low=0)]
+    travel: Annotated[float, _q("m", "XSM", above=0)]
+
+
+class Valve(NamedTuple):
+    """The metering edges, linearised."""
+
+    flow_gain: Annotated[float, _q("m2/s", "GQ", above=0, tolerance=0.015)]
+    pressure_gain: Annotated[float, _q("Pa/m", "GP", above=0, tolerance=0.015)]
+
+
+class Supply(NamedTuple):
+    """The hydraulic supply."""
+
+    pressure: Annotated[float, _q("Pa", "PSR", above=0, tolerance=0.015)]
+
+
+class Jack(NamedTuple):
+    """The cylinder with the surface it moves."""
+
+    area: Annotated[float, _q("m2", "AJ", above=0)]
+    mass: Annotated[float, _q("kg", "MJ", above=0, tolerance=0.015)]
+    damping: Annotated[float, _q("N s/m", "CJ", low=0, tolerance=0.015)]
+    static_friction: Annotated[float, _q("N", "FSJ", low=0, tolerance=0.015)]
+    dynamic_friction: Annotated[float, _q("N", "FDJ", low=0, tolerance=0.015)]
+    leakage: Annotated[float, _q("m3/s/Pa", "CLK", low=0, tolerance=0.015)]
+    travel: Annotated[float, _q("m", "XJM", above=0)]
+
+
+class Sensors(NamedTuple):
+    """White noise of the bench's transducers, one sample a cycle."""
+
+    position_noise: Annotated[float, _q("m rms", low=0)]
+    pressure_noise: Annotated[float, _q("Pa rms", low=0)]
+    spool_noise: Annotated[float, _q("m rms", low=0)]
+
+
+GROUPS: dict[str, type[Any]] = {
+    "controller": Controller, "torque_motor": TorqueMotor, "flapper": Flapper, "feedback_spring": FeedbackSpring,
+    "filter": Filter, "pilot": Pilot, "spool": Spool, "valve": Valve, "supply": Supply, "jack": Jack,
+    "sensors": Sensors,
+}
+
+
+def accept(where: object, name: str, quantity: Quantity, value: object) -> float:
+    """`value` as the number it stands for.
+
+    Raises:
+        InputError: not a number (or, for a choice, not one of its words), or out of range.
+    """
+    if isinstance(value, str) and value in quantity.words:
+        return quantity.words[value]
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            raise InputError(where, name, f"{quantity.expected}, not {value!r}") from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(where, name, f"{quantity.expected}, not {value!r}")
+    if quantity.refuses(float(value)) or (quantity.words and float(value) not in quantity.words.values()):
+        raise InputError(where, name, f"{quantity.expected}, not {value:g}")
+    return float(value)
+
+
+def resolve(where: object, name: str, groups: Mapping[str, type[Any]]) -> Quantity:
+    """What "group.field" means.
+
+    Raises:
+        InputError: no such group or field; the nearest name is offered.
+    """
+    group, _, field = name.partition(".")
+    if group not in groups:
+        raise InputError(where, name, f"a known group{_nearest(group, groups)}")
+    known = quantities(groups[group])
+    if field not in known:
+        raise InputError(where, name, f"a field of {group} ({', '.join(known)}){_nearest(field, known)}")
+    return known[field]
+
+
+def _nearest(word: str, known: Mapping[str, Any]) -> str:
+    near = get_close_matches(word, known, 1, 0.6)
+    return f"; did you mean {near[0]}?" if near else f" ({', '.join(known)})" if len(known) < 8 else ""
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises:
+        InputError: unreadable, or not TOML (with the line).
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "", f"a readable file ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(path, "", f"TOML ({error})") from None
+
+
+def flatten(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[Any]]) -> dict[str, float]:
+    """{"group": {"field": value}} as {"group.field": value}, every value accepted or refused by name."""
+    values: dict[str, float] = {}
+    for group, fields in tables.items():
+        if not isinstance(fields, Mapping):
+            raise InputError(where, group, f"a table [{group}] of fields")
+        for field, value in fields.items():
+            name = f"{group}.{field}"
+            values[name] = accept(where, name, resolve(where, name, groups), value)
+    return values
+
+
+def nominal() -> dict[str, float]:
+    """The nominal actuator, "group.field" to SI value."""
+    source = files("plant") / "nominal.toml"
+    return flatten("nominal.toml", tomllib.loads(source.read_text(encoding="utf-8")), GROUPS)
+
+
+def sensible(where: object, values: Mapping[str, float]) -> None:
+    """Refuse combinations that no actuator can have, each value being possible alone."""
+    for body in ("spool", "jack"):
+        static, dynamic = values[f"{body}.static_friction"], values[f"{body}.dynamic_friction"]
+        if dynamic > static and not math.isclose(dynamic, static):
+            raise InputError(where, f"{body}.dynamic_friction",
+                             f"at most {body}.static_friction ({static:g} N), not {dynamic:g}")

@@ -1,0 +1,58 @@
+"""A number with a meaning: unit, symbol of the paper, and the values that make sense.
+
+A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(...)]`. The unit lives in the type, where
+people, error messages, logs and tables all read the same one.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+
+
+class Quantity(NamedTuple):
+    """What a number means. `low` and `high` are allowed themselves; `above` and `below` are not."""
+
+    unit: str
+    symbol: str = ""  # as in the source paper, where it has one
+    low: float = -math.inf
+    high: float = math.inf
+    above: float = -math.inf
+    below: float = math.inf
+    words: Mapping[str, float] = {}  # named values, for a choice
+    typical: str = ""  # the range met in practice, for people
+    tolerance: float = 0.0  # how far one unit differs from another, as a fraction (prior of a fit)
+
+    def refuses(self, value: float) -> bool:
+        """True for a value that cannot be."""
+        return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below)
+
+    @property
+    def expected(self) -> str:
+        """The allowed values in words, for messages and tables.
+
+        >>> Quantity("kg", above=0).expected
+        'a number above 0 kg'
+        """
+        if self.words:
+            return "one of " + ", ".join(self.words)
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        bounds = [(self.above, -math.inf, "above"), (self.low, -math.inf, "at least"),
+                  (self.below, math.inf, "below"), (self.high, math.inf, "at most")]
+        said = [f"{word} {bound:g}{unit}" for bound, open_end, word in bounds if bound != open_end]
+        return "a number " + " and ".join(said) if said else f"a finite number in {self.unit}"
+
+
+def quantities(group: type[Any]) -> dict[str, Quantity]:
+    """The fields of a parameter group with what they mean, in order."""
+    hints = get_type_hints(group, include_extras=True)
+    return {name: get_args(hints[name])[1] for name in group._fields}
+
+
+Metre = Annotated[float, Quantity("m")]
+MetrePerSecond = Annotated[float, Quantity("m/s")]
+Ampere = Annotated[float, Quantity("A")]
+Pascal = Annotated[float, Quantity("Pa")]
+Newton = Annotated[float, Quantity("N")]
+Second = Annotated[float, Quantity("s")]
+One = Annotated[float, Quantity("1")]

@@ -1,0 +1,94 @@
+"""The plant as programs use it: one cycle at a time (`Actuator`), or a whole command at once (`simulate`)."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError
+from plant.model import STEPS, Model, kernel
+from plant.solve import NOISES
+from plant.state import State
+
+Array = NDArray[np.float64]
+
+
+class Columns(NamedTuple):
+    """A run, one row a cycle: `t` s, `com` and `xj` m, `cor` A, `p12` Pa, `xs` m, `load` N; each (n,)."""
+
+    t: Array
+    com: Array
+    xj: Array
+    cor: Array
+    p12: Array
+    xs: Array
+    load: Array
+
+
+def noise(seed: int, cycles: int) -> Array:
+    """The random numbers of a run, (cycles, NOISES) standard normal: the same for a bench run and a simulation."""
+    return np.random.default_rng(seed).standard_normal((cycles, NOISES))
+
+
+def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
+             fast: bool = True) -> Columns:
+    """The model with its own controller over a command.
+
+    Args:
+        model: the plant.
+        command: (n,) demand in m, one a cycle.
+        load: (n,) external force on the ram in N, positive against extension; none by default.
+        seed: of the noise.
+        steps: steps a cycle.
+        fast: compiled; False runs the same source in plain Python.
+
+    Raises:
+        InputError: an empty command, or a load of another length.
+    """
+    com = np.ascontiguousarray(command, float)
+    force = np.zeros_like(com) if load is None else np.ascontiguousarray(load, float)
+    if com.ndim != 1 or not len(com) or force.shape != com.shape:
+        raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
+    out = np.empty((len(com), 4))
+    record = model.record()
+    kernel("closed_loop", model.effects, fast)(model.state(), com, force, noise(seed, len(com)), record, steps, out)
+    t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
+    xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
+    return Columns(t, com, xj, cor, p12, xs, force)
+
+
+class Actuator:
+    """One plant that runs cycle by cycle: the emulator's core. Neither a clock nor a bus is known here."""
+
+    def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
+        self.model, self.steps = model, steps
+        self.state: State = model.state()
+        self.cycle = 0
+        self._record = model.record()
+        self._rng = np.random.default_rng(seed)
+        self._noise = [0.0] * NOISES
+        self._advance = kernel("cycle", model.effects, fast)
+        self._sensors, self._period = self._record[0].sensors, model["controller.period"]
+
+    def warm(self) -> None:
+        """Compile now, so that the first cycle is not late."""
+        self._advance(self.state, 0.0, 0.0, 0.0, 0.0, self._record, 0)
+
+    def sample(self) -> tuple[float, float, float]:
+        """What the transducers read now: XJ m, P12 Pa, XS m. Once a cycle: it draws the cycle's noise."""
+        n = self._noise = self._rng.standard_normal(NOISES).tolist()
+        s, g = self.state, self._sensors
+        return (s.sensed + float(g.position_noise) * n[0], s.pressure + float(g.pressure_noise) * n[1],
+                s.spool_position + float(g.spool_noise) * n[2])
+
+    def advance(self, current: float, load: float = 0.0) -> None:
+        """One cycle with `current` A in the torque motor and `load` N on the ram."""
+        t = self.cycle * self._period
+        self.state = self._advance(self.state, current, load, self._noise[3], t, self._record, self.steps)
+        self.cycle += 1
+
+    def set(self, name: str, value: float) -> None:
+        """Change the parameter "group.field" of the running plant; its effect must be in the model."""
+        group, _, field = name.partition(".")
+        setattr(self._record[0][group], field, value)

@@ -1,0 +1,145 @@
+"""One step of the reference model (Fig. 5 of the paper) in three parts: coefficients, servovalve, jack.
+
+Stiff terms are implicit: the pressure-flow damping has time constants of 3 us and 22 us, and dry friction is a set.
+Positions follow the mean of the old and the new velocity, the flapper the trapezoidal rule with the spool where it will be
+in mid step. That leaves 1/170 of the error of the plain implicit scheme at 10 us, for 8 % more time.
+
+Names in capitals in the comments are the paper's symbols; functions named `at_<port>` are bound to the model's effects.
+"""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from plant.friction import clip, slide
+from plant.state import Drag, Input, Line, Memory, Ports, State
+
+
+class Coefficients(NamedTuple):
+    """What a step needs of the parameters, so that no step divides: constant while they are."""
+
+    flapper_keep: float  # velocity kept over a step
+    flapper_push: float  # velocity gained per unit of torque
+    pilot_gain: float  # GPF1, Pa/m
+    pilot_slope: float  # GPF1 ASV / GQF1, Pa s/m
+    pilot_limit: float  # PS1, Pa
+    spool_free: float  # 1/kg
+    spool_coupled: float  # 1/kg
+    spool_push: float  # h ASV
+    valve_gain: float  # Pa/m, the metering edges with leakage
+    valve_slope: float  # Pa s/m
+    valve_limit: float  # PSR, Pa
+    jack_free: float  # 1/kg
+    jack_coupled: float  # 1/kg
+
+
+def through(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+    """A port without effects: the signal passes."""
+    return x, m
+
+
+at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
+at_valve = at_load = at_jack_drag = at_position = at_supply = through
+
+
+def coefficients(p: Any, ratio: float, h: float) -> Coefficients:
+    """Coefficients for parameters `p`, a supply of `ratio` times the nominal, and steps of `h` seconds."""
+    f, v, c = p.flapper, p.spool, p.jack
+    root = ratio**0.5
+    left = 1.0 - p.filter.clogging  # 1 - Kintas
+    gpf1 = p.pilot.pressure_gain * left * ratio
+    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * left**p.filter.law * root)
+    gq, gp = p.valve.flow_gain * root, p.valve.pressure_gain * ratio
+    leak = 1.0 / (1.0 + gp * c.leakage / gq)  # QJ = AJ XJ' + CLK P12, solved for P12
+    slope2 = gp * c.area / gq * leak
+    stiff = 1.0 / (f.inertia + 0.5 * h * f.damping + 0.25 * h * h * f.stiffness)
+    spool, jack = v.mass + h * v.damping, c.mass + h * c.damping
+    return Coefficients(
+        flapper_keep=(f.inertia - 0.5 * h * f.damping - 0.25 * h * h * f.stiffness) * stiff,
+        flapper_push=h * stiff,
+        pilot_gain=gpf1,
+        pilot_slope=slope1,
+        pilot_limit=p.supply.pressure * ratio * left,
+        spool_free=1.0 / spool,
+        spool_coupled=1.0 / (spool + h * v.end_area * slope1),
+        spool_push=h * v.end_area,
+        valve_gain=gp * leak,
+        valve_slope=slope2,
+        valve_limit=p.supply.pressure * ratio,
+        jack_free=1.0 / jack,
+        jack_coupled=1.0 / (jack + h * c.area * slope2),
+    )
+
+
+def steady_supply(k: Coefficients, m: Memory, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory]:
+    """A supply at its nominal pressure: the cycle's coefficients hold."""
+    return k, m
+
+
+def changing_supply(k: Coefficients, m: Memory, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory]:
+    """A supply with effects: coefficients for the pressure it has now."""
+    ratio, m = at_supply(1.0, m, s, u, p)
+    return coefficients(p, ratio, u.h), m
+
+
+supplied = steady_supply
+
+
+def travel(x0: float, v0: float, v: float, h: float, limit: float) -> tuple[float, float]:
+    """Position and velocity after a step at the mean velocity, between inelastic stops at +-`limit`."""
+    x = x0 + 0.5 * h * (v0 + v)
+    held = clip(x, limit)
+    return held, v if held == x else 0.0
+
+
+def flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory, Memory]:
+    """Torque motor and flapper (trapezoidal rule): XF, XF', memory of the current and of the feedback."""
+    current, m_current = at_current(u.current, s.memory.current, s, u, p)
+    ahead = s.spool_position + 0.5 * u.h * s.spool_speed
+    spring, m_feedback = at_feedback(ahead, s.memory.feedback, s, u, p)
+    torque = p.torque_motor.gain * current - p.feedback_spring.stiffness * spring  # Tact
+    v = k.flapper_keep * s.flapper_speed + k.flapper_push * (torque - p.flapper.stiffness * s.flapper_position)
+    x, v = travel(s.flapper_position, s.flapper_speed, v, u.h, p.flapper.travel)
+    return x, v, m_current, m_feedback
+
+
+def spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float, float, Memory, Memory]:
+    """Pilot pressure and spool: XS, XS', memory of the nozzle and of the force."""
+    xf, m_nozzle = at_nozzle(xf, s.memory.nozzle, s, u, p)
+    force, m_force = at_spool_force(0.0, s.memory.spool_force, s, u, p)
+    v0, g = s.spool_speed, p.spool
+    dry = u.h * (g.static_friction if v0 == 0.0 else g.dynamic_friction)
+    v = slide(v0, g.mass * v0 + u.h * force, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry,
+              k.spool_free, k.spool_coupled)
+    x, v = travel(s.spool_position, v0, v, u.h, g.travel)
+    return x, v, m_nozzle, m_force
+
+
+def jack(s: State, u: Input, p: Any, k: Coefficients, xs: float
+         ) -> tuple[float, float, float, Memory, Memory, Memory, Memory]:
+    """Metering edges and ram: XJ, XJ', P12, memory of the metering, valve, load and drag."""
+    g, h, v0 = p.jack, u.h, s.jack_speed
+    opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
+    line, m_valve = at_valve(Line(k.valve_gain * opening, k.valve_slope), s.memory.valve, s, u, p)
+    load, m_load = at_load(u.load, s.memory.load, s, u, p)
+    drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
+    # an effect that changes slope or damping pays for its division; without one these two fold away
+    push, mass = h * g.area, g.mass + h * (g.damping + drag.damping)
+    free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
+    same = drag.damping == 0.0 and line.slope == k.valve_slope
+    coupled = k.jack_coupled if same else 1.0 / (mass + push * line.slope)
+    dry = h * (drag.static if v0 == 0.0 else drag.dynamic)
+    impulse = g.mass * v0 - h * (load + drag.force)
+    v = slide(v0, impulse, push, line.offset, line.slope, k.valve_limit, dry, free, coupled)
+    x, v = travel(s.jack_position, v0, v, h, g.travel)
+    return x, v, clip(line.offset - line.slope * v, k.valve_limit), m_metering, m_valve, m_load, m_drag
+
+
+def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
+    """The plant `u.h` seconds later."""
+    k, m_supply = supplied(k, s.memory.supply, s, u, p)
+    xf, vf, m_current, m_feedback = flapper(s, u, p, k)
+    xs, vs, m_nozzle, m_force = spool(s, u, p, k, xf)
+    xj, vj, p12, m_metering, m_valve, m_load, m_drag = jack(s, u, p, k, xs)
+    sensed, m_position = at_position(xj, s.memory.position, s, u, p)
+    return State(xf, vf, xs, vs, xj, vj, p12, sensed, Ports(
+        m_current, m_supply, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load, m_drag, m_position))
