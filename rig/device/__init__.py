@@ -1,1 +1,8 @@
-"""."""
+"""CANopen slave core (CiA 301): one file per protocol service, put together in `Device`."""
+from rig.device.device import Device
+from rig.device.dictionary import Dictionary, Value
+from rig.device.emcy import EmcyCode, ErrorRegister
+from rig.device.nmt import NmtCommand, NmtState
+from rig.device.sdo import Abort, SdoAbort
+
+__all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value"]

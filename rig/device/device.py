@@ -1,0 +1,184 @@
+"""An emulated CANopen device: the protocol services around one object dictionary, driven by frames and ticks alone."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rig.device.dictionary import Dictionary, Value
+from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
+from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from rig.device.nmt import Nmt, NmtState
+from rig.device.pdo import Pdos
+from rig.device.sdo import Abort, SdoAbort, SdoServer
+from rig.device.sync import SyncConsumer
+from rig.frame import Frame, Send
+
+Handler = Callable[[Frame], None]
+_COMMUNICATING = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)  # states in which SDO, SYNC and EMCY exist
+
+
+def _nothing(*_: object) -> None:
+    """A hook nobody uses."""
+
+
+class Device:
+    """A slave. It boots (boot-up frame, PRE-OPERATIONAL) at its first tick.
+
+    What a frame may do depends on the NMT state (CiA 301, table 39), so the state's table of COB-ID -> service is the
+    gate: a frame that is foreign or not permitted costs one look-up. Hooks are attributes, set those you need:
+
+    on_sync()                    OPERATIONAL, after synchronous RPDOs are in `od`, before synchronous TPDOs are packed
+    on_rpdo(n)                   an asynchronous RPDO arrived and is in `od`
+    on_write(index, sub, data)   SDO download about to be stored; may raise SdoAbort
+    on_nmt(old, new)             the state has changed
+    on_heartbeat_lost(node)      a watched node fell silent (EMCY and 0x1029 are already done)
+
+    Raises InputError for an EDS that cannot be read or maps what it does not hold.
+    """
+
+    def __init__(self, node_id: int, eds_path: Path, send: Send) -> None:
+        self.node_id = node_id
+        self.t_ns = 0  # of the last frame or tick
+        self.on_sync: Callable[[], None] = _nothing
+        self.on_rpdo: Callable[[int], None] = _nothing
+        self.on_write: Callable[[int, int, bytes], None] = _nothing
+        self.on_nmt: Callable[[NmtState, NmtState], None] = _nothing
+        self.on_heartbeat_lost: Callable[[int], None] = _nothing
+
+        self.od = Dictionary(eds_path, node_id)
+        self.nmt = Nmt(node_id, self._enter, self._restart)
+        self.emcy = Emcy(self.od, send, lambda: self.nmt.state in _COMMUNICATING)
+        self.heartbeat = HeartbeatProducer(node_id, send)
+        self.consumer = HeartbeatConsumer(self._heartbeat_lost, self._heartbeat_back)
+        self.sync = SyncConsumer(self.emcy, self._cycle)
+        self.sdo = SdoServer(0x580 + node_id, send, self._upload, self.od.size, self._download)
+        self.pdo = Pdos(self.od, self.emcy, send, lambda n: self.on_rpdo(n))
+        self._handlers: dict[int, Handler] = {}
+
+    @property
+    def state(self) -> NmtState:
+        return self.nmt.state
+
+    def receive(self, frame: Frame) -> None:
+        """A frame of another node arrived."""
+        handler = self._handlers.get(frame.cob_id)
+        if handler is not None:
+            self.t_ns = frame.t_ns
+            handler(frame)
+
+    def tick(self, t_ns: int) -> None:
+        """It is now `t_ns`."""
+        self.t_ns = t_ns
+        if self.nmt.state is NmtState.INITIALISING:
+            self._boot()
+        self.heartbeat.tick(t_ns, self.nmt.state)
+        self.consumer.tick(t_ns)
+        self.sync.tick(t_ns)
+        self.sdo.tick(t_ns)
+
+    def read(self, index: int, sub: int = 0) -> Value:
+        """An object's raw value. Raises KeyError if there is none."""
+        return self.od.values[index, sub]
+
+    def write(self, index: int, sub: int, value: Value) -> None:
+        """Set an object's raw value from inside, read-only ones too. Raises KeyError if there is none."""
+        if (index, sub) not in self.od:
+            raise KeyError(f"node {self.node_id} has no object {index:04X}sub{sub:X}")
+        self.od.values[index, sub] = value
+        self._configure(index)
+
+    def transmit(self, n: int) -> None:
+        """The application has news for TPDO `n`; nothing is sent unless OPERATIONAL."""
+        if self.nmt.state is NmtState.OPERATIONAL:
+            self.pdo.tpdos[n].transmit()
+
+    def _boot(self) -> None:
+        for index in (0x1006, 0x1016):
+            self._configure(index)
+        self.pdo.configure()
+        self.heartbeat.boot_up()
+        self._enter(NmtState.PRE_OPERATIONAL)
+        self.heartbeat.configure(self.od.number(0x1017, 0), self.t_ns)
+
+    def _restart(self, node: bool) -> None:
+        """Reset node (all objects) or reset communication (0x1000..0x1FFF): defaults, then boot-up."""
+        self._enter(NmtState.INITIALISING)
+        self.od.restore(0x1000, 0xFFFF if node else 0x1FFF)
+        self.emcy.reset()
+        self.consumer.configure([])
+        self._boot()
+
+    def _enter(self, new: NmtState) -> None:
+        old = self.nmt.state
+        if new is old:
+            return
+        self.nmt.state = new
+        if new is not NmtState.OPERATIONAL:
+            self.pdo.forget()
+            self.sync.stop()
+        if new not in _COMMUNICATING:
+            self.sdo.reset()
+        self._gate()
+        self.on_nmt(old, new)
+
+    def _gate(self) -> None:
+        """Fill the table of frames that the present state lets in."""
+        state = self.nmt.state
+        self._handlers = {}
+        if state is NmtState.INITIALISING:
+            return
+        self._handlers[0x000] = self.nmt.receive
+        self._handlers.update(dict.fromkeys(self.consumer.cob_ids, self.consumer.receive))
+        if state in _COMMUNICATING:
+            self._handlers[0x600 + self.node_id] = self.sdo.receive
+        if state is NmtState.OPERATIONAL:
+            self._handlers[self.od.number(0x1005, 0, 0x80) & 0x7FF] = self.sync.receive
+            for pdo in self.pdo.rpdos.values():
+                if pdo.cob_id is not None:
+                    self._handlers[pdo.cob_id] = pdo.receive
+
+    def _cycle(self) -> None:
+        for rpdo in self.pdo.latched:
+            rpdo.latch()
+        self.on_sync()
+        for tpdo in self.pdo.cyclic:
+            tpdo.on_sync()
+
+    def _upload(self, index: int, sub: int) -> bytes:
+        if index == HISTORY and sub > self.od.number(HISTORY, 0):
+            self.od.find(index, sub)
+            raise SdoAbort(Abort.NO_DATA)
+        return self.od.encode(index, sub)
+
+    def _download(self, index: int, sub: int, data: bytes) -> None:
+        value = self.od.decode(index, sub, data)
+        self.pdo.check(index, sub, value)
+        if index == HISTORY:
+            if value != 0:
+                raise SdoAbort(Abort.VALUE)
+            self.emcy.erase_history()
+            return
+        self.on_write(index, sub, data)
+        self.od.values[index, sub] = value
+        self._configure(index)
+
+    def _configure(self, index: int) -> None:
+        """A communication object changed: the service it belongs to takes it over."""
+        if index == 0x1006:
+            self.sync.configure(self.od.number(0x1006, 0))
+        elif index == 0x1016:
+            self.consumer.configure([self.od.number(0x1016, sub) for sub in self.od.subs(0x1016)])
+            self._gate()
+        elif index == 0x1017:
+            self.heartbeat.configure(self.od.number(0x1017, 0), self.t_ns)
+        elif 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+            self.pdo.configure()
+            self._gate()
+
+    def _heartbeat_lost(self, node: int) -> None:
+        self.emcy.raise_(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))
+        self.nmt.communication_error(self.od.number(0x1029, 1))
+        self.on_heartbeat_lost(node)
+
+    def _heartbeat_back(self, node: int) -> None:
+        self.emcy.clear(EmcyCode.HEARTBEAT_LOST, bytes((node,)))

@@ -1,0 +1,135 @@
+"""Object dictionary: the entries of an EDS (CiA 306) and their values in use."""
+from __future__ import annotations
+
+import logging
+import struct
+from configparser import Error as ConfigError
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import canopen
+from canopen.objectdictionary import ODVariable, datatypes
+
+from plant.errors import InputError
+from rig.device.sdo import Abort, SdoAbort
+
+Value = int | float | bytes
+
+_FORMATS = {
+    datatypes.BOOLEAN: "?", datatypes.INTEGER8: "b", datatypes.INTEGER16: "h", datatypes.INTEGER32: "i",
+    datatypes.INTEGER64: "q", datatypes.UNSIGNED8: "B", datatypes.UNSIGNED16: "H", datatypes.UNSIGNED32: "I",
+    datatypes.UNSIGNED64: "Q", datatypes.REAL32: "f", datatypes.REAL64: "d",
+}  # fmt: skip
+_STRINGS = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.DOMAIN)
+
+
+class Entry(NamedTuple):
+    """One sub-index: what it is, who may do what with it, what it holds after power-on."""
+
+    name: str
+    code: str  # struct format of a number, "" for strings and domains
+    readable: bool
+    writable: bool
+    mappable: bool
+    default: Value
+    low: int | None
+    high: int | None
+
+
+class Dictionary:
+    """Entries by (index, sub-index) and, beside them, the plain dict of their values.
+
+    `values` is public and hot: the PDOs read and write it directly. Strings and domains are bytes.
+    """
+
+    def __init__(self, path: Path, node_id: int) -> None:
+        self.path = path
+        self.entries = _load(path, node_id)
+        self.values: dict[tuple[int, int], Value] = {}
+        self._indices = {index for index, _ in self.entries}
+        self.restore(0x1000, 0xFFFF)
+
+    def restore(self, first: int, last: int) -> None:
+        """Set the objects from index `first` to `last` to their defaults."""
+        for key, entry in self.entries.items():
+            if first <= key[0] <= last:
+                self.values[key] = entry.default
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        return key in self.entries
+
+    def subs(self, index: int) -> list[int]:
+        """The sub-indices of an object above 0, in order; empty if there is no such object."""
+        return sorted(sub for i, sub in self.entries if i == index and sub)
+
+    def number(self, index: int, sub: int, absent: int = 0) -> int:
+        """An integer object's value, or `absent` where the device has no such object."""
+        return cast(int, self.values.get((index, sub), absent))
+
+    def find(self, index: int, sub: int) -> Entry:
+        """The entry. Raises SdoAbort: no such object, no such sub-index."""
+        entry = self.entries.get((index, sub))
+        if entry is None:
+            raise SdoAbort(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
+        return entry
+
+    def encode(self, index: int, sub: int) -> bytes:
+        """The value as SDO upload sends it. Raises SdoAbort: absent, write-only."""
+        entry = self.find(index, sub)
+        if not entry.readable:
+            raise SdoAbort(Abort.WRITE_ONLY)
+        value = self.values[index, sub]
+        return value if isinstance(value, bytes) else struct.pack("<" + entry.code, value)
+
+    def size(self, index: int, sub: int) -> int:
+        """Bytes an SDO download must bring, 0 for any number. Raises SdoAbort: absent, read-only."""
+        entry = self.find(index, sub)
+        if not entry.writable:
+            raise SdoAbort(Abort.READ_ONLY)
+        return struct.calcsize("<" + entry.code)
+
+    def decode(self, index: int, sub: int, data: bytes) -> Value:
+        """The value an SDO download would store. Raises SdoAbort: absent, read-only, length, range."""
+        size, entry = self.size(index, sub), self.find(index, sub)
+        if not entry.code:
+            return data
+        excess = len(data) - size
+        if excess:
+            raise SdoAbort(Abort.TOO_LONG if excess > 0 else Abort.TOO_SHORT)
+        value: int | float = struct.unpack("<" + entry.code, data)[0]
+        if entry.high is not None and value > entry.high:
+            raise SdoAbort(Abort.TOO_HIGH)
+        if entry.low is not None and value < entry.low:
+            raise SdoAbort(Abort.TOO_LOW)
+        return value
+
+
+def _load(path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
+    """Read the EDS. Raises InputError if it cannot be read or holds a type this core does not know."""
+    try:
+        od = canopen.import_od(str(path), node_id)
+    except (OSError, ValueError, KeyError, ConfigError) as error:
+        logging.getLogger(__name__).debug("EDS %s", path, exc_info=True)
+        raise InputError(path, "", f"an electronic data sheet (CiA 306): {error}".replace("\n", " ")) from None
+    variables = [
+        variable
+        for item in od.values()
+        for variable in ([item] if isinstance(item, ODVariable) else item.values())
+        if item.index >= 0x1000  # below: the dummy types
+    ]
+    return {(variable.index, variable.subindex): _entry(path, variable) for variable in variables}
+
+
+def _entry(path: Path, variable: ODVariable) -> Entry:
+    code = _FORMATS.get(variable.data_type or 0, "")
+    if not code and variable.data_type not in _STRINGS:
+        where = f"{variable.index:04X}sub{variable.subindex:X}.DataType"
+        raise InputError(path, where, f"an integer of 8, 16, 32 or 64 bits, REAL, string or DOMAIN, "
+                                      f"not 0x{variable.data_type or 0:04X}")  # fmt: skip
+    default: Value
+    if code:
+        default = 0 if variable.default is None else variable.default
+    else:
+        default = variable.default.encode("ascii") if isinstance(variable.default, str) else variable.default or b""
+    return Entry(variable.name, code, variable.readable, variable.writable, variable.pdo_mappable, default,
+                 variable.min, variable.max)  # fmt: skip

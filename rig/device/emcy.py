@@ -1,0 +1,99 @@
+"""EMCY producer (CiA 301, 7.2.7): emergency frames, error register 0x1001 and error history 0x1003."""
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from enum import IntEnum, IntFlag
+
+from rig.device.dictionary import Dictionary
+
+_FRAME = struct.Struct("<HB5s")
+_INVALID = 1 << 31  # in 0x1014
+REGISTER, HISTORY, COB_ID = 0x1001, 0x1003, 0x1014
+
+
+class EmcyCode(IntEnum):
+    """Error codes the core itself raises, and those the bench needs."""
+
+    RESET = 0x0000
+    CURRENT = 0x2000
+    SOFTWARE = 0x6000
+    COMMUNICATION = 0x8100
+    HEARTBEAT_LOST = 0x8130
+    PDO_TOO_SHORT = 0x8210
+    PDO_TOO_LONG = 0x8220
+    SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
+
+
+class ErrorRegister(IntFlag):
+    """Bits of 0x1001."""
+
+    GENERIC = 0x01
+    CURRENT = 0x02
+    VOLTAGE = 0x04
+    TEMPERATURE = 0x08
+    COMMUNICATION = 0x10
+    PROFILE = 0x20
+    MANUFACTURER = 0x80
+
+
+class Emcy:
+    """The errors in force. One frame as an error comes, one as it goes; repeats of a standing error say nothing new.
+
+    An error is its code and its first information byte (which PDO, which node), so that two nodes lost are two errors.
+    `permitted()` says whether the NMT state lets EMCY through; register and history are kept in any state.
+    """
+
+    def __init__(self, od: Dictionary, send: Callable[[int, bytes], None], permitted: Callable[[], bool]) -> None:
+        self._od, self._send, self._permitted = od, send, permitted
+        self._active: dict[tuple[int, bytes], int] = {}  # (code, information) -> register bits
+
+    @property
+    def active(self) -> list[int]:
+        """Codes in force, oldest first."""
+        return [code for code, _ in self._active]
+
+    def reset(self) -> None:
+        """Forget all without a word, as at power-on."""
+        self._active.clear()
+
+    def raise_(self, code: int, register: int = ErrorRegister.GENERIC, info: bytes = b"") -> None:
+        """An error came: `code` as in CiA 301 table 26, its `register` bits, up to 5 bytes of `info`."""
+        key = code, info[:1]
+        if key in self._active:
+            return
+        self._active[key] = register | ErrorRegister.GENERIC
+        self._record(code, info)
+        self._transmit(code, info)
+
+    def clear(self, code: int | None = None, info: bytes = b"") -> None:
+        """All errors of that code (and information) are gone, without `code` every error; says so if there were any."""
+        gone = [key for key in self._active if code in (None, key[0]) and info[:1] in (b"", key[1])]
+        for key in gone:
+            del self._active[key]
+        if gone:
+            self._transmit(EmcyCode.RESET, b"")
+
+    def erase_history(self) -> None:
+        """Master wrote 0 to 0x1003 sub 0."""
+        for sub in (0, *self._od.subs(HISTORY)):
+            self._od.values[HISTORY, sub] = 0
+
+    def _record(self, code: int, info: bytes) -> None:
+        subs = self._od.subs(HISTORY)
+        values = self._od.values
+        for sub in reversed(subs[1:]):  # newest first: sub 1
+            values[HISTORY, sub] = values[HISTORY, sub - 1]
+        if subs:
+            values[HISTORY, 1] = code | int.from_bytes(info[:2], "little") << 16
+            values[HISTORY, 0] = min(self._od.number(HISTORY, 0) + 1, len(subs))
+
+    def _transmit(self, code: int, info: bytes) -> None:
+        register = 0
+        for bits in self._active.values():
+            register |= bits
+        self._od.values[REGISTER, 0] = register
+        cob_id = self._od.number(COB_ID, 0, _INVALID)
+        if self._permitted() and not cob_id & _INVALID:
+            self._send(cob_id & 0x7FF, _FRAME.pack(code, register, info[:5]))

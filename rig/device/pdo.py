@@ -1,0 +1,183 @@
+"""PDOs (CiA 301, 7.2.2): communication and mapping read from the object dictionary, one precompiled struct each.
+
+The mapping is fixed (1600.., 1A00.. are const); COB-ID and transmission type (1400.., 1800..) may be changed by SDO.
+"""
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from plant.errors import InputError
+from rig.device.dictionary import Dictionary, Value
+from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
+from rig.device.sdo import Abort, SdoAbort
+from rig.frame import Frame, Send
+
+RPDO, TPDO = 0x1400, 0x1800  # communication parameters; the mapping is 0x200 further on
+_INVALID = 1 << 31  # in a PDO's COB-ID
+_LAST_SYNCHRONOUS = 240
+_EVENT_DRIVEN = (254, 255)
+
+
+class Mapping:
+    """What lies in a PDO, in order: the keys of the objects and the struct that packs them.
+
+    Raises InputError if the dictionary maps what is not there, not mappable, of another length, or beyond 8 bytes.
+    """
+
+    def __init__(self, od: Dictionary, index: int) -> None:
+        self.keys: list[tuple[int, int]] = []
+        codes = "<"
+        for sub in range(1, od.number(index, 0) + 1):
+            word = od.number(index, sub)
+            key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
+            entry = od.entries.get(key)
+            if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
+                field = f"{index:04X}sub{sub:X}"
+                raise InputError(od.path, field, f"a mappable object and its length, not 0x{word:08X}")
+            self.keys.append(key)
+            codes += entry.code
+        self.struct = struct.Struct(codes)
+        self.size = self.struct.size
+        if self.size > 8:
+            raise InputError(od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {self.size}")
+
+
+class Rpdo:
+    """A received PDO: put into the dictionary on arrival, or kept until the next SYNC if it is synchronous."""
+
+    def __init__(self, n: int, od: Dictionary, emcy: Emcy, arrived: Callable[[int], None]) -> None:
+        self.n = n
+        self.fresh = False  # synchronous: a new frame was latched at this SYNC
+        self._od, self._emcy, self._arrived = od, emcy, arrived
+        self._mapping = Mapping(od, RPDO + 0x200 + n - 1)
+        self._size, self._unpack = self._mapping.size, self._mapping.struct.unpack_from
+        self._waiting: bytes | None = None
+        self._faulty = False
+        self.configure()
+
+    def configure(self) -> None:
+        self.cob_id = _cob_id(self._od, RPDO, self.n)
+        self.synchronous = self._od.number(RPDO + self.n - 1, 2) <= _LAST_SYNCHRONOUS
+
+    def forget(self) -> None:
+        """Drop what waits for a SYNC: the device left OPERATIONAL."""
+        self._waiting, self.fresh = None, False
+
+    def receive(self, frame: Frame) -> None:
+        data = frame.data
+        if (len(data) != self._size or self._faulty) and not self._judge(len(data)):
+            return
+        if self.synchronous:
+            self._waiting = data
+        else:
+            self._od.values.update(zip(self._mapping.keys, self._unpack(data), strict=True))
+            self._arrived(self.n)
+
+    def latch(self) -> None:
+        """SYNC: what came last becomes valid."""
+        data = self._waiting
+        self.fresh = data is not None
+        if data is not None:
+            self._waiting = None
+            self._od.values.update(zip(self._mapping.keys, self._unpack(data), strict=True))
+
+    def _judge(self, length: int) -> bool:
+        """Whether a frame of that length is used: too short no (EMCY 0x8210), too long its first bytes (0x8220)."""
+        info = bytes((self.n,))
+        codes = {EmcyCode.PDO_TOO_SHORT: length < self._size, EmcyCode.PDO_TOO_LONG: length > self._size}
+        for code, wrong in codes.items():
+            if wrong:
+                self._emcy.raise_(code, ErrorRegister.COMMUNICATION, info)
+            else:
+                self._emcy.clear(code, info)
+        self._faulty = length != self._size
+        return length >= self._size
+
+
+class Tpdo:
+    """A transmitted PDO: every n-th SYNC (types 1..240), the first SYNC after `transmit` (0), or at once (254, 255)."""
+
+    def __init__(self, n: int, od: Dictionary, send: Send) -> None:
+        self.n = n
+        self._od, self._send = od, send
+        mapping = Mapping(od, TPDO + 0x200 + n - 1)
+        self._keys, self._pack = mapping.keys, mapping.struct.pack
+        self.configure()
+
+    def configure(self) -> None:
+        self.cob_id = _cob_id(self._od, TPDO, self.n)
+        self._type = self._od.number(TPDO + self.n - 1, 2)
+        self.synchronous = self._type <= _LAST_SYNCHRONOUS
+        self.forget()
+
+    def forget(self) -> None:
+        """Start counting SYNCs anew; nothing is due."""
+        self._countdown = self._type
+        self._requested = False
+
+    def transmit(self) -> None:
+        """The application asks for it. A cyclic synchronous PDO keeps to its SYNCs."""
+        if self._type in _EVENT_DRIVEN:
+            self.send()
+        else:
+            self._requested = True
+
+    def on_sync(self) -> None:
+        if self._type == 0:
+            due, self._requested = self._requested, False
+        else:
+            self._countdown -= 1
+            due = self._countdown <= 0
+        if due:
+            self._countdown = self._type
+            self.send()
+
+    def send(self) -> None:
+        if self.cob_id is not None:
+            values = self._od.values
+            self._send(self.cob_id, self._pack(*[values[key] for key in self._keys]))
+
+
+class Pdos:
+    """All PDOs of a device, by number from 1, and the ones a SYNC concerns."""
+
+    def __init__(self, od: Dictionary, emcy: Emcy, send: Send, arrived: Callable[[int], None]) -> None:
+        self._od = od
+        self.rpdos = {n: Rpdo(n, od, emcy, arrived) for n in _numbers(od, RPDO)}
+        self.tpdos = {n: Tpdo(n, od, send) for n in _numbers(od, TPDO)}
+        self.configure()
+
+    def configure(self) -> None:
+        """Read the communication parameters again."""
+        for pdo in self._all():
+            pdo.configure()
+        self.latched = [pdo for pdo in self.rpdos.values() if pdo.synchronous]
+        self.cyclic = [pdo for pdo in self.tpdos.values() if pdo.synchronous]
+
+    def forget(self) -> None:
+        """The device left OPERATIONAL."""
+        for pdo in self._all():
+            pdo.forget()
+
+    def _all(self) -> list[Rpdo | Tpdo]:
+        return [*self.rpdos.values(), *self.tpdos.values()]
+
+    def check(self, index: int, sub: int, value: Value) -> None:
+        """Refuse a communication parameter that means nothing. Raises SdoAbort."""
+        if not isinstance(value, int) or not (RPDO <= index < RPDO + 0x200 or TPDO <= index < TPDO + 0x200):
+            return
+        if sub == 2 and _LAST_SYNCHRONOUS < value < _EVENT_DRIVEN[0]:  # reserved, or by remote frame
+            raise SdoAbort(Abort.VALUE)
+        if sub == 1 and (value & 0x3FFFF800 or (not value & _INVALID and not 0x180 < value & 0x7FF < 0x600)):
+            raise SdoAbort(Abort.VALUE)
+
+
+def _numbers(od: Dictionary, base: int) -> list[int]:
+    return [n for n in range(1, 0x201) if (base + n - 1, 1) in od]
+
+
+def _cob_id(od: Dictionary, base: int, n: int) -> int | None:
+    """COB-ID in use, None while the PDO is switched off (bit 31)."""
+    word = od.number(base + n - 1, 1)
+    return None if word & _INVALID else word & 0x7FF

@@ -1,0 +1,170 @@
+"""SDO server (CiA 301, 7.2.4.3): expedited and segmented upload and download, with the abort codes.
+
+Block transfer is optional for a server and refused with "command specifier not valid".
+canopen's SdoServer was looked at and not taken: it notices a read-only or absent object only after the last segment of
+a download, accepts any number of bytes against the size announced, and answers a stray first request with an exception.
+"""
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from enum import IntEnum
+
+from rig.frame import Frame, Send
+
+_HEAD = struct.Struct("<BHB")
+_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # client command specifiers
+_TIMEOUT = 1_000_000_000  # ns between two requests of one transfer
+_LARGEST = 1 << 20  # bytes in one download: a scenario is a few kB
+
+
+class Abort(IntEnum):
+    """SDO abort codes (CiA 301, table 22), as far as this server uses them."""
+
+    TOGGLE = 0x05030000
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001
+    MEMORY = 0x05040005
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    INCOMPATIBLE = 0x06040043
+    LENGTH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    GENERAL = 0x08000000
+    STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+class SdoAbort(Exception):
+    """Refuses a transfer; the code goes to the client."""
+
+    def __init__(self, code: int = Abort.GENERAL) -> None:
+        self.code = int(code)
+        super().__init__(f"SDO abort 0x{self.code:08X}")
+
+
+class SdoServer:
+    """One transfer at a time.
+
+    `upload(index, sub)` gives an object's bytes; `size(index, sub)` refuses a download that cannot succeed before its
+    segments are sent and gives the object's length in bytes, 0 if it has no fixed one; `download(index, sub, data)`
+    stores. All three may raise SdoAbort.
+    """
+
+    def __init__(
+        self,
+        tx_cob_id: int,
+        send: Send,
+        upload: Callable[[int, int], bytes],
+        size: Callable[[int, int], int],
+        download: Callable[[int, int, bytes], None],
+    ) -> None:
+        self._tx, self._send = tx_cob_id, send
+        self._upload, self._size, self._download = upload, size, download
+        self._object = (0, 0)
+        self._last_ns = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget an open transfer."""
+        self._open: int | None = None  # command specifier of the segments expected
+        self._buffer = bytearray()
+        self._announced: int | None = None  # bytes
+        self._toggle = 0
+
+    def receive(self, frame: Frame) -> None:
+        """A request. What is not 8 bytes long is no SDO and is ignored."""
+        if len(frame.data) != 8:
+            return
+        self._last_ns = frame.t_ns
+        try:
+            reply = self._answer(frame.data)
+        except SdoAbort as abort:
+            self._abort(abort.code)
+        else:
+            if reply:
+                self._send(self._tx, reply.ljust(8, b"\0"))
+
+    def tick(self, t_ns: int) -> None:
+        """Give up a transfer whose client fell silent."""
+        if self._open is not None and t_ns - self._last_ns > _TIMEOUT:
+            self._abort(Abort.TIMEOUT)
+
+    def _abort(self, code: int) -> None:
+        self.reset()
+        self._send(self._tx, _HEAD.pack(0x80, *self._object) + code.to_bytes(4, "little"))
+
+    def _answer(self, data: bytes) -> bytes:
+        """The reply to one request, empty for none; raises SdoAbort."""
+        command, index, sub = _HEAD.unpack_from(data)
+        specifier = command >> 5
+        if specifier == _ABORT:
+            self.reset()
+            return b""
+        if specifier in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT):
+            return self._segment(command, data)
+        self.reset()  # a new request takes the place of an unfinished one
+        self._object = index, sub
+        if specifier == _DOWNLOAD:
+            self._begin_download(command, data)
+            return _HEAD.pack(0x60, index, sub)
+        if specifier == _UPLOAD:
+            return self._begin_upload()
+        raise SdoAbort(Abort.COMMAND)  # block transfer, or nothing the standard knows
+
+    def _begin_download(self, command: int, data: bytes) -> None:
+        size = self._size(*self._object)
+        expedited, announced = command & 2, command & 1
+        if expedited:
+            length = 4 - (command >> 2 & 3) if announced else size or 4
+            self._download(*self._object, data[4 : 4 + length])
+            return
+        if announced:
+            self._announced = int.from_bytes(data[4:], "little")
+            if self._announced > _LARGEST:
+                raise SdoAbort(Abort.MEMORY)
+            if size and self._announced != size:
+                raise SdoAbort(Abort.TOO_LONG if self._announced > size else Abort.TOO_SHORT)
+        self._open = _DOWNLOAD_SEGMENT
+
+    def _begin_upload(self) -> bytes:
+        value = self._upload(*self._object)
+        if 0 < len(value) <= 4:
+            return _HEAD.pack(0x43 | (4 - len(value)) << 2, *self._object) + value
+        self._buffer += value
+        self._open = _UPLOAD_SEGMENT
+        return _HEAD.pack(0x41, *self._object) + len(value).to_bytes(4, "little")
+
+    def _segment(self, command: int, data: bytes) -> bytes:
+        if self._open != command >> 5:
+            raise SdoAbort(Abort.COMMAND)
+        if command & 0x10 != self._toggle:
+            raise SdoAbort(Abort.TOGGLE)
+        toggle, self._toggle = self._toggle, self._toggle ^ 0x10
+        if self._open == _DOWNLOAD_SEGMENT:
+            self._buffer += data[1 : 8 - (command >> 1 & 7)]
+            self._check_length(last=bool(command & 1))
+            if command & 1:
+                value = bytes(self._buffer)
+                self.reset()
+                self._download(*self._object, value)
+            return bytes((0x20 | toggle,))
+        part = bytes(self._buffer[:7])
+        del self._buffer[:7]
+        last = not self._buffer
+        if last:
+            self.reset()
+        return bytes((toggle | (7 - len(part)) << 1 | last,)) + part
+
+    def _check_length(self, last: bool) -> None:
+        length = len(self._buffer)
+        if length > (_LARGEST if self._announced is None else self._announced):
+            raise SdoAbort(Abort.MEMORY if self._announced is None else Abort.TOO_LONG)
+        if last and self._announced is not None and length < self._announced:
+            raise SdoAbort(Abort.TOO_SHORT)

@@ -1,0 +1,49 @@
+"""SYNC consumer (CiA 301, 7.2.5): what happens at a SYNC, and whether they still come (0x1006)."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
+from rig.frame import Frame
+
+# 0x1006 says when a SYNC is due but not when it is lost. A late one is the bench's own business, it measures lateness;
+# ten missing in a row mean that the producer is gone.
+_LOST_AFTER = 10  # periods
+
+
+class SyncConsumer:
+    """Runs `cycle` at each SYNC; raises EMCY 0x8100 when they stop and 0x8240 for one that carries data."""
+
+    def __init__(self, emcy: Emcy, cycle: Callable[[], None]) -> None:
+        self._emcy, self._cycle = emcy, cycle
+        self._limit_ns = 0
+        self._deadline = 0  # 0: not waiting
+        self._lost = self._malformed = False
+
+    def configure(self, period_us: int) -> None:
+        """A new communication cycle period (0x1006); 0: do not watch. Watching begins with the next SYNC."""
+        self._limit_ns = period_us * 1000 * _LOST_AFTER
+        self._deadline = 0
+
+    def stop(self) -> None:
+        """The device leaves OPERATIONAL: no SYNC is missed."""
+        self._deadline = 0
+
+    def receive(self, frame: Frame) -> None:
+        if frame.data:  # a SYNC counter, which the device does not ask for (no 0x1019)
+            self._malformed = True
+            self._emcy.raise_(EmcyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION)
+            return
+        if self._limit_ns:
+            self._deadline = frame.t_ns + self._limit_ns
+        if self._lost or self._malformed:
+            self._lost = self._malformed = False
+            self._emcy.clear(EmcyCode.COMMUNICATION)
+            self._emcy.clear(EmcyCode.SYNC_LENGTH)
+        self._cycle()
+
+    def tick(self, t_ns: int) -> None:
+        if self._deadline and t_ns > self._deadline:
+            self._deadline = 0
+            self._lost = True
+            self._emcy.raise_(EmcyCode.COMMUNICATION, ErrorRegister.COMMUNICATION)
