@@ -35,7 +35,7 @@ def sections(command: Floats, period: float = 1e-3) -> list[Section]:
     out: list[Section] = []
     for start, stop, slope in _lines(com):
         before = com[start - 1] if start else com[0]
-        if stop - start < shortest:
+        if stop - start < shortest or _tangent(com, start, stop, slope, 3 * shortest):
             kind, rate = "dynamic", 0.0
         elif abs(slope) * (stop - start) <= 2 * RESOLUTION:
             kind, rate = ("step" if _jumps(com, start) else "hold"), 0.0
@@ -70,6 +70,14 @@ def _lines(com: Floats) -> list[tuple[int, int, float]]:
         out.append((start, stop, (values[stop - 1] - origin) / (n - 1) if n > 1 else 0.0))
         start = stop
     return out
+
+
+def _tangent(com: Floats, start: int, stop: int, slope: float, longest: int) -> bool:
+    """True for a short line that only touches a slow curve: its slope bends on beyond one of its ends."""
+    if stop - start > longest or abs(slope) * (stop - start) <= 2 * RESOLUTION:
+        return False
+    beyond = [com[start] - com[start - 20]] * (start >= 20) + [com[stop + 19] - com[stop - 1]] * (stop + 20 <= len(com))
+    return any(0 < abs(rise / (20 * slope) - 1) < 0.2 and abs(rise - 20 * slope) > RESOLUTION / 10 for rise in beyond)
 
 
 def _jumps(com: Floats, row: int) -> bool:

@@ -161,7 +161,7 @@ def _from_csv(path: Path) -> Trace:
     period = round(float(t[-1] - t[0]) / float(rows[-1]), 9)
     grid, gaps = _on_grid(path, rows, {**columns, "t": t})
     lost = np.isnan(grid["t"])
-    grid["t"][lost] = (t[0] + period * np.arange(len(lost)))[lost]
+    grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
     return _trace(grid, period, gaps, provenance={"source": path.name},
                   notes=tuple(f"column {name} is not known and was left out" for name in unknown))
 
@@ -208,12 +208,12 @@ def _from_log(log: Log, everything: bool) -> Trace:
     rows = cycle[kept] - cycle[kept][0]
     grid, gaps = _on_grid(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
                           | {"phase": phase[kept].astype(float)})
-    grid["t"] = (np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period
+    grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
 
     def seconds(time_ns: float) -> float:
-        return float(time_ns - zero_ns) * 1e-9
+        return float(time_ns - zero_ns) / 1e9
 
     return _trace(grid, period, gaps, phase=filled.astype(int), provenance=_provenance(log, run),
                   units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,

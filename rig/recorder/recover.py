@@ -1,0 +1,142 @@
+"""Salvage of a log whose writer died: every sound chunk is kept, the indexes are made anew."""
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import BinaryIO
+
+import zstandard
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+
+from plant.errors import InputError
+from rig.recorder.container import McapFile
+
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQ")
+_OPCODE_MESSAGE = 0x05
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError)
+
+
+@dataclass(frozen=True)
+class Salvage:
+    """What came back from a broken log."""
+
+    path: Path  # the log written anew
+    complete: bool  # the log was whole: nothing to salvage
+    messages: int
+    cycles: int
+    duration: float  # s, from the first to the last message kept
+    attachments: tuple[str, ...]
+    lost_bytes: int  # in the file, but in no sound chunk
+    reason: str  # why reading stopped; empty for a whole log
+
+    def __str__(self) -> str:
+        kept = f"{self.messages} messages, {self.cycles} cycles, {self.duration:.3f} s, {len(self.attachments)} files"
+        if self.complete:
+            return f"{self.path}: the log was complete: {kept}"
+        return (f"{self.path}: kept {kept}; lost {self.lost_bytes} bytes that hold no sound chunk ({self.reason}) and "
+                f"what the writer had not yet written, at most about 0.25 s")
+
+
+def recover(path: Path, out: Path) -> Salvage:
+    """Write what is sound in `path` to `out`, a complete indexed MCAP file with the attachments and metadata.
+
+    Raises InputError when `path` cannot be read or holds nothing sound, and when `out` cannot be written.
+    """
+    try:
+        source = path.open("rb")
+    except OSError as error:
+        raise InputError(path, "", f"a readable file ({error.strerror})") from error
+    if out.exists() and out.samefile(path):
+        raise InputError(out, "--out", "another file than the one to recover")
+    with source:
+        reading = _Reading(source, path.stat().st_size)
+        records = iter(reading)
+        first = next(records, None)
+        if first is None:
+            raise InputError(path, "", f"an MCAP log with something in it ({reading.reason or 'it is empty'})")
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            return _write(chain([first], records), reading, out)
+        except OSError as error:
+            raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
+
+
+class _Reading:
+    """Iterates over the sound records of a log up to where it ends; a damaged chunk in the middle is left out."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream, self._size = stream, size
+        self.reason = ""
+        self.lost = 0  # bytes
+
+    def __iter__(self) -> Iterator[McapRecord]:
+        at = 0
+        try:
+            for record in StreamReader(self._stream, emit_chunks=True, record_size_limit=self._size).records:
+                start, at = at, self._stream.tell()
+                if isinstance(record, Chunk):
+                    try:
+                        breakup_chunk(record, validate_crc=True)
+                    except _DAMAGE as error:
+                        self.reason, self.lost = f"damaged chunk: {error}", self.lost + at - start
+                        continue
+                yield record
+        except _DAMAGE as error:
+            self.reason = self.reason or str(error) or "the file ends in mid run"
+            self.lost += self._size - at
+
+
+def _write(records: Iterator[McapRecord], reading: _Reading, out: Path) -> Salvage:
+    file = McapFile(out, "eha-rig recover", [], [])
+    names = []
+    for record in records:
+        if isinstance(record, Attachment):
+            names.append(record.name)
+            file.attachment(record.name, record.media_type, record.data, record.log_time)
+        elif isinstance(record, Metadata):
+            file.metadata(record.name, record.metadata)
+        elif isinstance(record, Chunk):
+            for item in breakup_chunk(record) if not file.channels else ():
+                _declare(file, item)
+            stream, size = get_chunk_data_stream(record)
+            raw = stream.read(size)
+            index = _index(raw)
+            if index:
+                file.chunk(raw, index)
+        else:
+            _declare(file, record)
+    if reading.reason:
+        file.metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
+    counts = file.statistics()
+    cycles = sum(n for c, n in counts.channel_message_counts.items() if file.channels[c].topic == "/signals")
+    file.finish()
+    return Salvage(out, not reading.reason, counts.message_count, cycles,
+                   (counts.message_end_time - counts.message_start_time) * 1e-9, tuple(names), reading.lost,
+                   reading.reason)
+
+
+def _declare(file: McapFile, record: McapRecord) -> None:
+    if isinstance(record, Schema):
+        file.schemas[record.id] = record
+    elif isinstance(record, Channel):
+        file.channels[record.id] = record
+
+
+def _index(raw: bytes) -> dict[int, array[int]]:
+    """Channel -> flat pairs (log time ns, offset) of the messages in a chunk."""
+    index: dict[int, array[int]] = {}
+    at = 0
+    while at < len(raw):
+        opcode, length = _RECORD.unpack_from(raw, at)
+        if opcode == _OPCODE_MESSAGE:
+            channel, _, time_ns = _MESSAGE.unpack_from(raw, at + 9)
+            index.setdefault(channel, array("Q")).extend((time_ns, at))
+        at += 9 + length
+    return index
