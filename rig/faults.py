@@ -1,0 +1,287 @@
+"""Faults as data, and the schedule that says what is wrong in each cycle.
+
+A `Schedule` is asked every millisecond by the node that injects the fault, so everything random or periodic is laid out
+when it is made; the same seed gives the same faults in the same cycles. Times in a fault are seconds from the start of
+the main phase; a fault ends when main ends, so that clean-up finds a sound plant.
+"""
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from plant.errors import InputError
+from plant.segments import RATE, Array, Second
+from rig import tables
+
+Sensor = Literal["xj", "p12", "xs"]
+FrameName = Literal["feedback", "valve_state", "drive", "command"]
+Heart = Literal["rig", "plant"]
+InSI = Annotated[float, "SI units"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault(ABC):
+    """Something wrong from `start` until before `end` (without one: until main ends). `name` is what checks call it."""
+
+    kind: ClassVar[str]
+    start: Second
+    end: Second | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _require(self.start >= 0, "start", f"0 s or later, not {self.start:g}")
+        _require(self.end is None or self.end > self.start, "end", f"after the start at {self.start:g} s")
+
+    @property
+    def label(self) -> str:
+        """Its name, or what it does to what: `lost drive`, `parameter filter.clogging`."""
+        what = next((getattr(self, key) for key in ("parameter", "signal", "frame", "node") if hasattr(self, key)), "")
+        return self.name or f"{self.kind} {what}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ramped(Fault):
+    """A fault of a size that is reached linearly within `ramp` seconds of the start."""
+
+    value: InSI
+    ramp: Second = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.ramp >= 0, "ramp", f"0 s or more, not {self.ramp:g}")
+
+    def growth(self, t: float) -> float:
+        """How much of it is there at `t` s after its start, 0..1."""
+        return 1.0 if t >= self.ramp else t / self.ramp
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter(_Ramped):
+    """A parameter of the plant or of an effect goes from the model's value to `value`, and back when the fault ends."""
+
+    kind = "parameter"
+    parameter: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Offset(_Ramped):
+    """A sensor reads `value` too much."""
+
+    kind = "offset"
+    signal: Sensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(_Ramped):
+    """A sensor has more white noise: `value` is its standard deviation."""
+
+    kind = "noise"
+    signal: Sensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Fault):
+    """A sensor stays at `value`, or without one at what it last read."""
+
+    kind = "stuck"
+    signal: Sensor
+    value: InSI | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Frames(Fault):
+    """Hits every `every`-th frame, each with a probability, until `count` were hit."""
+
+    frame: FrameName
+    every: int = 1
+    count: int | None = None
+    probability: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.every >= 1, "every", f"1 or more cycles, not {self.every}")
+        _require(self.count is None or self.count >= 1, "count", f"1 or more frames, not {self.count}")
+        _require(0 < self.probability <= 1, "probability", f"above 0 and at most 1, not {self.probability:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lost(_Frames):
+    """Frames that never arrive."""
+
+    kind = "lost"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Late(_Frames):
+    """Frames that arrive `delay` seconds late."""
+
+    kind = "late"
+    delay: Second
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(0 < self.delay <= 1, "delay", f"above 0 and at most 1 s, not {self.delay:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Silent(Fault):
+    """A node whose heartbeat stops."""
+
+    kind = "heartbeat"
+    node: Heart
+
+
+KINDS: dict[str, type[Fault]] = {kind.kind: kind for kind in (Parameter, Offset, Noise, Stuck, Lost, Late, Silent)}
+
+
+class Drop(NamedTuple):
+    """This frame never arrives."""
+
+
+class Delay(NamedTuple):
+    """This frame arrives later."""
+
+    ns: int
+
+
+class Edge(NamedTuple):
+    """A fault begins or ends: a line for the log."""
+
+    cycle: int
+    label: str
+    begins: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Faults placed in a run: main is the cycles start <= k < stop, counted from the start of set-up."""
+
+    faults: tuple[Fault, ...] = ()
+    start: int = 0
+    stop: int
+    seed: int = 0
+
+    def cycles(self, fault: Fault) -> tuple[int, int]:
+        """First cycle in which a fault acts and the one in which it no longer does."""
+        last = self.stop if fault.end is None else min(self.stop, self.start + round(fault.end * RATE))
+        return min(last, self.start + round(fault.start * RATE)), last
+
+    def to_json(self) -> dict[str, Any]:
+        """What `from_json` makes a plan of: plain dicts, lists, numbers and texts."""
+        faults = [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}} for f in self.faults]
+        return {"faults": faults, "start": self.start, "stop": self.stop, "seed": self.seed}
+
+    @classmethod
+    def from_json(cls, data: object) -> Plan:
+        """The plan that was sent; InputError if it is none."""
+        plain = {**data, "faults": list(data.get("faults", ()))} if isinstance(data, dict) else data
+        return tables.read(cls, plain, tables.Place("scenario"), {Fault: KINDS})
+
+
+class Schedule:
+    """What is wrong in cycle k. `base` gives the model's own value of every parameter that a fault changes.
+
+    Cycles are counted from the start of set-up. Only a stuck sensor has a memory (what it last read), so ask for them
+    in the order of the cycles; everything else may be asked in any order. InputError for a parameter without a base.
+    """
+
+    def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
+        self._base = base or {}
+        self._parameters: dict[str, list[tuple[int, int, Parameter]]] = {}
+        self._signals: dict[str, list[Callable[[int, float], float]]] = {}
+        self._frames: dict[str, list[tuple[int, bytes, Drop | Delay]]] = {}
+        self._silent: dict[str, list[range]] = {}
+        self.edges: tuple[Edge, ...] = ()
+        for index, fault in enumerate(plan.faults):
+            first, last = plan.cycles(fault)
+            self._add(fault, first, last, np.random.default_rng((plan.seed, index)))
+            self.edges += (Edge(first, fault.label, True), Edge(last, fault.label, False))
+
+    def _add(self, fault: Fault, first: int, last: int, rng: np.random.Generator) -> None:
+        match fault:
+            case Parameter():
+                if fault.parameter not in self._base:
+                    raise InputError("faults", fault.parameter, tables.one_of(fault.parameter, self._base))
+                self._parameters.setdefault(fault.parameter, []).append((first, last, fault))
+            case Offset() | Noise():
+                noise = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
+                self._signals.setdefault(fault.signal, []).append(_Added(fault, first, noise))
+            case Stuck():
+                self._signals.setdefault(fault.signal, []).append(_Held(fault, first, last))
+            case _Frames():
+                action = Delay(round(fault.delay * 1e9)) if isinstance(fault, Late) else Drop()
+                self._frames.setdefault(fault.frame, []).append((first, _hits(fault, last - first, rng), action))
+            case Silent():
+                self._silent.setdefault(fault.node, []).append(range(first, last))
+
+    def parameters_at(self, cycle: int, since: int | None = None) -> dict[str, float]:
+        """The parameters, SI, that differ from what they were in cycle `since` (default: the cycle before)."""
+        before = cycle - 1 if since is None else since
+        return {name: value for name in self._parameters
+                if (value := self._parameter(name, cycle)) != self._parameter(name, before)}
+
+    def _parameter(self, name: str, cycle: int) -> float:
+        base = self._base[name]
+        for first, last, fault in self._parameters[name]:
+            if first <= cycle < last:
+                return base + (fault.value - base) * fault.growth((cycle - first) / RATE)
+        return base
+
+    def signal(self, name: str, value: float, cycle: int) -> float:
+        """What the sensor `name` (xj, p12, xs; SI) says in place of `value`; faults act in the order of the plan."""
+        for change in self._signals.get(name, ()):
+            value = change(cycle, value)
+        return value
+
+    def frame(self, name: str, cycle: int) -> Drop | Delay | None:
+        """What happens to the frame `name` of this cycle; None: it goes its way."""
+        for first, hits, action in self._frames.get(name, ()):
+            if 0 <= cycle - first < len(hits) and hits[cycle - first]:
+                return action
+        return None
+
+    def heartbeat_alive(self, node: str, cycle: int) -> bool:
+        """Whether the node (rig or plant) sends its heartbeat."""
+        return not any(cycle in cycles for cycles in self._silent.get(node, ()))
+
+
+class _Added:
+    """A sensor that reads more than there is: an offset, or noise drawn beforehand."""
+
+    def __init__(self, fault: Offset | Noise, first: int, shape: Array) -> None:
+        self._first, self._added = first, [
+            fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
+
+    def __call__(self, cycle: int, value: float) -> float:
+        k = cycle - self._first
+        return value + self._added[k] if 0 <= k < len(self._added) else value
+
+
+class _Held:
+    """A stuck sensor."""
+
+    def __init__(self, fault: Stuck, first: int, last: int) -> None:
+        self._cycles, self._last_read, self._value = range(first, last), 0.0, fault.value
+
+    def __call__(self, cycle: int, value: float) -> float:
+        if cycle in self._cycles:
+            return self._last_read if self._value is None else self._value
+        self._last_read = value
+        return value
+
+
+def _hits(fault: _Frames, cycles: int, rng: np.random.Generator) -> bytes:
+    """One byte a cycle, 1 where the fault hits the frame."""
+    hits = (np.arange(cycles) % fault.every == 0) & (rng.random(cycles) < fault.probability)
+    if fault.count is not None:
+        hits &= np.cumsum(hits) <= fault.count
+    return bytes(hits.tobytes())
+
+
+def _require(holds: bool, key: str, expected: str) -> None:
+    if not holds:
+        raise InputError("fault", key, expected)

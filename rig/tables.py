@@ -1,0 +1,158 @@
+"""TOML text to frozen dataclasses. A refusal names file and line, key, and what was expected there.
+
+The dataclass is the schema: its fields are the keys, its annotations the types (`Annotated[float, "s"]` adds the unit),
+its defaults say what may be left out. A base class whose subclasses are told apart by the key `kind` is read by the
+table of kinds given for it. A field with metadata {"key": False} is the program's own, not a key.
+"""
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, dataclass, field, fields
+from difflib import get_close_matches
+from math import isfinite
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from plant.errors import InputError
+from rig.toml_lines import Path, lines
+
+T = TypeVar("T")
+Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: subclass}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a value stands: a file, the keys that lead to it, and the lines of all keys."""
+
+    file: str
+    lines: Mapping[Path, int] = field(default_factory=dict, repr=False)
+    keys: Path = ()
+
+    def at(self, *keys: str | int) -> Place:
+        """The place below this one."""
+        return Place(self.file, self.lines, self.keys + keys)
+
+    def refuse(self, expected: str) -> InputError:
+        """The error to raise for the value at this place, with the line of the nearest key that has one."""
+        known = (self.lines[self.keys[:n]] for n in range(len(self.keys), 0, -1) if self.keys[:n] in self.lines)
+        line = next(known, None)
+        text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.keys).lstrip(".")
+        return InputError(self.file if line is None else f"{self.file}:{line}", text, expected)
+
+
+def parse(text: str, file: str) -> tuple[dict[str, Any], Place]:
+    """The tables of a TOML text and the place of its root; InputError with the line if it is not TOML."""
+    try:
+        return tomllib.loads(text), Place(file, lines(text))
+    except tomllib.TOMLDecodeError as error:
+        found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
+        message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
+        raise InputError(f"{file}:{line}", "", f"TOML; {message[:1].lower()}{message[1:]}") from error
+
+
+def read(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:
+    """A `cls` from the table at `place`; raises InputError for a key or value it cannot be made from."""
+    kinds = kinds or {}
+    if not isinstance(table, dict):
+        raise place.refuse("a table")
+    pairs = dict(table)
+    if cls in kinds:
+        kind = pairs.pop("kind", None)
+        if kind not in kinds[cls]:
+            raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {one_of(kind, kinds[cls])}")
+        cls = kinds[cls][kind]
+    hints = get_type_hints(cls, include_extras=True)
+    known = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
+    for key in pairs:
+        if key not in known:
+            raise place.at(key).refuse(f"a key: {one_of(key, known)}")
+    for key, f in known.items():
+        if key not in pairs and f.default is MISSING and f.default_factory is MISSING:
+            raise place.refuse(f"also the key {key!r}, {_describe(hints[key])}")
+    values = {key: _convert(value, hints[key], place.at(key), kinds) for key, value in pairs.items()}
+    try:
+        return cls(**values)
+    except InputError as error:  # the class knows what is wrong with which field, not where it stands
+        raise (place.at(error.field) if error.field else place).refuse(error.expected) from error
+
+
+def one_of(word: object, known: Iterable[str]) -> str:
+    """The words that would have done in place of `word`, and the one that was probably meant.
+
+    >>> one_of("hodl", ["hold", "step"])
+    "'hold' or 'step', not 'hodl' (did you mean 'hold'?)"
+    """
+    names = sorted(known)
+    listed = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), "".join(map(repr, names[-1:])))))
+    if word is None:
+        return listed
+    close = get_close_matches(str(word), names, 1)
+    return f"{listed}, not {word!r}" + (f" (did you mean {close[0]!r}?)" if close else "")
+
+
+def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
+    """`value` as the annotated type, or InputError at `place`."""
+    bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    origin, args = get_origin(bare), get_args(bare)
+    if bare in _SCALARS:
+        if not _fits(value, bare):
+            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+        return bare(value)
+    if origin is Literal:
+        if value not in args:
+            raise place.refuse(one_of(value, args))
+        return value
+    if origin in (Union, UnionType):
+        for member in (m for m in args if m is not NoneType):
+            with suppress(InputError):
+                return _convert(value, member, place, kinds)
+        raise place.refuse(f"{_describe(hint)}, not {value!r}")
+    if origin is tuple:
+        members = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
+        if not isinstance(value, list) or len(value) != len(members):
+            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+        return tuple(_convert(item, member, place.at(i), kinds) for i, (item, member) in
+                     enumerate(zip(value, members, strict=True)))
+    if origin is Mapping:
+        if not isinstance(value, dict):
+            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+        return dict(_named(value, args[1], place, kinds))
+    return read(bare, value, place, kinds)
+
+
+def _named(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values: `spool.travel = 1` and `"spool.travel" = 1` are the same to a user."""
+    for key, item in table.items():
+        if isinstance(item, dict):
+            yield from _named(item, hint, place.at(key), kinds, f"{prefix}{key}.")
+        else:
+            yield prefix + key, _convert(item, hint, place.at(key), kinds)
+
+
+_SCALARS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+
+
+def _fits(value: object, kind: Any) -> bool:
+    if kind is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
+    return type(value) is kind
+
+
+def _describe(hint: Any) -> str:
+    """An annotation in words: what a user should write."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return f"{_describe(args[0])} in {args[1]}"
+    if origin is Literal:
+        return one_of(None, args)
+    if origin in (Union, UnionType):
+        return " or ".join(_describe(member) for member in args if member is not NoneType)
+    if origin is tuple:
+        members = [_describe(member) for member in args if member is not Ellipsis]
+        return f"a list, each {members[0]}" if args[-1] is Ellipsis else f"[{', '.join(members)}]"
+    if origin is Mapping:
+        return f"a table of names, each with {_describe(args[1])}"
+    return _SCALARS.get(hint, "a table")
