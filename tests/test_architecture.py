@@ -1,0 +1,238 @@
+"""The house rules that a machine can check: direction of imports, sizes, public names, docstrings, leftovers, pins."""
+from __future__ import annotations
+
+import ast
+import fnmatch
+import importlib
+import re
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("plant", "fdi", "rig", "dbc")
+MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAX_FILE, MAX_FUNCTION = 330, 45
+
+# The project's packages that each package may import. dbc is data only.
+MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"}}
+# Modules of others that only some files may import (prefixes of paths).
+ONLY_IN = {
+    "numba": ("plant/compile.py",),
+    "llvmlite": ("plant/compile.py",),
+    "can": ("rig/",),
+    "canopen": ("rig/",),
+    "cantools": ("rig/",),
+    "rerun": ("rig/",),
+    "rich": ("rig/",),
+    "mcap": ("rig/", "fdi/"),
+    "matplotlib": ("fdi/", "rig/"),
+    "socket": ("rig/",),
+    "threading": ("rig/",),
+    "asyncio": (),
+    "random": (),
+    "tests": (),
+    "pytest": (),
+    "scipy": (),  # the tests' independent solver, not a part of the product
+}
+# The edge, where the wall clock may be seen; everything else is told the time.
+CLOCK_MODULES = {"time", "datetime", "sched"}
+CLOCK_FILES = (
+    "rig/clock.py", "rig/loop.py", "rig/link.py", "rig/bus.py", "rig/lateness.py", "rig/commands/",
+    "rig/recorder/",  # its thread must close a chunk in time
+)
+# Public names of each package: what `from package import *` gives.
+PUBLIC = {
+    "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
+    "rig.device": {
+        "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
+    },
+    "rig.recorder": {
+        "U32", "CanFrame", "Check", "Event", "NmtState", "Record", "Recorder", "RecorderError", "Signals", "Timing",
+    },
+    "dbc": {"DBC", "EDS"},
+}
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), name(path))
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Absolute names of all modules that a file imports, wherever in the file."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name(path)}:{node.lineno}: relative import"
+            yield node.module or ""
+
+
+def tracked() -> list[Path]:
+    """Text files of the project: what git knows, or everything outside hidden and generated folders."""
+    git = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    if git.returncode == 0 and git.stdout:
+        paths = [ROOT / line for line in git.stdout.split("\0") if line]
+    else:
+        folders = [*PACKAGES, "tests"]
+        paths = [path for folder in folders for path in (ROOT / folder).rglob("*") if "__pycache__" not in path.parts]
+    return [path for path in paths if path.is_file() and b"\0" not in path.read_bytes()[:4096]]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_point_one_way(package: str) -> None:
+    """plant <- fdi <- rig."""
+    for path in MODULES:
+        if name(path).startswith(f"{package}/"):
+            ours = {module.partition(".")[0] for module in imported(path)} & set(PACKAGES)
+            assert ours <= MAY_IMPORT[package], name(path)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name)
+def test_imports_stay_in_their_place(path: Path) -> None:
+    """numba in one file, no CAN outside rig, no wall clock but at the edge."""
+    for module in {module.partition(".")[0] for module in imported(path)}:
+        allowed = CLOCK_FILES if module in CLOCK_MODULES else ONLY_IN.get(module, ("",))
+        assert name(path).startswith(allowed or "nowhere"), f"{name(path)} imports {module}"
+
+
+@pytest.mark.parametrize("path", sorted({*MODULES, *(ROOT / "tests").rglob("*.py")}), ids=name)
+def test_sizes(path: Path) -> None:
+    """A file and a function can be read in one go."""
+    assert len(path.read_text().splitlines()) <= MAX_FILE, name(path)
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            length = (node.end_lineno or 0) - node.lineno + 1
+            assert length <= MAX_FUNCTION, f"{name(path)}:{node.lineno}: {node.name} has {length} lines"
+
+
+def public_names(path: Path) -> set[str]:
+    """`__all__`, or without one every public name that the file itself defines."""
+    names = set()
+    for node in tree(path).body:
+        targets: list[ast.expr] = node.targets if isinstance(node, ast.Assign) else []
+        targets = [node.target] if isinstance(node, ast.AnnAssign) else targets
+        words = [target.id for target in targets if isinstance(target, ast.Name)]
+        if words == ["__all__"] and isinstance(node, ast.Assign):
+            return set(ast.literal_eval(node.value))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            words.append(node.name)
+        names |= {word for word in words if not word.startswith("_")}
+    return names
+
+
+def test_public_names() -> None:
+    """The packages offer exactly these names; a change of them is a decision, made here."""
+    found = {}
+    for path in MODULES:
+        if path.name == "__init__.py" and (names := public_names(path)):
+            found[name(path.parent).replace("/", ".")] = names
+    assert found == PUBLIC
+    for package, names in PUBLIC.items():
+        module = importlib.import_module(package)
+        assert [word for word in names if not hasattr(module, word)] == [], package
+
+
+def undocumented(path: Path) -> Iterator[str]:
+    """Public functions and classes without a docstring. (Methods often repeat those of a protocol.)"""
+    for node in tree(path).body:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
+            continue
+        if ast.get_docstring(node) is None and not decorated(node, "overload"):
+            yield f"{node.name} (line {node.lineno})"
+
+
+def decorated(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef, *words: str) -> bool:
+    """True if a decorator's text holds one of the words."""
+    return any(word in ast.unparse(decorator) for decorator in node.decorator_list for word in words)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name)
+def test_docstrings(path: Path) -> None:
+    """Every module, public class and public function says what it is."""
+    assert len(ast.get_docstring(tree(path)) or "") > 20, f"{name(path)} has no docstring"
+    assert list(undocumented(path)) == [], name(path)
+
+
+def stubs(path: Path) -> Iterator[str]:
+    """Functions with neither a body nor a word why, that are not declarations (protocols, overloads)."""
+    classes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
+    protocols = [node for node in classes if "Protocol" in map(ast.unparse, node.bases)]
+    excused = {id(child) for node in protocols for child in ast.walk(node)}
+    for node in ast.walk(tree(path)):
+        if not isinstance(node, ast.FunctionDef) or id(node) in excused or decorated(node, "overload", "abstract"):
+            continue
+        body = [line for line in node.body if not isinstance(line, ast.Pass)]
+        body = [line for line in body if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))]
+        if not body and ast.get_docstring(node) is None:
+            yield f"{name(path)}:{node.lineno}: {node.name}"
+
+
+def test_no_empty_functions() -> None:
+    """Nothing is left to be filled in later; what does nothing on purpose has a docstring that says so."""
+    assert [stub for path in MODULES for stub in stubs(path)] == []
+
+
+def test_no_leftovers_and_no_machine_paths() -> None:
+    """No notes to oneself, no folder of one machine, no host of a package registry."""
+    notes = "|".join(["TO" + "DO", "FIX" + "ME", "X" * 3, "HA" + "CK"])
+    hosts = "|".join(["pypi" + r"\.org", "pythonhosted" + r"\.org", "debian" + r"\.org", "npm" + r"js\."])
+    bad = re.compile(rf"\b(?:{notes})\b|(?:{hosts})|(?<![\w.$}}~*-])/(?:work|root|home|tmp)/\w")
+    found = []
+    for path in tracked():
+        for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+            if bad.search(line):
+                found.append(f"{name(path)}:{number}: {line.strip()[:100]}")
+    assert found == []
+
+
+def requirements() -> list[str]:
+    project = PROJECT["project"]
+    extras = project["optional-dependencies"].values()
+    return [*project["dependencies"], *(line for extra in extras for line in extra)]
+
+
+def test_pins_have_both_bounds() -> None:
+    """An old release that was never tried and a new one that breaks us are both kept out."""
+    for line in [*requirements(), *PROJECT["build-system"]["requires"]]:
+        assert re.fullmatch(r"[a-z0-9-]+>=[\d.]+,<[\d.]+", line), line
+
+
+def test_each_dependency_is_explained() -> None:
+    """ARCHITECTURE.md has a line '- `name`: why (licence)' for each dependency, and for nothing else."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    named = {re.split("[<>=]", line)[0] for line in requirements()}
+    explained = set(re.findall(r"^\s*[-*] `([a-z0-9-]+)`: .+\(.+\)", text, re.MULTILINE))
+    assert explained == named
+
+
+def test_each_dependency_is_used() -> None:
+    """Nothing is installed for nothing. The imports, or what needs the package where nothing imports it."""
+    modules = {"python-can": "can", "mcap-protobuf-support": "mcap_protobuf", "protobuf": "google"}
+    not_imported = {"msgpack"}  # python-can's udp_multicast interface does not work without it
+    used = {module.partition(".")[0] for path in MODULES for module in imported(path)}
+    for line in PROJECT["project"]["dependencies"]:
+        distribution = re.split("[<>=]", line)[0]
+        assert distribution in not_imported or modules.get(distribution, distribution) in used, distribution
+
+
+def test_every_package_and_data_file_is_installed() -> None:
+    """pyproject.toml lists each package, and a pattern for each file in it that is not Python."""
+    tools = PROJECT["tool"]["setuptools"]
+    folders = {path.parent for path in MODULES if path.name == "__init__.py"}
+    assert sorted(tools["packages"]) == sorted(name(folder).replace("/", ".") for folder in folders)
+    for folder in folders:
+        patterns = tools["package-data"].get(name(folder).replace("/", "."), [])
+        for path in folder.iterdir():
+            if path.is_file() and path.suffix not in {".py", ".pyc"}:
+                assert any(fnmatch.fnmatch(path.name, pattern) for pattern in patterns), f"{name(path)}: not installed"
