@@ -1,0 +1,92 @@
+"""What a check may look at: a run's columns by window and signal, its events, and when its faults began."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from plant.segments import RATE, Array
+from rig import measures
+from rig.measures import NotMeasurable
+
+MAIN = "main"  # the window that is all of the main phase
+MISSING_ALLOWED = 0.01  # of a window; fewer missing samples are bridged by straight lines, and the detail says so
+
+
+class TraceLike(Protocol):
+    """The columns of a run, each (n,) and SI; row k is cycle k of main. Also cor, p12, xs, load. NaN, None: absent."""
+
+    @property
+    def t(self) -> Array: ...
+    @property
+    def com(self) -> Array: ...
+    @property
+    def xj(self) -> Array: ...
+
+
+class EventLike(Protocol):
+    """Something that happened at `t` seconds of the main phase."""
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def text(self) -> str: ...
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that a check may look at: trace, sections, events, and when each fault started (s of main, by label)."""
+
+    trace: TraceLike
+    sections: Mapping[str, slice] = field(default_factory=dict)
+    events: Sequence[EventLike] = ()
+    starts: Mapping[str, float] = field(default_factory=dict)
+
+    def span(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
+        """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""
+        rows = len(self.trace.t)
+        if isinstance(window, tuple):
+            first, last = round(window[0] * RATE), round(window[1] * RATE)
+        elif window == MAIN:
+            first, last = 0, rows
+        elif window in self.sections:
+            first, last = self.sections[window].start, self.sections[window].stop
+        else:
+            raise NotMeasurable(f"there is no section {window!r}")
+        if last > rows:
+            raise NotMeasurable(f"the run ended at {rows / RATE:g} s, the window at {last / RATE:g} s")
+        first += round(skip * RATE)
+        if first >= last:
+            raise NotMeasurable("the window is empty")
+        return slice(first, last)
+
+    def signal(self, name: str, span: slice) -> Array:
+        """A signal's samples in a span, few missing ones bridged; NotMeasurable without it."""
+        if name == "error":
+            return self.signal("com", span) - self.signal("xj", span)
+        if name == "speed":
+            return measures.speed(self.signal("xj", span))
+        column = getattr(self.trace, name, None)
+        if column is None:
+            raise NotMeasurable(f"{name} was not measured")
+        return measures.bridged(np.asarray(column, float)[span], name, MISSING_ALLOWED)
+
+    def missing(self, name: str, span: slice) -> int:
+        """How many samples of a signal were bridged."""
+        column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), None)
+        return 0 if column is None else int(np.isnan(np.asarray(column, float)[span]).sum())
+
+    def step(self, span: slice) -> tuple[Array, Array, float]:
+        """Position and demand in a span, and the demand before it (at the very start: where the ram is)."""
+        position = self.signal("xj", span)
+        return position, self.signal("com", span), float(self.trace.com[span.start - 1] if span.start else position[0])
+
+    def matching(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
+        """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
+        words = set(event.lower().split())
+        found = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))
+        return sorted(found, key=lambda e: e.t)

@@ -1,0 +1,254 @@
+"""A test sequence: what is asked of the actuator, what goes wrong meanwhile, what must be true afterwards. All data.
+
+A sequence is a TOML file (rig/sequences/ has examples): set-up, main and clean-up as lists of segments, the load on the
+ram, faults, checks and guards. Times of loads, faults and checks count from the start of main.
+"""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plant import segments
+from plant.errors import InputError
+from plant.model import meaning
+from plant.profile import Profile, build, parse_columns
+from plant.segments import RATE, Array, Csv, Segment
+from rig import checks, faults, tables
+from rig.checks import Check, ResponseWithin
+from rig.faults import Fault, Parameter, Plan
+from rig.guards import Guard
+from rig.scene import MAIN
+from rig.tables import Place
+
+Known = Callable[[str], object]  # raises InputError for a name that no parameter has
+ReadFile = Callable[[str], bytes]
+
+_KINDS: tables.Kinds = {Segment: segments.KINDS, Fault: faults.KINDS, Check: checks.KINDS}
+_OWN = {"key": False}  # a field that the program fills in
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelChoice:
+    """Which plant to run on: a model's name or file, and parameters that differ from it (SI)."""
+
+    name: str = "eha"
+    overrides: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sequence:
+    """A test as the file describes it, and the text it was read from.
+
+    `load` is made of segments in N and lies over main from its start; after its end the last value stays.
+    """
+
+    title: str
+    description: str = ""
+    setup: tuple[Segment, ...] = ()
+    main: tuple[Segment, ...]
+    cleanup: tuple[Segment, ...] = ()
+    load: tuple[Segment, ...] = ()
+    faults: tuple[Fault, ...] = ()
+    checks: tuple[Check, ...] = ()
+    guards: tuple[Guard, ...] = ()
+    model: ModelChoice = ModelChoice()
+    name: str = field(default="", metadata=_OWN)  # the file's, without folders
+    source: str = field(default="", metadata=_OWN, repr=False)
+    files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV files, by name in source
+
+    @property
+    def duration(self) -> float:
+        """Length of main, s."""
+        return sum(segment.duration for segment in self.main)
+
+    def setup_profile(self) -> Profile:
+        """The command before main, from 0 m."""
+        return build(self.setup)
+
+    def main_profile(self) -> Profile:
+        """The command that is judged, from where set-up ended."""
+        return build(self.main, self.setup_profile().end)
+
+    def cleanup_profile(self, start: float) -> Profile:
+        """The command after main, or after it was broken off at the demand `start` (m)."""
+        return build(self.cleanup, start)
+
+    def sections(self) -> dict[str, slice]:
+        """Rows of main by section name, as checks see them."""
+        return {section.name: slice(section.start, section.stop) for section in self.main_profile().sections}
+
+    def load_profile(self) -> Array:
+        """Force on the ram in N for every cycle of main."""
+        force, _, end = build(self.load)
+        cycles = round(self.duration * RATE)
+        return np.concatenate((force, np.full(cycles - len(force), end)))
+
+    def plan(self, seed: int) -> Plan:
+        """The faults by cycle of the run."""
+        start = round(sum(segment.duration for segment in self.setup) * RATE)
+        return Plan(faults=self.faults, start=start, stop=start + round(self.duration * RATE), seed=seed)
+
+    def fault_starts(self) -> dict[str, float]:
+        """When each fault begins, s of main, by its label."""
+        return {fault.label: fault.start for fault in self.faults}
+
+    def bundle(self) -> dict[str, bytes]:
+        """The text and the CSV files it uses, by name: all that `from_bundle` needs to make the same sequence."""
+        return {self.name: self.source.encode(), **self.files}
+
+    @classmethod
+    def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = meaning) -> Sequence:
+        """The sequence of a bundle; raises InputError if a file is not in it or does not make one."""
+        names = [name for name in bundle if name.endswith(".toml")]
+        if len(names) != 1:
+            raise InputError("bundle", "", f"one .toml file, not {len(names)}")
+
+        def read_file(name: str) -> bytes:
+            if name not in bundle:
+                raise InputError("bundle", name, "to be part of the bundle")
+            return bundle[name]
+
+        return parse_sequence(bundle[names[0]].decode(), names[0], read_file, known)
+
+
+def load_sequence(name_or_path: str | Path, known: Known = meaning) -> Sequence:
+    """Read a sequence: a TOML file, or the name of one that comes with the rig.
+
+    Args:
+        name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV files in it are sought beside it.
+        known: raises InputError for the name of a parameter that does not exist.
+
+    Raises:
+        InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
+    """
+    entries = {entry.name: entry for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml")}
+    shipped = {Path(name).stem: name for name in entries}
+    if str(name_or_path) in shipped:
+        name = shipped[str(name_or_path)]
+        return parse_sequence(entries[name].read_text(encoding="utf-8"), name, _read_beside(Path()), known)
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        raise InputError(name_or_path, "", f"a .toml file, or {tables.one_of(str(name_or_path), shipped)}")
+    read_file = _read_beside(path.parent)
+    try:
+        text = read_file(path.name).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "text in UTF-8") from error
+    return parse_sequence(text, str(path), read_file, known)
+
+
+def _read_beside(folder: Path) -> ReadFile:
+    def read_file(name: str) -> bytes:
+        try:
+            return (folder / name).read_bytes()
+        except OSError as error:
+            raise InputError(folder / name, "", f"a file that can be read ({error.strerror})") from error
+
+    return read_file
+
+
+def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = meaning) -> Sequence:
+    """The sequence of a TOML text; `read_file` gives the bytes of the CSV files that it names."""
+    table, place = tables.parse(text, name)
+    sequence = tables.read(Sequence, table, place, _KINDS)
+    sequence = replace(sequence, name=Path(name).name, source=text)
+    for phase in ("setup", "main", "cleanup", "load"):
+        sequence = _with_csv(sequence, phase, place.at(phase), read_file)
+    _check_phases(sequence, place)
+    _check_faults(sequence, place.at("faults"))
+    _check_parameters(sequence, place, known)
+    _check_checks(sequence, place.at("checks"))
+    return sequence
+
+
+def _with_csv(sequence: Sequence, phase: str, place: Place, read_file: ReadFile) -> Sequence:
+    """The sequence with the CSV segments of one phase filled in from their files."""
+    found: list[Segment] = []
+    embedded = dict(sequence.files)
+    for i, segment in enumerate(getattr(sequence, phase)):
+        if isinstance(segment, Csv):
+            here = place.at(i, "file")
+            try:
+                embedded[segment.file] = embedded.get(segment.file) or read_file(segment.file)
+                columns = parse_columns(embedded[segment.file], segment.file)
+            except InputError as error:
+                raise here.refuse(f"a readable command file; {error}") from error
+            values = columns.get("value" if phase == "load" or "com" not in columns else "com")
+            if values is None:
+                raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else 'com'}")
+            segment = replace(segment, values=tuple(values.tolist()))
+        found.append(segment)
+    filled: Any = {phase: tuple(found)}
+    return replace(sequence, files=embedded, **filled)
+
+
+def _check_phases(sequence: Sequence, place: Place) -> None:
+    for phase in ("setup", "main", "cleanup", "load"):
+        try:
+            build(getattr(sequence, phase))
+        except InputError as error:
+            raise place.at(phase).refuse(error.expected) from error
+    if not sequence.main:
+        raise place.at("main").refuse("at least one segment")
+    length = sum(segment.duration for segment in sequence.load)
+    if round(length * RATE) > round(sequence.duration * RATE):
+        raise place.at("load").refuse(f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
+    if any(name == MAIN for name in sequence.sections()):
+        raise place.at("main").refuse(f"section names other than {MAIN!r}, which is all of it")
+
+
+def _check_faults(sequence: Sequence, place: Place) -> None:
+    """Each begins within main, and no two change one parameter at the same time."""
+    plan = sequence.plan(0)
+    taken: dict[str, list[tuple[int, int]]] = {}
+    for i, fault in enumerate(sequence.faults):
+        if fault.start >= sequence.duration:
+            raise place.at(i, "start").refuse(f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
+        if isinstance(fault, Parameter):
+            first, last = plan.cycles(fault)
+            others = taken.setdefault(fault.parameter, [])
+            if any(first < b and a < last for a, b in others):
+                raise place.at(i, "start").refuse(f"a time when no other fault changes {fault.parameter}")
+            others.append((first, last))
+
+
+def _check_parameters(sequence: Sequence, place: Place, known: Known) -> None:
+    """Names must exist. If `known` says what a name means (plant.model.meaning does), values are tried as well."""
+    named: list[tuple[Place, Place, str, float]] = []
+    for name, value in sequence.model.overrides.items():
+        here = place.at("model", "overrides", *name.split("."))  # where `overrides.spool.travel` stands in the file
+        here = here if here.keys in place.lines else place.at("model", "overrides", name)
+        named.append((here, here, name, value))
+    for i, fault in enumerate(sequence.faults):
+        if isinstance(fault, Parameter):
+            here = place.at("faults", i)
+            named.append((here.at("parameter"), here.at("value"), fault.parameter, fault.value))
+    for name_place, value_place, name, value in named:
+        try:
+            quantity: Any = known(name)
+        except InputError as error:
+            raise name_place.refuse(f"{error.expected}, not {name!r}") from error
+        if hasattr(quantity, "refuses") and quantity.refuses(value):
+            raise value_place.refuse(f"{quantity.expected}, not {value:g}")
+
+
+def _check_checks(sequence: Sequence, place: Place) -> None:
+    """Windows and faults that checks point at must be there; names are the lines of a table and must differ."""
+    sections, labels = sequence.sections(), Counter(fault.label for fault in sequence.faults)
+    names = Counter(check.name for check in sequence.checks)
+    for i, check in enumerate(sequence.checks):
+        if names[check.name] > 1:
+            raise place.at(i, "name").refuse(f"a name used once, not {names[check.name]} times {check.name!r}")
+        window = check.window
+        if isinstance(window, str) and window != MAIN and window not in sections:
+            raise place.at(i, "window").refuse(f"a section: {tables.one_of(window, [MAIN, *sections])}")
+        if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / RATE:
+            raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
+        if isinstance(check, ResponseWithin) and isinstance(check.after, str) and labels[check.after] != 1:
+            raise place.at(i, "after").refuse(f"a time or one fault: {tables.one_of(check.after, labels)}")
