@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from rig import lateness
+from rig import bus, lateness
 
 Status = Literal["ok", "limited", "missing"]
 LOG_BYTES_PER_S = 500e3  # raw frames, signals and timing of a 1 kHz run, compressed
@@ -89,27 +89,6 @@ def python() -> Iterator[Finding]:
         yield finding._replace(found="missing: " + ", ".join(absent)) if absent else finding
 
 
-def can_interfaces() -> dict[str, bool]:
-    """CAN network interfaces of this kernel, and whether each is up."""
-    found = {}
-    for folder in sorted(Path("/sys/class/net").glob("*")):
-        try:
-            if int((folder / "type").read_text()) == 280:  # ARPHRD_CAN
-                found[folder.name] = bool(int((folder / "flags").read_text(), 16) & 1)  # IFF_UP
-        except (OSError, ValueError):
-            continue
-    return found
-
-
-def kernel_has_can() -> bool:
-    """True if this kernel can open a raw CAN socket."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (OSError, AttributeError):
-        return False
-    return True
-
-
 def multicast_works(group: str = "239.74.163.2", port: int = 43113) -> bool:
     """True if a datagram sent to a multicast group on the loopback interface comes back."""
     local = socket.inet_aton("127.0.0.1")
@@ -134,21 +113,21 @@ def can() -> Iterator[Finding]:
     multicast = "multicast on lo" if multicast_works() else ""
     remedy = "ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo"
     yield _finding("bus", "udp_multicast", multicast, "nodes in processes of their own, without CAN", remedy)
-    kernel = kernel_has_can()
-    remedy = "a kernel with CONFIG_CAN, CONFIG_CAN_RAW, CONFIG_CAN_VCAN"
-    yield _finding("bus", "CAN in the kernel", "AF_CAN" if kernel else "", "socketcan: real and virtual CAN", remedy)
-    interfaces = can_interfaces()
-    up = [name for name, is_up in interfaces.items() if is_up]
-    if not kernel:
-        remedy = "CAN in the kernel first (the tests use the guest)"
-    elif interfaces:
-        remedy = f"ip link set {next(iter(interfaces))} up"
-    else:
-        remedy = "modprobe vcan; ip link add dev vcan0 type vcan; ip link set vcan0 up"
-    yield _finding("bus", "CAN interface", ", ".join(up), "rig run --bus socketcan:vcan0, or hardware", remedy)
+    yield _finding("bus", "CAN in the kernel", _af_can(), "socketcan: real and virtual CAN", "a kernel with CONFIG_CAN")
+    up = ", ".join(bus.can_interfaces())
+    remedy = bus.socketcan_problem("vcan0")
+    yield _finding("bus", "CAN interface", up, "rig run --bus socketcan:vcan0, or hardware", remedy)
     absent = [package for tool, package in GUEST_TOOLS.items() if shutil.which(tool, path=_PATH) is None]
     guest = "" if absent else "User-Mode Linux with a vcan0"
     yield _finding("bus", "CAN guest", guest, "the socketcan tests on a kernel without CAN", _apt(" ".join(absent)))
+
+
+def _af_can() -> str:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError):
+        return ""
+    return "AF_CAN"
 
 
 _PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  # users seldom have the last three

@@ -49,6 +49,7 @@ CLOCK_FILES = (
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
+    "plant.effects": {"CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"},
     "rig.device": {
         "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
     },

@@ -29,6 +29,8 @@ from plant.quantity import Quantity, quantities
 from plant.state import Memory, Ports
 from plant.step import through
 
+__all__ = ["CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"]
+
 Law = Function
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 import functools
 import os
 import shutil
-import socket
 import subprocess
 from pathlib import Path
+
+from rig.bus import socketcan_problem
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent.parent
@@ -18,12 +19,7 @@ REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1"  # then nothing about v
 @functools.cache
 def kernel_has_vcan0() -> bool:
     """True if vcan0 is there and up in this very kernel. Nothing is sent: somebody may be using it."""
-    try:
-        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
-            can.bind(("vcan0",))
-        return bool(int(Path("/sys/class/net/vcan0/flags").read_text(), 16) & 1)  # IFF_UP
-    except (OSError, AttributeError):
-        return False
+    return not socketcan_problem("vcan0")
 
 
 @functools.cache
