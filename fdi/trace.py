@@ -125,6 +125,12 @@ class Trace:
             return _from_csv(path)
         raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
 
+    @classmethod
+    def of(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
+        """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
+        grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
+        return _trace(grid, period, [], provenance=dict(provenance))
+
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the columns that hold at least one sample, t aside."""

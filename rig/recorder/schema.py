@@ -12,12 +12,12 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
-from typing import Any, NewType, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Fd
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-U32 = NewType("U32", int)  # fixed32
+U32 = Annotated[int, "fixed32"]
 
 _WIRE: dict[object, tuple[Fd.Type.ValueType, int, str]] = {  # type -> protobuf type, wire type, struct code
     float: (Fd.TYPE_DOUBLE, 1, "d"),
@@ -115,7 +115,7 @@ def schema_bytes(record: type) -> bytes:
     files = FileDescriptorSet()
     file = files.file.add(name=f"eha/{record.__name__}.proto", package="eha", syntax="proto3")
     message = file.message_type.add(name=record.__name__)
-    hints = get_type_hints(record)
+    hints = get_type_hints(record, include_extras=True)
     for number, item in enumerate(fields(record), 1):
         message.field.add(name=item.name, number=number, type=_WIRE[hints[item.name]][0], label=Fd.LABEL_OPTIONAL)
     return files.SerializeToString(deterministic=True)
@@ -136,7 +136,7 @@ def packer(record: type) -> Callable[[int, Any], bytes]:
 
     `values` of a frame is the Frame itself (t_ns, cob_id, data), which saves an object per frame.
     """
-    hints = get_type_hints(record)
+    hints = get_type_hints(record, include_extras=True)
     layout, args = _HEAD, [_MESSAGE, 0, CHANNELS[record], 0, 0, 0]
     blobs: list[tuple[str, bytes]] = []
     for number, item in enumerate(fields(record), 1):

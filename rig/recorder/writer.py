@@ -107,6 +107,11 @@ class Recorder:
         """Add names and values known only later, such as the verdict."""
         self._queue.append((0, (name, dict(values))))
 
+    @property
+    def waiting(self) -> int:
+        """Records not yet packed."""
+        return len(self._queue)
+
     def close(self) -> None:
         """Write all that is queued, the indexes and statistics. Safe to call again."""
         self._stop.set()

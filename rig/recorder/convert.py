@@ -1,0 +1,217 @@
+"""Other formats to and from a log: CSV of the signals; raw frames as candump .log, Vector .blf/.asc or PEAK .trc."""
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fdi.log import open_log
+from fdi.trace import Trace
+from plant.errors import InputError
+from rig import codec
+from rig.device.nmt import NmtState as State
+from rig.frame import Frame
+from rig.recorder.provenance import provenance
+from rig.recorder.schema import Event, NmtState, Record, Signals
+from rig.recorder.writer import Recorder
+
+RAW = (".log", ".blf", ".asc", ".trc")
+NAN = math.nan
+
+
+def export(source: Path, out: Path, everything: bool = False) -> int:
+    """Write a trace as the suffix of `out` says: .csv, .csv.gz: the signals; .log, .blf, .asc, .trc: the raw frames.
+
+    `everything`: signals of set-up and clean-up too; raw frames are always all of them. -> rows or frames written.
+    Raises InputError for another suffix, and for a trace without raw frames.
+    """
+    if out.name.endswith((".csv", ".csv.gz")):
+        trace = Trace.read(source, all=everything)
+        trace.write_csv(out)
+        return len(trace)
+    if out.suffix not in RAW:
+        raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW)}")
+    import can
+
+    path = source / "trace.mcap" if source.is_dir() else source
+    if path.suffix != ".mcap":
+        raise InputError(path, "", "a log with raw frames (.mcap)")
+    count = 0
+    try:
+        with can.Logger(out) as writer:
+            for frame in frames(path):
+                writer(can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.cob_id, data=frame.data,
+                                   is_extended_id=False, channel="can0" if out.suffix == ".log" else 0))
+                count += 1
+    except OSError as error:
+        raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
+    if not count:
+        out.unlink()
+        raise InputError(path, "/can", "at least one raw frame")
+    return count
+
+
+def frames(path: Path) -> Iterator[Frame]:
+    """The raw frames of a log."""
+    for _, t_ns, message in open_log(path).messages("/can"):
+        yield Frame(t_ns, message.cob_id, message.data)
+
+
+def import_csv(source: Path, out: Path) -> int:
+    """Make a log with signals only from a CSV trace; -> cycles."""
+    trace = Trace.read(source)
+    write_mcap(trace, out, provenance(imported=source.name, period=trace.period, pace="imported"))
+    return len(trace)
+
+
+def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = None) -> None:
+    """Write a trace's signals as a log; `metadata` is its own provenance by default."""
+    given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
+    recorder = Recorder(_mcap(out), {n: ("application/octet-stream", d) for n, d in trace.attachments.items()}, given)
+    columns = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
+    for k, (phase, *values) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+        if not all(math.isnan(value) for value in values):
+            com, xj, cor, p12, xs, load = values
+            recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
+            _wait(recorder, k)
+    recorder.close()
+
+
+def import_frames(source: Path, out: Path, dbc: Path) -> int:
+    """Make a log from raw frames, decoded by `dbc` and cut into cycles at each SYNC; -> cycles.
+
+    Row k holds the demand sent before SYNC k, what the plant sensed at it and the drive frame that echoes its number.
+    Raises InputError for a file or DBC that cannot be read, and when there is no SYNC in it.
+    """
+    raw = list(_read_frames(source))
+    cycles = _Cycles(_decoder(dbc))
+    records = [(frame.t_ns, record) for frame in raw for record in cycles.feed(frame)]
+    if not cycles.rows:
+        raise InputError(source, "", f"at least one SYNC frame (0x{codec.SYNC:03X})")
+    spans = [b[0] - a[0] for a, b in zip(cycles.rows, cycles.rows[1:], strict=False)]
+    period = round(sorted(spans)[len(spans) // 2] / 1e9, 4) if spans else 1e-3
+    recorder = Recorder(_mcap(out), {dbc.name: ("text/plain", dbc.read_bytes())},
+                        provenance(imported=source.name, period=period, pace="imported"))
+    items: list[tuple[int, Frame | Record]] = [(f.t_ns, f) for f in raw]
+    items += [*cycles.rows, *records]
+    for k, (t_ns, item) in enumerate(sorted(items, key=lambda pair: pair[0])):
+        if isinstance(item, Frame):
+            recorder.frame(item)
+        else:
+            recorder.put(t_ns, item)
+        _wait(recorder, k)
+    recorder.close()
+    return len(cycles.rows)
+
+
+class _Cycles:
+    """Frames in, one Signals a SYNC out; heartbeats and emergencies become records on the way."""
+
+    def __init__(self, decode: dict[int, Any]) -> None:
+        self.rows: list[tuple[int, Signals]] = []
+        self._decode = decode
+        self._demand, self._control = NAN, 0
+        self._sent: int | None = None  # cycle of the command since the last SYNC
+        self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
+        self._nmt: dict[int, int] = {}
+
+    def feed(self, frame: Frame) -> Iterable[Record]:
+        """Take a frame; -> what is to be recorded besides rows."""
+        cob_id, node = frame.cob_id, frame.cob_id & 0x7F
+        if cob_id == codec.SYNC:
+            self._open(frame.t_ns)
+        elif cob_id in self._decode:
+            message = self._decode[cob_id]
+            if len(frame.data) < message.length:
+                return [Event("WARN", "frame", f"0x{cob_id:03X}: {len(frame.data)} bytes instead of {message.length}")]
+            self._signals(cob_id, message.decode(frame.data, decode_choices=False))
+        elif 0x700 < cob_id < 0x780 and len(frame.data) == 1 and self._nmt.get(node) != frame.data[0]:
+            self._nmt[node] = frame.data[0]
+            return [NmtState(node, frame.data[0], _state_name(frame.data[0]))]
+        elif codec.SYNC < cob_id < 0x100 and len(frame.data) == 8:
+            code = int.from_bytes(frame.data[:2], "little")
+            return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
+        return []
+
+    def _open(self, t_ns: int) -> None:
+        cycle, expected = (self.rows[-1][1].cycle + 1, self._recent[-1][0] + 1) if self.rows else (0, 0)
+        sent = expected if self._sent is None else self._sent
+        skipped = (sent - expected) & 0xFFFF if self.rows else 0
+        cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
+        row = Signals(cycle, 1, self._demand, NAN, NAN, NAN, NAN, NAN, self._control, 0, 0)
+        self.rows.append((t_ns, row))
+        self._recent.append((sent & 0xFFFF, row))
+        self._sent = None
+
+    def _signals(self, cob_id: int, values: dict[str, Any]) -> None:
+        if cob_id == codec.COMMAND:
+            self._demand, self._control = values["position_demand"], values["control_word"]
+            self._sent = values["cycle"]
+        elif cob_id == codec.FEEDBACK and self.rows:
+            self.rows[-1][1].xj, self.rows[-1][1].p12 = values["ram_position"], values["load_pressure"]
+        elif cob_id == codec.VALVE_STATE and self.rows:
+            self.rows[-1][1].xs, self.rows[-1][1].flags = values["spool_position"], values["flags"]
+        elif cob_id == codec.DRIVE:
+            for sent, row in self._recent:
+                if sent == values["cycle"]:
+                    row.cor, row.status = values["current"], values["status_word"]
+
+
+def _state_name(code: int) -> str:
+    try:
+        return State(code).name.lower().replace("_", "-")
+    except ValueError:
+        return f"state {code}"
+
+
+def _read_frames(source: Path) -> Iterator[Frame]:
+    import can
+
+    first = None
+    try:
+        with can.LogReader(source) as reader:
+            for message in reader:
+                if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
+                    continue
+                first = message.timestamp if first is None else first
+                t_ns = max(0, round((message.timestamp - first) * 1e9))
+                yield Frame(t_ns, message.arbitration_id, bytes(message.data))
+    except OSError as error:
+        raise InputError(source, "", f"a readable file ({error.strerror})") from error
+    except (ValueError, IndexError, can.CanError) as error:
+        raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
+
+
+def _decoder(dbc: Path) -> dict[int, Any]:
+    import cantools
+
+    try:
+        base = cantools.database.load_file(str(dbc), database_format="dbc")
+    except OSError as error:
+        raise InputError(dbc, "--dbc", f"a readable file ({error.strerror})") from error
+    except cantools.Error as error:
+        raise InputError(dbc, "--dbc", f"a DBC file ({str(error).splitlines()[0]})") from error
+    found = {m.frame_id: m for m in base.messages}  # type: ignore[union-attr]
+    wanted: dict[int, set[str]] = {}
+    for signal in codec.SIGNALS:
+        wanted.setdefault(signal.cob_id, set()).add(signal.name)
+    for cob_id, names in wanted.items():
+        if cob_id not in found or not names <= {s.name for s in found[cob_id].signals}:
+            raise InputError(dbc, f"frame 0x{cob_id:03X}", f"the signals {', '.join(sorted(names))}")
+    return {cob_id: found[cob_id] for cob_id in wanted}
+
+
+def _mcap(out: Path) -> Path:
+    if out.suffix != ".mcap":
+        raise InputError(out, "--out", "a name that ends in .mcap")
+    return out
+
+
+def _wait(recorder: Recorder, item: int) -> None:
+    """Let the writer keep up: here nothing paces the loop."""
+    if item % 10_000 == 0:
+        while recorder.waiting > 100_000:
+            time.sleep(0.01)
