@@ -48,7 +48,7 @@ def interpreted(function: Function, ports: Mapping[str, Function] | None = None)
 def compiled(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
     root = _link(function, ports or {}, lambda f: f)
-    linked = _link(function, ports or {}, lambda f: numba.njit(f, error_model="numpy"))
+    linked = _link(function, ports or {}, lambda f: numba.njit(f, error_model="numpy", forceinline=True))
     plain = rebind(linked.py_func)
     settings: Any = numba.config
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))

@@ -5,6 +5,8 @@ within the static level; one that moves is resisted by the dynamic level and sto
 """
 from __future__ import annotations
 
+from math import inf
+
 
 def clip(x: float, limit: float) -> float:
     """`x` within +-`limit`, as two selects."""
@@ -35,8 +37,12 @@ def slide(v0: float, impulse: float, push: float, line: float, slope: float, lim
         free: 1/(m + h c), one over the body's effective mass at the limit, 1/kg.
         coupled: 1/(m + h c + h A s), the same on the sloping part, 1/kg.
     """
-    v = soften(impulse + push * line, dry) * coupled
+    # the factors that do not wait for `line` are multiplied among themselves: the step is as long as its chain
+    v = soften(coupled * impulse + coupled * push * line, coupled * dry)
     wanted = line - slope * v
     held = clip(wanted, limit)
     v = v if held == wanted else soften(impulse + push * held, dry) * free
-    return 0.0 if v * v0 < 0.0 else v
+    # no further than zero; the bounds depend on v0 alone, so that only two selects wait for v
+    low, high = 0.0 if v0 > 0.0 else -inf, 0.0 if v0 < 0.0 else inf
+    v = v if v > low else low
+    return v if v < high else high

@@ -86,9 +86,8 @@ supplied = steady_supply
 
 def travel(x0: float, v0: float, v: float, h: float, limit: float) -> tuple[float, float]:
     """Position and velocity after a step at the mean velocity, between inelastic stops at +-`limit`."""
-    x = x0 + 0.5 * h * (v0 + v)
-    held = clip(x, limit)
-    return held, v if held == x else 0.0
+    x = (x0 + 0.5 * h * v0) + 0.5 * h * v
+    return clip(x, limit), v if abs(x) <= limit else 0.0
 
 
 def flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory, Memory]:
@@ -96,8 +95,9 @@ def flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, 
     current, m_current = at_current(u.current, s.memory.current, s, u, p)
     ahead = s.spool_position + 0.5 * u.h * s.spool_speed
     spring, m_feedback = at_feedback(ahead, s.memory.feedback, s, u, p)
-    torque = p.torque_motor.gain * current - p.feedback_spring.stiffness * spring  # Tact
-    v = k.flapper_keep * s.flapper_speed + k.flapper_push * (torque - p.flapper.stiffness * s.flapper_position)
+    own = p.torque_motor.gain * current - p.flapper.stiffness * s.flapper_position
+    torque = own - p.feedback_spring.stiffness * spring  # Tact - KF XF; the spool's part last, it is known last
+    v = k.flapper_keep * s.flapper_speed + k.flapper_push * torque
     x, v = travel(s.flapper_position, s.flapper_speed, v, u.h, p.flapper.travel)
     return x, v, m_current, m_feedback
 
