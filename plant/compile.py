@@ -1,9 +1,9 @@
 """Plain Python physics made fast: the only file that knows numba.
 
-The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls, puts
-the model's effects in place of the port functions, and compiles the lot as one. The result is kept on disk under
-a hash of all the sources that went in, so a changed effect is never served by stale code: numba's own cache looks at one
-file only.
+The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls,
+puts the model's effects in place of the port functions, and compiles the lot as one, inlined: a call that passes the
+state through memory costs as much as the step. The result is kept on disk under a hash of all the sources that went in,
+so a changed effect is never served by stale code: numba's own cache looks at one file only.
 """
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import solve
+from plant import flat, solve
 from plant import step as step_module
 from plant.compile import Function, compiled, interpreted
 from plant.effects import CATALOGUE, Effect, at
@@ -87,6 +87,10 @@ class Model:
             lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
         return "\n".join(lines) + "\n"
 
+    def names(self) -> list[str]:
+        """The parameters "group.field", in the order of `record`."""
+        return [f"{group}.{f}" for group, cls in known_groups(self.effects).items() for f in cls._fields]
+
     def record(self) -> NDArray[Any]:
         """The values as a one-row record array, fields group.field: what compiled code reads, live."""
         groups = known_groups(self.effects)
@@ -96,7 +100,7 @@ class Model:
 
     def state(self) -> State:
         """The centred actuator at rest, with the memory of this model's effects."""
-        return State(memory=Ports(*(at(port, self.effects)[1] for port in Ports._fields)))
+        return initial(self.effects)
 
 
 def load_model(source: str | Path = "eha") -> Model:
@@ -137,6 +141,11 @@ def entry(name: str) -> Effect:
     return CATALOGUE[name]
 
 
+def initial(effects: tuple[str, ...]) -> State:
+    """The actuator at rest with the memory of `effects`."""
+    return State(memory=Ports(*(at(port, effects)[1] for port in Ports._fields)))
+
+
 def kernel(name: str, effects: tuple[str, ...], fast: bool = True) -> Function:
     """The function `plant.solve.<name>` for a model with `effects`, compiled once per set, or interpreted."""
     laws = tuple(CATALOGUE[e].function for e in effects)
@@ -146,6 +155,7 @@ def kernel(name: str, effects: tuple[str, ...], fast: bool = True) -> Function:
 @cache
 def _kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool) -> Function:
     ports = {f"at_{port}": at(port, effects)[0] for port in Ports._fields}
+    ports["pack"], ports["unpack"] = flat.packers(initial(effects))
     if any(CATALOGUE[e].port == "supply" for e in effects):
         ports["supplied"] = step_module.changing_supply
     return (compiled if fast else interpreted)(getattr(solve, name), ports)

@@ -1,17 +1,21 @@
 """The plant as programs use it: one cycle at a time (`Actuator`), or a whole command at once (`simulate`)."""
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
+from plant.flat import packers, values
 from plant.model import STEPS, Model, kernel
 from plant.solve import NOISES
 from plant.state import State
 
 Array = NDArray[np.float64]
+DRAWN = 64  # cycles of noise at a time: 10 us once in 64 cycles
+SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
 
 
 class Columns(NamedTuple):
@@ -29,6 +33,13 @@ class Columns(NamedTuple):
 def noise(seed: int, cycles: int) -> Array:
     """The random numbers of a run, (cycles, NOISES) standard normal: the same for a bench run and a simulation."""
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
+
+
+def draws(seed: int) -> Iterator[list[float]]:
+    """The rows of `noise`, without end; a few at a time, which costs a tenth of one by one."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from rng.standard_normal((DRAWN, NOISES)).tolist()
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
@@ -63,32 +74,47 @@ class Actuator:
 
     def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
         self.model, self.steps = model, steps
-        self.state: State = model.state()
         self.cycle = 0
+        self._flat = np.array(values(model.state()))
+        self._unpack = packers(model.state())[1]
         self._record = model.record()
-        self._rng = np.random.default_rng(seed)
+        self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
+        self._index = {name: i for i, name in enumerate(model.names())}
+        self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
+        self._draws = draws(seed)
         self._noise = [0.0] * NOISES
-        self._advance = kernel("cycle", model.effects, fast)
-        self._sensors, self._period = self._record[0].sensors, model["controller.period"]
+        self._advance = kernel("advance", model.effects, fast)
+        self._period = model["controller.period"]
+
+    @property
+    def state(self) -> State:
+        """The plant now."""
+        return cast(State, self._unpack(self._flat.tolist()))
 
     def warm(self) -> None:
         """Compile now, so that the first cycle is not late."""
-        self._advance(self.state, 0.0, 0.0, 0.0, 0.0, self._record, 0)
+        self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
 
     def sample(self) -> tuple[float, float, float]:
         """What the transducers read now: XJ m, P12 Pa, XS m. Once a cycle: it draws the cycle's noise."""
-        n = self._noise = self._rng.standard_normal(NOISES).tolist()
-        s, g = self.state, self._sensors
-        return (s.sensed + float(g.position_noise) * n[0], s.pressure + float(g.pressure_noise) * n[1],
-                s.spool_position + float(g.spool_noise) * n[2])
+        n = self._noise = next(self._draws)
+        level, state = self._live.item, self._flat.item
+        position, pressure, spool = self._levels
+        return (state(SENSED) + level(position) * n[0], state(PRESSURE) + level(pressure) * n[1],
+                state(SPOOL) + level(spool) * n[2])
 
     def advance(self, current: float, load: float = 0.0) -> None:
         """One cycle with `current` A in the torque motor and `load` N on the ram."""
         t = self.cycle * self._period
-        self.state = self._advance(self.state, current, load, self._noise[3], t, self._record, self.steps)
+        self._advance(self._flat, current, load, self._noise[3], t, self._record, self.steps)
         self.cycle += 1
 
     def set(self, name: str, value: float) -> None:
-        """Change the parameter "group.field" of the running plant; its effect must be in the model."""
-        group, _, field = name.partition(".")
-        setattr(self._record[0][group], field, value)
+        """Change the parameter "group.field" of the running plant; its effect must be in the model.
+
+        Raises:
+            InputError: the running model has no such parameter.
+        """
+        if name not in self._index:
+            raise InputError("set", name, f"a parameter of the running model ({self.model.name})")
+        self._live[self._index[name]] = value

@@ -1,8 +1,8 @@
 """One step of the reference model (Fig. 5 of the paper) in three parts: coefficients, servovalve, jack.
 
 Stiff terms are implicit: the pressure-flow damping has time constants of 3 us and 22 us, and dry friction is a set.
-Positions follow the mean of the old and the new velocity, the flapper the trapezoidal rule with the spool where it will be
-in mid step. That leaves 1/170 of the error of the plain implicit scheme at 10 us, for 8 % more time.
+Positions follow the mean of the old and the new velocity, the flapper the trapezoidal rule with the spool where it
+will be in mid step. That leaves 1/170 of the error of the plain implicit scheme at 10 us, for 8 % more time.
 
 Names in capitals in the comments are the paper's symbols; functions named `at_<port>` are bound to the model's effects.
 """

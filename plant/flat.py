@@ -1,0 +1,57 @@
+"""The plant's state as a flat array of floats and back: nested tuples for the physics, one buffer for whoever keeps it.
+
+The state of a model with effects nests their memories. `packers` writes the two conversions out as plain assignments,
+so that compiled code moves numbers between registers and the buffer and nothing else.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+from plant.compile import Function
+from plant.state import Memory, Ports, State
+
+
+def packers(state: State) -> tuple[Function, Function]:
+    """`pack(state, array)` and `unpack(array) -> state` for states shaped as `state`."""
+    kinds: dict[str, type[Any]] = {}
+    paths: list[str] = []
+    built = _built(state, "s", kinds, paths)
+    stores = [f"    a[{i}] = {path}" for i, path in enumerate(paths)]
+    source = "\n".join(["def pack(s, a):", *stores, "def unpack(a):", f"    return {built}"])
+    made: dict[str, Any] = dict(kinds)
+    exec(source, made)
+    return made["pack"], made["unpack"]
+
+
+def values(state: State) -> list[float]:
+    """The numbers of `state` in the order of the array: the fields of `State` first, then what effects remember."""
+    array: dict[int, float] = {}
+    packers(state)[0](state, array)
+    return [float(x) for x in array.values()]
+
+
+def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str]) -> str:
+    """The expression that builds `x` from the array `a`; notes the tuple types it needs and the path to each number."""
+    if not isinstance(x, tuple):
+        paths.append(path)
+        return f"a[{len(paths) - 1}]"
+    named = getattr(x, "_fields", None)
+    parts = [(part, f"{path}.{named[i]}" if named else f"{path}[{i}]") for i, part in enumerate(x)]
+    # a bare number among ports or effects says that nothing is remembered there
+    bare = isinstance(x, Ports) or not named
+    inner = ["0.0" if bare and not isinstance(part, tuple) else _built(part, p, kinds, paths) for part, p in parts]
+    if not named:
+        return f"({', '.join(inner)},)"
+    kind = f"T{len(kinds)}"
+    kinds[kind] = type(x)
+    return f"{kind}({', '.join(inner)})"
+
+
+def pack(s: State, a: Any) -> None:
+    """Write `s` into the array `a` (bound to a model's own)."""
+    raise NotImplementedError
+
+
+def unpack(a: Any) -> Any:
+    """The state that the array `a` holds (bound to a model's own)."""
+    raise NotImplementedError
