@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import random
+import time
 
 import pytest
 from rack import MS, Rack
@@ -183,8 +184,6 @@ def test_what_is_not_8_bytes_is_no_sdo(request_: str) -> None:
 
 def test_time_of_a_scenario_is_a_few_milliseconds() -> None:
     """6 kB, some 900 segments: must not hold up the start of a run (bound with a wide margin, 20 us a segment)."""
-    import time
-
     rack = Rack(3)
     begin = time.perf_counter_ns()
     download(rack, "102200", bytes(6000))
