@@ -45,6 +45,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "rig/clock.py", "rig/loop.py", "rig/link.py", "rig/bus.py", "rig/lateness.py", "rig/commands/",
     "rig/recorder/",  # its thread must close a chunk in time
+    "rig/viewer.py",  # waits for the viewer to come up
 )
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
