@@ -18,6 +18,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent.parent
 BUS = "socketcan:vcan0"
+RUN_LIMIT_S = 300
 RIG = Path(sys.executable).with_name("rig")
 
 
@@ -26,6 +27,15 @@ def bus_tests(out: Path) -> int:
     files = sorted(str(path) for path in TESTS.glob("test_*.py") if "bus_kind" in path.read_text())
     words = ["-m", "pytest", *files, "-k", "socketcan", f"--junitxml={out / 'bus.xml'}", "-p", "no:cacheprovider"]
     return subprocess.run([sys.executable, *words, f"--basetemp={out / 'tmp'}"], cwd=TESTS.parent).returncode
+
+
+def finish(process: subprocess.Popen[bytes], seconds: float) -> int:
+    """Wait for a process, kill it when the time is over; its status."""
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 @contextlib.contextmanager
@@ -38,11 +48,7 @@ def background(out: Path, name: str, *command: str | Path) -> Iterator[subproces
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            finish(process, 20)
 
 
 def preflight(out: Path) -> int:
@@ -57,14 +63,15 @@ def preflight(out: Path) -> int:
         with (out / "run.json").open("wb") as answer, (out / "run.log").open("wb") as log:
             begin = time.monotonic()
             words += ["--json", "--out", str(out / "run")]
-            run = subprocess.run([RIG, *words], stdout=answer, stderr=log, stdin=subprocess.DEVNULL)
+            run = subprocess.Popen([RIG, *words], stdout=answer, stderr=log, stdin=subprocess.DEVNULL)
+            status = finish(run, RUN_LIMIT_S)
             seconds = time.monotonic() - begin
         alive = {name: process.poll() for name, process in nodes.items()}
         time.sleep(0.5)  # the last frames still go to candump
     ended = {name: process.returncode for name, process in nodes.items()}
-    facts = {"status": run.returncode, "seconds": seconds, "before_interrupt": alive, "after_interrupt": ended}
+    facts = {"status": status, "seconds": seconds, "before_interrupt": alive, "after_interrupt": ended}
     (out / "facts.json").write_text(json.dumps(facts))
-    return run.returncode
+    return status
 
 
 def main() -> int:
