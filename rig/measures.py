@@ -12,6 +12,7 @@ import numpy as np
 from plant.segments import RATE, Array
 
 MEDIAN = 5  # samples
+SMALLEST_STEP = 20e-6  # m, ten times the noise
 SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
 
 
@@ -54,7 +55,7 @@ def speed(position: Array) -> Array:
 def step_size(com: Array, before: float) -> float:
     """What a step section asks for; NotMeasurable if it has no step at its start or moves on later."""
     size = float(com[-1] - before)
-    if size == 0 or np.abs(com - com[-1]).max() > 1e-9:
+    if abs(size) < SMALLEST_STEP or np.abs(com - com[-1]).max() > 1e-9:
         raise NotMeasurable("the command does not step here and then hold")
     return size
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -45,7 +45,8 @@ class ModelChoice:
 class Sequence:
     """A test as the file describes it, and the text it was read from.
 
-    `load` is made of segments in N and lies over main from its start; after its end the last value stays.
+    `load` is made of segments in N and lies over main from its start; after its end the last value stays. `ends` says
+    how the run must end to pass: "completed", or "safe_state" for a test whose point is that it is broken off.
     """
 
     title: str
@@ -57,6 +58,7 @@ class Sequence:
     faults: tuple[Fault, ...] = ()
     checks: tuple[Check, ...] = ()
     guards: tuple[Guard, ...] = ()
+    ends: Literal["completed", "safe_state"] = "completed"
     model: ModelChoice = ModelChoice()
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)

@@ -94,7 +94,8 @@ def test_a_silent_node_comes_back() -> None:
 ONE_OF_EACH: tuple[Fault, ...] = (
     Parameter(parameter="filter.clogging", value=0.3, start=1.0, ramp=0.5), Offset(signal="p12", value=1e5, start=0.1),
     Noise(signal="xs", value=1e-6, start=0.2, end=0.4), Stuck(signal="xj", start=0.3),
-    Lost(frame="drive", start=1.0, count=3), Late(frame="feedback", start=1.0, delay=1e-3), Silent(node="rig", start=2.0, name="rig dies"),
+    Lost(frame="drive", start=1.0, count=3), Late(frame="feedback", start=1.0, delay=1e-3),
+    Silent(node="rig", start=2.0, name="rig dies"),
 )
 
 
