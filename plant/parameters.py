@@ -169,11 +169,23 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: unreadable, or not TOML (with the line).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(path.read_text(encoding="utf-8"), path)
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"TOML ({error})") from None
+    except UnicodeDecodeError:
+        raise InputError(path, "", "text in UTF-8") from None
+
+
+def parse_toml(text: str, where: object) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Raises:
+        InputError: not TOML (with the line).
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(where, "", f"TOML ({error})") from None
 
 
 def flatten(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[Any]]) -> dict[str, float]:

@@ -1,0 +1,47 @@
+"""The only place that knows what time it is: a clock that is set (lockstep) and one that runs (real time)."""
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Time since the run began, ns."""
+
+    def now(self) -> int:
+        """What time it is, ns."""
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at `t_ns`, at once if it has passed."""
+
+
+class VirtualClock:
+    """Stands still until somebody waits, and then jumps: a run costs what it computes, and repeats bit for bit."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+
+    def now(self) -> int:
+        """The time last jumped to, ns."""
+        return self._t_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Jump to `t_ns`; never back."""
+        self._t_ns = max(self._t_ns, t_ns)
+
+
+class WallClock:
+    """The machine's monotonic clock, from zero at its making."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic_ns()
+
+    def now(self) -> int:
+        """Time since the clock was made, ns."""
+        return time.monotonic_ns() - self._start
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Sleep. CPython sleeps on an absolute deadline, so a long run does not drift."""
+        left = t_ns - self.now()
+        if left > 0:
+            time.sleep(left * 1e-9)

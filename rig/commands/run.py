@@ -1,0 +1,101 @@
+"""`rig run`: play a test sequence on the bench, log it, judge it."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rig import options
+
+if TYPE_CHECKING:
+    from rig.job import Job
+
+HELP = "run a test sequence: log, checks, verdict"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this command alone."""
+    add = parser.add_argument
+    add("sequence", nargs="?", metavar="SEQUENCE", help="a .toml file, or the name of a shipped one (preflight)")
+    options.add_model(parser)
+    add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
+        help="virtual: embedded in this process (default); socketcan:can0, udp_multicast, ...")
+    add("--pace", choices=("lockstep", "realtime"), default=None,
+        help="lockstep: virtual time, repeatable (default); realtime: the wall clock")
+    add("--controller", choices=("builtin", "external"), default=None,
+        help="whose firmware is node 2 (default: builtin)")
+    add("--plant", choices=("auto", "builtin", "external"), default=None,
+        help="node 3: auto takes the one that answers on the bus, else starts one (default)")
+    add("--max-overruns", type=float, default=None, metavar="FRACTION",
+        help="real time: more overruns than this part of all cycles make the timing invalid (default 0.001)")
+    add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run of this log")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a sequence; results go to --out (default: a new folder in runs/)."""
+    from fdi.report import write_report
+
+    from rig import show
+    from rig.bus import choose
+    from rig.runner import run as do
+
+    job = repeated(args) if args.source else asked(args)
+    bus, why = choose(job.bus if args.source and args.bus == "auto" else args.bus)
+    job = replaced(job, bus=bus)
+    folder = Path(args.out) if args.out else fresh_folder(Path("runs"), Path(job.sequence.name).stem)
+    silent = args.json or args.quiet
+    with show.progress(job, why, silent) as progress, show.stoppable() as stop:
+        outcome = do(job, folder, progress, stop)
+        progress("report", 0, 0)
+        write_report(folder / "trace.mcap", folder / "report.html")
+    if args.json:
+        show.as_json(outcome)
+    elif not args.quiet:
+        show.outcome(outcome)
+    return outcome.status
+
+
+def asked(args: argparse.Namespace) -> Job:
+    """The job the options describe; the sequence's own model choice comes first, --model and --set on top."""
+    from plant import InputError, load_model
+    from rig.job import Job
+    from rig.sequence import load_sequence
+
+    options.load_user_effects(args.effects)
+    sequence = load_sequence(args.sequence or "preflight")
+    chosen = load_model(args.model or sequence.model.name).replace(sequence.model.overrides, sequence.name)
+    model = chosen.replace(options.changes(args.set))
+    if model["controller.period"] != 1e-3:
+        raise InputError("--set", "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
+    if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
+        raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
+    return replaced(Job(sequence=sequence, model=model, seed=args.seed, effects=tuple(args.effects)), pace=args.pace,
+                    controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
+
+
+def repeated(args: argparse.Namespace) -> Job:
+    """The job of a log; what only this machine can know (bus, pace, who the controller is) may be asked for anew."""
+    from plant import InputError
+    from rig.job import repeat
+
+    if args.sequence or args.set or args.model or args.effects:
+        raise InputError("--from", str(args.source), "no SEQUENCE, --model, --set or --effects: the log has them")
+    return replaced(repeat(args.source), pace=args.pace, controller=args.controller, plant=args.plant,
+                    max_overruns=args.max_overruns)
+
+
+def replaced(job: Job, **given: object) -> Job:
+    """The job with the settings that were given."""
+    from dataclasses import replace
+    from typing import Any
+
+    said: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    return replace(job, **said)
+
+
+def fresh_folder(parent: Path, name: str) -> Path:
+    """A folder that is not there yet: parent/name, name-2, name-3, ..."""
+    number = 1
+    while (folder := parent / (name if number == 1 else f"{name}-{number}")).exists():
+        number += 1
+    return folder

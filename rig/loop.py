@@ -1,0 +1,152 @@
+"""The cycle of the bench: command, SYNC, answers, row. The only loop, for every bus and both paces.
+
+Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
+fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of firing a
+burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong.
+"""
+from __future__ import annotations
+
+import heapq
+from math import nan
+from typing import NamedTuple, Protocol
+
+from rig import codec
+from rig.clock import WallClock
+from rig.faults import Delay, Schedule
+from rig.frame import Frame
+from rig.master import Master
+from rig.recorder import U32, Signals, Timing
+
+_XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
+
+
+class Log(Protocol):
+    """The part of the recorder that the loop uses."""
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        """Record one cycle."""
+
+
+class Step(NamedTuple):
+    """What one cycle is asked to do."""
+
+    phase: int  # 0 set-up, 1 main, 2 clean-up
+    demand: float  # m
+    load: float  # N, what the plant was told to expect
+    control: int  # control word
+
+
+class Loop:
+    """Runs cycles one by one; `rows` and `timings` are those that are closed."""
+
+    def __init__(self, master: Master, faults: Schedule, log: Log, period_ns: int, realtime: bool) -> None:
+        self._master, self._wire = master, master.wire
+        self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
+        self.k = 0  # the cycle to come
+        self.overruns = 0
+        self.rows: list[Signals] = []
+        self.timings: list[Timing] = []
+        self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
+        self._seen = 0
+        self._wall = WallClock()
+        self._origin = self._t_ns = self._wire.clock.now() + period_ns
+        self._sync = 0
+        self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
+        read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
+        master.on_cyclic.update(read)
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began: the cycle's in lockstep, the clock's in real time."""
+        return self._wire.clock.now() if self._realtime else self._t_ns
+
+    def cycle(self, step: Step) -> Signals | None:
+        """One cycle; returns the row of the cycle before, which it closes."""
+        lateness = self._wait_until_due()
+        closed = self._close()
+        master, k = self._master, self.k
+        row = Signals(U32(k), U32(step.phase), codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
+                      step.load, U32(step.control), U32(0), U32(0))
+        timing = Timing(U32(k), lateness > self._period, lateness * 1e-9, nan, nan)
+        self._open, self._seen = (self._t_ns, row, timing), 0
+        master.silent = not self._faults.heartbeat_alive("rig", k)
+        self._command(codec.pack_command(step.demand, step.control, k))
+        self._sync = self._wall.now()
+        master.send(codec.SYNC, b"")
+        if not self._realtime:
+            self._wire.settle(self._t_ns, lambda: self._seen == _XJ | _XS | _COR)
+            self._send_held(self._t_ns + self._period)
+        master.tick()
+        self.k += 1
+        return closed
+
+    def finish(self) -> Signals | None:
+        """Wait for the answers of the last cycle and close it."""
+        self._wait_until_due()
+        return self._close()
+
+    def _wait_until_due(self) -> int:
+        """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
+        self._t_ns = self._origin + self.k * self._period
+        if not self._realtime:
+            return 0
+        while self._held and self._held[0][0] < self._t_ns:
+            due = self._held[0][0]
+            self._wire.run_until(due)
+            self._send_held(due + 1)
+        self._wire.run_until(self._t_ns)
+        late = self._wire.clock.now() - self._t_ns
+        if late > self._period:
+            lost = late // self._period
+            self.overruns += lost
+            self._origin += lost * self._period
+        return late
+
+    def _command(self, data: bytes) -> None:
+        action = self._faults.frame("command", self.k)
+        if action is None:
+            self._master.send(codec.COMMAND, data)
+        elif isinstance(action, Delay):
+            heapq.heappush(self._held, (self._t_ns + action.ns, self.k, data))
+
+    def _send_held(self, before_ns: int) -> None:
+        """Late commands whose time has come."""
+        while self._held and self._held[0][0] < before_ns:
+            self._master.send(codec.COMMAND, heapq.heappop(self._held)[2])
+
+    def _feedback(self, frame: Frame) -> None:
+        if self._open is not None and not self._seen & _XJ and len(frame.data) == 8:
+            row = self._open[1]
+            row.xj, row.p12 = codec.unpack_feedback(frame.data)
+            self._answered(_XJ)
+
+    def _valve(self, frame: Frame) -> None:
+        if self._open is not None and len(frame.data) == 8:
+            row, state = self._open[1], codec.unpack_valve_state(frame.data)
+            if state.cycle == row.cycle & 0xFFFF:
+                row.xs, row.flags = state.spool, U32(state.flags)
+                self._answered(_XS)
+
+    def _drive(self, frame: Frame) -> None:
+        if self._open is not None and not self._seen & _COR and len(frame.data) == 8:
+            _, row, timing = self._open
+            drive = codec.unpack_drive(frame.data)
+            if drive.cycle == row.cycle & 0xFFFF:
+                row.cor, row.status = drive.current, U32(drive.status)
+                timing.response = (self._wall.now() - self._sync) * 1e-9
+                self._answered(_COR)
+
+    def _answered(self, what: int) -> None:
+        self._seen |= what
+        if self._seen == _XJ | _XS | _COR and self._open is not None:
+            self._open[2].work = (self._wall.now() - self._sync) * 1e-9
+
+    def _close(self) -> Signals | None:
+        """The cycle under way is over: the next SYNC is due."""
+        if self._open is None:
+            return None
+        t_ns, row, timing = self._open
+        self._open = None
+        self.rows.append(row)
+        self.timings.append(timing)
+        self._log.cycle(t_ns, row, timing)
+        return row

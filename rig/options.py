@@ -1,0 +1,67 @@
+"""Options that mean the same in every command, and what they stand for."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from plant import InputError, Model, load_model
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """--model, --set, --seed, --effects: which plant to run."""
+    add = parser.add_argument
+    add("--model", metavar="FILE|NAME", help="model file, or eha for the nominal actuator (default)")
+    add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
+        help="change a parameter of the model or of an effect, SI units (repeatable)")
+    add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")
+    add_seed(parser)
+
+
+def add_seed(parser: argparse.ArgumentParser) -> None:
+    """--seed: of all random numbers of a run."""
+    parser.add_argument("--seed", type=whole, default=0, metavar="N", help="seed of the noise (default 0)")
+
+
+def whole(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    value = int(text)
+    if value < 0:
+        raise ValueError
+    return value
+
+
+whole.__name__ = "whole number from 0"
+
+
+def changes(pairs: list[str]) -> dict[str, str]:
+    """The --set options as a dict.
+
+    Raises:
+        InputError: one that is not GROUP.FIELD=VALUE.
+    """
+    table: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not (equals and value and "." in name):
+            raise InputError("--set", pair, "GROUP.FIELD=VALUE, such as spool.static_friction=35")
+        table[name.strip()] = value.strip()
+    return table
+
+
+def model_of(args: argparse.Namespace) -> Model:
+    """The model that --model, --set and --effects describe.
+
+    Raises:
+        InputError: a file, name or value that cannot be used.
+    """
+    load_user_effects(args.effects)
+    return load_model(args.model or "eha").replace(changes(args.set))
+
+
+def load_user_effects(files: list[Path]) -> None:
+    """Put the user's own effects into the catalogue."""
+    if files:
+        from plant.effects import load_effects
+
+        for file in files:
+            load_effects(file)

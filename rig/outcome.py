@@ -1,0 +1,74 @@
+"""What came of a run: verdict, checks, timing. For the table, for verdict.json and for the exit status."""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.checks import CheckResult
+from rig.job import Job
+from rig.recorder import Timing
+from rig.session import Happening
+
+STATUS = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """A finished run."""
+
+    job: Job
+    folder: Path
+    checks: Sequence[CheckResult]
+    events: Sequence[Happening]
+    aborted: str  # why, or ""
+    interrupted: bool
+    timing: dict[str, Any]
+    counters: dict[str, int]
+    speed: float  # multiple of real time, of the cycles alone
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL, INVALID_TIMING or ABORTED."""
+        if self.aborted:
+            return "ABORTED"
+        if self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]:
+            return "INVALID_TIMING"
+        return "PASS" if all(check.passed for check in self.checks) else "FAIL"
+
+    @property
+    def status(self) -> int:
+        """Exit status of `rig run`."""
+        return INTERRUPTED if self.interrupted else STATUS[self.verdict]
+
+    def to_json(self) -> dict[str, Any]:
+        """As interface and verdict.json have it; a number that is not there is null."""
+        return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.aborted,
+                "checks": [_plain(check._asdict()) for check in self.checks],
+                "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
+                "events": [_plain(event._asdict()) for event in self.events],
+                "run": self.job.settings(), "fdi": {}}
+
+
+def timing(timings: Sequence[Timing], overruns: int, scheduler: str) -> dict[str, Any]:
+    """Percentiles of lateness and response in us, as `rig run --json` gives them."""
+    return {"cycles": len(timings), "overruns": overruns, "scheduler": scheduler,
+            "lateness_us": _percentiles([t.lateness for t in timings]),
+            "response_us": _percentiles([t.response for t in timings])}
+
+
+def _percentiles(seconds: Sequence[float]) -> dict[str, float | None]:
+    values = np.array([s for s in seconds if not math.isnan(s)]) * 1e6
+    if not len(values):
+        return dict.fromkeys(("p50", "p99", "p99_9", "max"))
+    p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
+    return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
+
+
+def _plain(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}

@@ -1,0 +1,157 @@
+"""A job from start to finish: nodes and bus, log, session, checks, verdict.json, report.html."""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from plant import InputError
+from rig.bus import open_can
+from rig.checks import CheckResult, evaluate
+from rig.clock import VirtualClock, WallClock
+from rig.emulator import Emulator
+from rig.firmware import Firmware
+from rig.frame import Node, Send
+from rig.job import Job
+from rig.link import Link
+from rig.master import CONTROLLER, NAMES, PLANT, BusError, Master
+from rig.outcome import Outcome, timing
+from rig.recorder import Check, Recorder, Signals
+from rig.recorder.provenance import provenance
+from rig.session import MAIN, Progress, Session
+from rig.wire import EmbeddedWire, LinkWire, Wire
+
+EMBEDDED = ("embedded", "virtual")
+ANSWER = 0.7  # s: a node that is there boots within this
+START = 60.0  # s: a node of our own may have to compile the plant first
+
+
+class Columns(NamedTuple):
+    """Main as checks see it; each (n,) SI."""
+
+    t: np.ndarray
+    com: np.ndarray
+    xj: np.ndarray
+    cor: np.ndarray
+    p12: np.ndarray
+    xs: np.ndarray
+    load: np.ndarray
+
+
+def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
+    """Do a job; what comes of it lies in `folder`.
+
+    Raises:
+        RigError: bad input, a bus or node that is not there, or a log that cannot be written. The log is closed first.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with nodes_and_wire(job) as wire, log(job, folder) as recorder:
+        session = Session(job, wire, recorder, progress, stop)
+        progress("bring-up", 0, 0)
+        session.bring_up()
+        assert session.loop is not None
+        begun = time.perf_counter()
+        session.play()
+        spent = time.perf_counter() - begun
+        loop = session.loop
+        checks = judge(job, session, loop.rows)
+        for check in checks:
+            recorder.put(session.now(), _record(check))
+        outcome = Outcome(
+            job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted,
+            interrupted=session.interrupted, timing=timing(loop.timings, loop.overruns, scheduler()),
+            counters=_counters(loop.rows), speed=len(loop.rows) * job.period_ns * 1e-9 / spent)
+        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted,
+                                      "overruns": str(loop.overruns)})
+    (folder / "verdict.json").write_text(json.dumps(outcome.to_json(), indent=1) + "\n", encoding="utf-8")
+    return outcome
+
+
+def judge(job: Job, session: Session, rows: Sequence[Signals]) -> list[CheckResult]:
+    """The job's checks on the main phase."""
+    main = [row for row in rows if row.phase == MAIN]
+    table = np.array([(row.com, row.xj, row.cor, row.p12, row.xs, row.load) for row in main]).reshape(len(main), 6)
+    columns = Columns(np.arange(len(main)) * (job.period_ns * 1e-9), *table.T)
+    sequence = job.sequence
+    return evaluate(sequence.checks, columns, sequence.sections(), session.events, sequence.fault_starts())
+
+
+@contextlib.contextmanager
+def log(job: Job, folder: Path) -> Iterator[Recorder]:
+    """The run's log, closed whatever happens."""
+    recorder = Recorder(folder / "trace.mcap", job.attachments(), provenance(**job.settings()))
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+@contextlib.contextmanager
+def nodes_and_wire(job: Job) -> Iterator[Wire]:
+    """The bus with all nodes that are ours to run on it: inside this process, or as processes of their own.
+
+    Raises:
+        InputError: an external node was asked for on a bus that no other program can reach.
+        BusError: an external node does not answer.
+    """
+    if job.bus in EMBEDDED:
+        if "external" in (job.controller, job.plant):
+            raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
+        makers: list[Callable[[Send], Node]] = [Emulator, Firmware]
+        yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
+        return
+    clock = WallClock()
+    wire = LinkWire(Link(open_can(job.bus), clock.now), clock)
+    children: list[subprocess.Popen[bytes]] = []
+    try:
+        master = Master(wire, clock.now)
+        for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
+            there = (wanted != "builtin" or node == CONTROLLER) and master.present(node, ANSWER)
+            if wanted == "external" and not there:
+                raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
+            if node == CONTROLLER and wanted == "builtin" and there:
+                raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
+            if not there:
+                children.append(_start(job, NAMES[node]))
+                if not master.present_within(node, START):
+                    raise BusError(f"our own node {node} ({NAMES[node]}) did not start on {job.bus}")
+        yield wire
+    finally:
+        for child in children:
+            child.terminate()
+        for child in children:
+            child.wait(10)
+        wire.close()
+
+
+def _start(job: Job, name: str) -> subprocess.Popen[bytes]:
+    """A node of our own in its own process: it shares neither interpreter lock nor fate with the rig."""
+    effects = [word for path in job.effects for word in ("--effects", str(path))]
+    command = [sys.executable, "-m", "rig.cli", "node", name, "--bus", job.bus, "--quiet", *effects]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL)
+
+
+def scheduler() -> str:
+    """How the kernel schedules this process."""
+    names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
+    return names.get(os.sched_getscheduler(0), "unknown") if hasattr(os, "sched_getscheduler") else "unknown"
+
+
+def _counters(rows: Sequence[Signals]) -> dict[str, int]:
+    """Cycles whose answers did not come, from what the rig itself saw and what the plant flagged."""
+    return {"no_feedback": sum(row.xj != row.xj for row in rows), "no_drive": sum(row.cor != row.cor for row in rows),
+            "plant_drive_missing": sum(row.flags & 1 for row in rows),
+            "plant_drive_late": sum(row.flags >> 1 & 1 for row in rows)}
+
+
+def _record(check: CheckResult) -> Check:
+    return Check(name=check.name, signal=check.signal, value=check.value, unit=check.unit, low=check.low,
+                 high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)

@@ -1,0 +1,62 @@
+"""What the plant emulator is told before a run: which plant, what goes wrong when, which load. One SDO download."""
+from __future__ import annotations
+
+import json
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from plant import InputError, Model
+from plant.segments import Array
+from rig.faults import Plan
+
+FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
+WHERE = "scenario (object 0x2210)"
+
+
+class Scenario(NamedTuple):
+    """A plant and its fate. `force`: load on the ram in counts of FORCE, one a cycle from the start of set-up."""
+
+    model: Model
+    plan: Plan
+    force: tuple[int, ...] = ()
+    seed: int = 0
+
+    @classmethod
+    def of(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
+        """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load."""
+        counts = [0] * plan.start + np.rint(load / FORCE).astype(int).tolist()
+        return cls(model.having(_touched(plan)), plan, tuple(counts), seed)
+
+    def load(self) -> list[float]:
+        """Load on the ram in N, one a cycle; none after the last."""
+        return [count * FORCE for count in self.force]
+
+    def to_bytes(self) -> bytes:
+        """JSON, compressed. Loads are second differences: constant and ramp are zeros."""
+        changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
+        return zlib.compress(json.dumps({
+            "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.differences()},
+            "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Scenario:
+        """The scenario that was sent.
+
+        Raises:
+            InputError: it is none, or names what this node does not know.
+        """
+        try:
+            table: dict[str, Any] = json.loads(zlib.decompress(data))
+            named = table["model"]
+            model = Model(str(named["name"])).having(named["effects"]).replace(named["values"], WHERE)
+            force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
+            return cls(model, Plan.from_json(table["plan"]), tuple(force), int(table["seed"]))
+        except (zlib.error, ValueError, KeyError, TypeError) as error:
+            raise InputError(WHERE, "", f"compressed JSON of a scenario ({type(error).__name__}: {error})") from error
+
+
+def _touched(plan: Plan) -> set[str]:
+    """Groups of the parameters that faults change: the plant must have their effects from the start."""
+    return {fault.parameter.partition(".")[0] for fault in plan.faults if hasattr(fault, "parameter")}

@@ -1,0 +1,198 @@
+"""One run from bring-up to clean-up on a bus that is already there: the sequencer.
+
+Set-up, main and clean-up are cycles of one loop. Clean-up always runs. Trouble that a fault of the sequence explains
+puts the bench into its safe state (no current) and main goes on, for the response is what is being tested; trouble that
+none explains ends main.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from canopen.emcy import EmcyError
+
+from plant.segments import RATE
+from rig import firmware
+from rig.codec import Control
+from rig.device.nmt import NmtState
+from rig.faults import Schedule
+from rig.guards import Watch
+from rig.job import Job
+from rig.loop import Loop, Step
+from rig.master import NAMES, Master
+from rig.recorder import U32, Event, Recorder, Signals
+from rig.recorder import NmtState as NmtRecord
+from rig.scenario import Scenario
+from rig.wire import Wire
+
+SETUP, MAIN, CLEANUP = 0, 1, 2
+PHASES = ("setup", "main", "cleanup")
+_ENABLING = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
+Progress = Callable[[str, int, int], None]  # phase or section, cycles done, cycles in all
+
+
+class Happening(NamedTuple):
+    """An event of the run; `t` in s of main."""
+
+    t: float
+    level: str
+    kind: str
+    text: str
+
+
+class Session:
+    """Plays a job's sequence on a wire. `stop()` is asked every cycle whether the operator wants to end."""
+
+    def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
+        self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
+        self._plan = job.sequence.plan(job.seed)
+        self._load = job.sequence.load_profile()
+        self.scenario = Scenario.of(job.model, self._plan, self._load, job.seed)
+        self._faults = Schedule(self._plan, self.scenario.model.values)
+        self._watch = Watch(job.sequence.guards)
+        self.loop: Loop | None = None
+        self.events: list[Happening] = []
+        self.aborted = ""  # why main ended early
+        self.interrupted = False
+        self._safe = False
+        self._edges = sorted(self._faults.edges)
+        self._clock = wire.clock
+        self._master = Master(wire, self.now)
+        self._master.on_frame = recorder.frame
+        self._master.on_emcy = self._emcy
+        self._master.on_state = self._state
+        self._master.on_lost = self._silent
+        self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is back")
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began."""
+        return self.loop.now() if self.loop else self._clock.now()
+
+    def say(self, level: str, kind: str, text: str) -> None:
+        """Something happened."""
+        t_ns = self.now()
+        self.events.append(Happening(self._main_time(), level, kind, text))
+        self.recorder.put(t_ns, Event(level, kind, text))
+
+    def bring_up(self) -> None:
+        """Reset, configure and start the nodes.
+
+        Raises:
+            BusError: a node does not answer or refuses.
+        """
+        job = self.job
+        self.say("INFO", "phase", "bring-up")
+        self._master.reset()
+        gains = firmware.gains_of(job.model) if job.controller == "builtin" else None
+        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns / 1e9)
+        self._master.start()
+        self.loop = Loop(self._master, self._faults, self.recorder, job.period_ns, job.realtime)
+
+    def play(self) -> None:
+        """All three phases."""
+        try:
+            self._run(SETUP, self._steps(SETUP)) and self._run(MAIN, self._steps(MAIN))
+        finally:
+            self._clean_up()
+
+    def _clean_up(self) -> None:
+        assert self.loop is not None
+        self._safe = not self._recovered()
+        self._run(CLEANUP, self._steps(CLEANUP))
+        self.loop.finish()
+        self._master.stop()
+        self.say("INFO", "phase", "end")
+
+    def _recovered(self) -> bool:
+        """Try to have all nodes OPERATIONAL and without error again; whether clean-up may use current."""
+        if self._safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
+            self._master.start()
+        return not self._safe or not self._master.errors()
+
+    def _steps(self, phase: int) -> Iterator[tuple[str, Step]]:
+        """Section name and step of every cycle of a phase."""
+        sequence = self.job.sequence
+        last = self.loop.rows[-1].com if self.loop and self.loop.rows else 0.0
+        profile = (sequence.setup_profile, sequence.main_profile, lambda: sequence.cleanup_profile(last))[phase]()
+        names = [""] * len(profile.command)
+        for section in profile.sections:
+            names[section.start:section.stop] = [section.name] * (section.stop - section.start)
+        loads = self.scenario.load()[self._plan.start:] if phase == MAIN else []
+        for i, demand in enumerate(profile.command.tolist()):
+            yield names[i], Step(phase, demand, loads[i] if loads else 0.0, self._control(phase, i))
+
+    def _control(self, phase: int, i: int) -> int:
+        if self._safe:
+            return 0
+        if phase == CLEANUP and self.aborted and i == 0:
+            return int(Control.RESET)
+        return int(_ENABLING[i]) if i < len(_ENABLING) and phase == SETUP else int(Control.ACTIVE)
+
+    def _run(self, phase: int, steps: Iterator[tuple[str, Step]]) -> bool:
+        """The cycles of one phase; False when it was ended early."""
+        assert self.loop is not None
+        self.say("INFO", "phase", PHASES[phase])
+        section, begun, total = "", self.loop.k, self._plan.stop
+        for name, step in steps:
+            if name != section:
+                section = name
+                self.say("INFO", "section", f"{PHASES[phase]}: {name}")
+            self._announce_faults()
+            closed = self.loop.cycle(step)
+            if self.loop.k % 50 == 0:
+                self._progress(name if phase == MAIN else PHASES[phase], self.loop.k, max(total, self.loop.k))
+            if phase != CLEANUP and self._must_end(closed):
+                return False
+        return self.loop.k > begun or phase != MAIN
+
+    def _must_end(self, row: Signals | None) -> bool:
+        if self._stop() and not self.aborted:
+            self.interrupted = True
+            self._abort("operator", "stopped by the operator")
+        if row is not None:
+            measured = {name: getattr(row, name) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+            passed = self._watch.see({**measured, "error": row.com - row.xj})
+            if passed:
+                self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
+        return bool(self.aborted)
+
+    def _abort(self, kind: str, why: str) -> None:
+        self.aborted = self.aborted or why
+        self.say("ERROR", kind, why)
+
+    def _trouble(self, kind: str, what: str) -> None:
+        """A node is in trouble: no current from here on, and an end of main unless a fault was to cause it."""
+        self.say("ERROR", kind, what)
+        k = self.loop.k if self.loop else -1
+        explained = any(edge.begins and edge.cycle <= k for edge in self._faults.edges)
+        if not self._safe:
+            self._safe = True
+            self.say("WARN", "safe_state", f"no current from here on: {what}")
+        if not explained and not self.aborted:
+            self._abort("abort", f"{what}, which no fault of the sequence explains")
+
+    def _emcy(self, node: int, error: EmcyError) -> None:
+        if error.code & 0xFF00 == 0:
+            self.say("INFO", "emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} no error")
+        else:
+            self._trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
+
+    def _silent(self, node: int) -> None:
+        self._trouble("heartbeat", f"node {node} {NAMES[node]} is silent")
+
+    def _state(self, node: int, state: int) -> None:
+        known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
+        name = known.get(state, f"state {state}") if state else "boot-up"
+        self.recorder.put(self.now(), NmtRecord(U32(node), U32(state), name))
+
+    def _announce_faults(self) -> None:
+        assert self.loop is not None
+        while self._edges and self._edges[0].cycle <= self.loop.k:
+            edge = self._edges.pop(0)
+            self.say("WARN" if edge.begins else "INFO", "fault", f"{edge.label} {'begins' if edge.begins else 'ends'}")
+
+    def _main_time(self) -> float:
+        """Now, s of main; negative before it."""
+        if self.loop is None:
+            return -self._plan.start / RATE
+        return (self.loop.k - self._plan.start) / RATE

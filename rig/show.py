@@ -1,0 +1,119 @@
+"""What `rig run` shows a person: a progress bar, a table, a verdict in plain words."""
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from rig.job import Job
+from rig.outcome import Outcome
+
+COLOURS = {"PASS": "green", "FAIL": "red", "ABORTED": "red", "INVALID_TIMING": "yellow"}
+MEANING = {"PASS": "every check passed", "FAIL": "a check did not pass", "ABORTED": "the run was ended early",
+           "INVALID_TIMING": "the bench itself was too late too often: nothing can be said of the controller"}
+
+
+@contextlib.contextmanager
+def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on standard error, and who is who on standard output; nothing at all if `silent`."""
+    if silent:
+        yield lambda what, done, total: None
+        return
+    Console(highlight=False).print(f"[bold]{job.sequence.title}[/], {job.sequence.duration:g} s, {job.pace}, "
+                                   f"seed {job.seed}, {why}")
+    bar = Progress(TextColumn("{task.description:<14}"), BarColumn(40), TextColumn("{task.percentage:>3.0f} %"),
+                   TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+    with bar:
+        task = bar.add_task("bring-up", total=None)
+
+        def update(what: str, done: int, total: int) -> None:
+            bar.update(task, description=what, completed=done, total=total or None)
+
+        yield update
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM end main and let clean-up run; a second one ends the program."""
+    asked: list[int] = []
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def as_json(outcome: Outcome) -> None:
+    """One object on standard output."""
+    print(json.dumps(outcome.to_json()))
+
+
+def outcome(o: Outcome) -> None:
+    """The table of checks, the timing and the verdict."""
+    console = Console(highlight=False)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("check")
+    table.add_column("measured", justify="right")
+    table.add_column("limits", justify="right")
+    table.add_column("unit")
+    table.add_column("")
+    table.add_column("", overflow="fold")
+    for c in o.checks:
+        mark = "[green]pass[/]" if c.passed else "[bold red]FAIL[/]"
+        table.add_row(c.name, number(c.value), limits(c.low, c.high), c.unit, mark, f"[dim]{c.detail}[/]")
+    console.print(table)
+    timing = o.timing
+    late = timing["lateness_us"]
+    if o.job.realtime:
+        console.print(f"\ntiming    {timing['cycles']} cycles, {timing['overruns']} overruns; lateness "
+                      f"p50 {late['p50']:g}, p99 {late['p99']:g}, max {late['max']:g} us ({timing['scheduler']})")
+    else:
+        console.print(f"\ntiming    {timing['cycles']} cycles in lockstep, {o.speed:.1f} times real time")
+    missing = {name: count for name, count in o.counters.items() if count}
+    if missing:
+        console.print("missing   " + ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in missing.items()))
+    for event in o.events:
+        if event.level != "INFO":
+            console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {event.text}")
+    console.print(f"results   {o.folder}/ trace.mcap, verdict.json, report.html")
+    failed = [c.name for c in o.checks if not c.passed]
+    words = o.aborted or (f"{', '.join(failed)}" if o.verdict == "FAIL" else MEANING[o.verdict])
+    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {words}")
+
+
+def number(value: float) -> str:
+    """Four digits, or a dash for what could not be measured.
+
+    >>> number(0.123456), number(float("nan"))
+    ('0.1235', '-')
+    """
+    return "-" if math.isnan(value) else f"{value:.4g}"
+
+
+def limits(low: float, high: float) -> str:
+    """The limits of a check in words.
+
+    >>> limits(float("nan"), 5.0), limits(1.0, 2.0)
+    ('<= 5', '1 .. 2')
+    """
+    if math.isnan(low):
+        return f"<= {high:g}"
+    return f">= {low:g}" if math.isnan(high) else f"{low:g} .. {high:g}"
