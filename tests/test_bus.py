@@ -57,7 +57,15 @@ class TestEveryBus:
             heard = contents(gather(listening, 40))
         assert heard == [(cob_id, bytes([n])) for n in range(20) for cob_id in (0x600, 0x580)]
 
-    def test_times_lie_between_sending_and_polling_and_do_not_go_back(self, bus_kind: str) -> None:
+    def test_own_frames_do_not_hide_those_of_others(self, bus_kind: str) -> None:
+        with stations(bus_kind, 2) as (one, other):
+            for n in range(10):
+                one.send(0x100, bytes([n]))
+                other.send(0x200, bytes([n]))
+            time.sleep(0.05)
+            assert contents(one.poll(0.0)) == [(0x200, bytes([n])) for n in range(10)]
+
+    def test_times_do_not_go_back_and_span_no_more_than_it_took(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (sender, receiver):
             begin = time.monotonic_ns()
             for n in range(5):

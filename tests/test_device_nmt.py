@@ -155,6 +155,15 @@ def test_heartbeat_of_the_master_lost_and_back() -> None:
     assert rack.device.state is PRE  # coming back is for the master to command
 
 
+def test_watching_begins_anew_after_a_reset() -> None:
+    rack, lost = Rack(), []
+    rack.device.on_heartbeat_lost = lost.append
+    rack.send(0x701, b"\5")
+    rack.nmt(NmtCommand.RESET_COMMUNICATION)
+    rack.wait(1000)
+    assert lost == []
+
+
 @pytest.mark.parametrize(("behaviour", "state"), [(0, PRE), (1, OPERATIONAL), (2, STOPPED)])
 def test_error_behaviour(behaviour: int, state: NmtState) -> None:
     rack = rack_in(OPERATIONAL)

@@ -39,10 +39,10 @@ class HeartbeatConsumer:
     """
 
     def __init__(self, lost: Callable[[int], None], back: Callable[[int], None]) -> None:
+        """`lost(node)` when one falls silent, `back(node)` when it is heard for the first time or again."""
         self._lost, self._back = lost, back
         self._limits: dict[int, int] = {}  # node -> ns
         self._deadlines: dict[int, int] = {}  # of the nodes heard
-        self._missing: set[int] = set()
 
     def configure(self, entries: list[int]) -> None:
         """`entries` of 0x1016: bits 16..23 node, bits 0..15 consumer time in ms; a zero in either disables."""
@@ -51,7 +51,6 @@ class HeartbeatConsumer:
         changed = {node for node in self._limits | limits if self._limits.get(node) != limits.get(node)}
         for node in changed:
             self._deadlines.pop(node, None)
-            self._missing.discard(node)
         self._limits = limits
 
     @property
@@ -60,14 +59,12 @@ class HeartbeatConsumer:
 
     def receive(self, frame: Frame) -> None:
         node = frame.cob_id - COB_ID
-        self._deadlines[node] = frame.t_ns + self._limits[node]
-        if node in self._missing:
-            self._missing.remove(node)
+        if node not in self._deadlines:
             self._back(node)
+        self._deadlines[node] = frame.t_ns + self._limits[node]
 
     def tick(self, t_ns: int) -> None:
         for node, deadline in list(self._deadlines.items()):
             if t_ns > deadline:
                 del self._deadlines[node]
-                self._missing.add(node)
                 self._lost(node)
