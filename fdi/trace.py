@@ -55,6 +55,7 @@ class Check(NamedTuple):
     """A judged measurement; NaN limits and window ends mean none."""
 
     name: str
+    kind: str  # overshoot, settling_time, ...
     signal: str
     value: float
     unit: str

@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     from rig.recorder.convert import export
 
     if args.out is None:
-        raise InputError("rig export", "--out", "the file to write")
+        raise InputError("--out", "", "the file to write")
     count = export(Path(args.trace), Path(args.out), args.all)
     if args.json:
         print(json.dumps({"path": str(args.out), "count": count}))

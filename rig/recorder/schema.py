@@ -99,6 +99,7 @@ class Check:
     t0: float = _doc("start of the window, from the start of the main phase; NaN: not a window", "s", default=math.nan)
     t1: float = _doc("end of the window", "s", default=math.nan)
     name: str = _doc("as in the sequence")
+    kind: str = _doc("what was measured: overshoot, settling, never_exceeds, ...", default="")
     signal: str = _doc("what was looked at")
     unit: str = _doc("of value, low and high")
     detail: str = _doc("why, in words", default="")
