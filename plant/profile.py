@@ -39,6 +39,11 @@ class Command(NamedTuple):
     load: Array | None  # N, None without such a column
 
 
+def names(segments: Sequence[Segment]) -> list[str]:
+    """What the sections of a command are called: their own name, or kind_number with the segment's number from 1."""
+    return [segment.name or f"{segment.kind}_{number}" for number, segment in enumerate(segments, 1)]
+
+
 def build(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     """Lay segments end to end from the demand `start` (m). No segments: an empty command that ends where it starts.
 
@@ -47,12 +52,11 @@ def build(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     pieces: list[Array] = [np.empty(0)]
     sections: list[Section] = []
     last, begin = start, 0
-    for number, segment in enumerate(segments, 1):
+    for segment, name in zip(segments, names(segments), strict=True):
         cycles = round(segment.duration * RATE)
         demand = segment.demand(np.arange(cycles + 1) / RATE, last)
         pieces.append(demand[:-1])
         last = float(demand[-1])
-        name = segment.name or f"{segment.kind}_{number}"
         require(all(name != s.name for s in sections), "name", f"a name used once, not a second {name!r}")
         sections.append(Section(name, segment.kind, begin, begin + cycles))
         begin += cycles
@@ -82,10 +86,10 @@ def parse_columns(data: bytes, where: object) -> dict[str, Array]:
     """
     rows = _rows(data, where)
     _, header = next(rows, (0, [""]))
-    names = [name.strip().lower() for name in header]
-    if "t" not in names:
+    titles = [title.strip().lower() for title in header]
+    if "t" not in titles:
         raise InputError(where, "line 1", "a header with a column t and commas between columns")
-    picked: dict[str, int] = {name: names.index(name) for name in ("t", "com", "value", "load") if name in names}
+    picked: dict[str, int] = {name: titles.index(name) for name in ("t", "com", "value", "load") if name in titles}
     table = {name: np.array(values) for name, values in _numbers(rows, picked, where).items()}
     t = table.pop("t")
     grid = t[0] + np.arange(round((t[-1] - t[0]) * RATE) + 1) / RATE

@@ -29,7 +29,7 @@ LONGEST = 3600.0  # s, of one segment or file: beyond it, somebody wrote millise
 
 @dataclass(frozen=True, kw_only=True)
 class Segment(ABC):
-    """One piece of a command. `name` is what checks call its section; without one it is kind_number."""
+    """One piece of a command. `name` is what checks call its section."""
 
     kind: ClassVar[str]
     name: str = ""

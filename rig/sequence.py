@@ -17,7 +17,7 @@ import numpy as np
 from plant import segments
 from plant.errors import InputError
 from plant.model import meaning
-from plant.profile import Profile, build, parse_columns
+from plant.profile import Profile, build, names, parse_columns
 from plant.segments import RATE, Array, Csv, Segment
 from rig import checks, faults, tables
 from rig.checks import Check, ResponseWithin
@@ -107,16 +107,16 @@ class Sequence:
     @classmethod
     def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = meaning) -> Sequence:
         """The sequence of a bundle; raises InputError if a file is not in it or does not make one."""
-        names = [name for name in bundle if name.endswith(".toml")]
-        if len(names) != 1:
-            raise InputError("bundle", "", f"one .toml file, not {len(names)}")
+        sources = [name for name in bundle if name.endswith(".toml")]
+        if len(sources) != 1:
+            raise InputError("bundle", "", f"one .toml file, not {len(sources)}")
 
         def read_file(name: str) -> bytes:
             if name not in bundle:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        return parse_sequence(bundle[names[0]].decode(), names[0], read_file, known)
+        return parse_sequence(bundle[sources[0]].decode(), sources[0], read_file, known)
 
 
 def load_sequence(name_or_path: str | Path, known: Known = meaning) -> Sequence:
@@ -192,17 +192,17 @@ def _with_csv(sequence: Sequence, phase: str, place: Place, read_file: ReadFile)
 
 def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in ("setup", "main", "cleanup", "load"):
-        try:
-            build(getattr(sequence, phase))
-        except InputError as error:
-            raise place.at(phase).refuse(error.expected) from error
+        called = names(getattr(sequence, phase))
+        for i, name in enumerate(called):
+            if name in called[:i]:
+                raise place.at(phase, i, "name").refuse(f"a name used once, not a second {name!r}")
+            if name == MAIN:
+                raise place.at(phase, i, "name").refuse(f"another name than {MAIN!r}, which is all of main")
     if not sequence.main:
         raise place.at("main").refuse("at least one segment")
     length = sum(segment.duration for segment in sequence.load)
     if round(length * RATE) > round(sequence.duration * RATE):
         raise place.at("load").refuse(f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
-    if any(name == MAIN for name in sequence.sections()):
-        raise place.at("main").refuse(f"section names other than {MAIN!r}, which is all of it")
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
@@ -243,10 +243,10 @@ def _check_parameters(sequence: Sequence, place: Place, known: Known) -> None:
 def _check_checks(sequence: Sequence, place: Place) -> None:
     """Windows and faults that checks point at must be there; names are the lines of a table and must differ."""
     sections, labels = sequence.sections(), Counter(fault.label for fault in sequence.faults)
-    names = Counter(check.name for check in sequence.checks)
+    used = Counter(check.name for check in sequence.checks)
     for i, check in enumerate(sequence.checks):
-        if names[check.name] > 1:
-            raise place.at(i, "name").refuse(f"a name used once, not {names[check.name]} times {check.name!r}")
+        if used[check.name] > 1:
+            raise place.at(i, "name").refuse(f"a name used once, not {used[check.name]} times {check.name!r}")
         window = check.window
         if isinstance(window, str) and window != MAIN and window not in sections:
             raise place.at(i, "window").refuse(f"a section: {tables.one_of(window, [MAIN, *sections])}")

@@ -141,7 +141,7 @@ def test_gain_and_phase_of_a_first_order_lag(frequency: float) -> None:
     zoh = exp(-1e-3 / LAG)
     z = np.exp(2j * pi * frequency / 1000)
     h = (1 - zoh) / (z - zoh)  # of the sampled lag
-    keys = {"window": "sine", "frequency": frequency, "skip": 0.5}
+    keys: dict[str, Any] = {"window": "sine", "frequency": frequency, "skip": 0.5}
     assert judged(run, sections, "amplitude_ratio", **keys).value == pytest.approx(abs(h), abs=1e-3)
     assert judged(run, sections, "phase_lag", **keys).value == pytest.approx(-degrees(atan2(h.imag, h.real)), abs=0.1)
 

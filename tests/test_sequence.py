@@ -1,0 +1,238 @@
+"""Sequences from TOML: what a good one says, what a bad one is told, and that the shipped ones do their work."""
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from plant import load_model, simulate
+from plant.errors import InputError
+from rig import toml_lines
+from rig.checks import CheckResult, evaluate
+from rig.sequence import Sequence, load_sequence, parse_sequence
+
+SHIPPED = sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
+FULL = """\
+title = "All of it"
+setup = [{ kind = "ramp", to = 1e-3, time = 0.2 }]
+main = [
+  { kind = "hold", time = 0.5 },
+  { name = "up", kind = "step", to = 2e-3, time = 0.5 },  # a comment with ] and "
+  { name = "taped", kind = "csv", file = "tape.csv" },
+]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.1 }]
+load = [{ kind = "points", points = [[0.1, 1000.0], [0.2, 500]] }]
+faults = [
+  { kind = "parameter", parameter = "filter.clogging", value = 0.25, start = 0.5, end = 0.8, ramp = 0.1 },
+  { name = "gone", kind = "lost", frame = "drive", start = 0.9, count = 3 },
+]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "up", high = 10 },
+  { name = "emergency", kind = "response_within", after = "gone", event = "EMCY 0x8250", high = 10, unit = "ms" },
+]
+guards = [{ name = "far", signal = "xj", high = 0.01 }]
+
+[model]
+overrides = { spool.static_friction = 35, "null_bias.current" = 1e-4 }
+"""
+TAPE = b"t,com\n0,0.002\n0.001,0.001\n0.002,0\n"
+
+
+def tape(name: str) -> bytes:
+    if name != "tape.csv":
+        raise InputError(name, "", "a file that can be read (No such file or directory)")
+    return TAPE
+
+
+def parse(text: str) -> Sequence:
+    return parse_sequence(text, "mine.toml", tape)
+
+
+def test_a_full_sequence_says_what_the_file_says() -> None:
+    s = parse(FULL)
+    assert (s.title, s.name, s.duration, s.ends) == ("All of it", "mine.toml", 1.003, "completed")
+    assert s.model.overrides == {"spool.static_friction": 35.0, "null_bias.current": 1e-4}
+    command = s.main_profile().command
+    assert command[0] == 1e-3 and command[500] == 2e-3  # main goes on where set-up ended
+    assert command[1000:].tolist() == [0.002, 0.001, 0.0]
+    assert s.sections() == {"hold_1": slice(0, 500), "up": slice(500, 1000), "taped": slice(1000, 1003)}
+    assert s.cleanup_profile(5e-3).command[0] == 5e-3
+    force = s.load_profile()
+    assert len(force) == 1003 and force[50] == 500.0 and force[100] == 1000.0 and (force[200:] == 500.0).all()
+    plan = s.plan(seed=3)
+    assert (plan.start, plan.stop, plan.seed) == (200, 1203, 3)
+    assert s.fault_starts() == {"parameter filter.clogging": 0.5, "gone": 0.9}
+
+
+def test_a_sequence_is_repeated_from_its_bundle_alone() -> None:
+    s = parse(FULL)
+    assert s.bundle() == {"mine.toml": FULL.encode(), "tape.csv": TAPE}
+    assert Sequence.from_bundle(s.bundle()) == s
+    with pytest.raises(InputError, match=r"tape.csv: expected to be part of the bundle"):
+        Sequence.from_bundle({"mine.toml": FULL.encode()})
+    with pytest.raises(InputError, match=r"one \.toml file"):
+        Sequence.from_bundle({})
+
+
+def test_files_are_found_beside_the_sequence(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(FULL)
+    (tmp_path / "tape.csv").write_bytes(TAPE)
+    assert load_sequence(tmp_path / "mine.toml") == parse(FULL)
+    (tmp_path / "mine.toml").write_bytes(b"title = '\xff'")
+    with pytest.raises(InputError, match="UTF-8"):
+        load_sequence(str(tmp_path / "mine.toml"))
+    with pytest.raises(InputError, match=r"other.toml: expected a file that can be read"):
+        load_sequence(tmp_path / "other.toml")
+
+
+def test_an_unknown_name_is_answered_with_the_shipped_ones() -> None:
+    with pytest.raises(InputError, match=r"'preflight'.* not 'preflihgt' \(did you mean 'preflight'\?\)"):
+        load_sequence("preflihgt")
+
+
+def test_names_are_asked_of_the_caller() -> None:
+    asked: list[str] = []
+    parse_sequence(FULL, "mine.toml", tape, asked.append)
+    assert asked == ["spool.static_friction", "null_bias.current", "filter.clogging"]
+
+
+HEAD = 'title = "T"\nmain = [{ kind = "hold", time = 1.0 }]\n'
+BAD = [  # text, then what the user reads
+    ("title = \n", "mine.toml:1: expected TOML; invalid value"),
+    ('title = "T"\n\nmain = [\n', "mine.toml:4: expected TOML;"),
+    ('main = [{ kind = "hold", time = 1.0 }]\n', "mine.toml: expected also the key 'title', a text"),
+    ('title = "T"\nmain = []\n', "mine.toml:2: main: expected at least one segment"),
+    ('title = 3\nmain = []\n', "mine.toml:1: title: expected a text, not 3"),
+    ('title = "T"\nmain = { kind = "hold" }\n',
+     "mine.toml:2: main: expected a list, each a table, not {'kind': 'hold'}"),
+    (HEAD + "cheks = []\n", "mine.toml:3: cheks: expected a key: "),
+    (HEAD + "cheks = []\n", "not 'cheks' (did you mean 'checks'?)"),
+    (HEAD + 'source = "x"\n', "mine.toml:3: source: expected a key: "),
+    ('title = "T"\nmain = [\n  { kind = "hold", time = 1 },\n  { kind = "stepp", to = 1, time = 1 },\n]\n',
+     "mine.toml:4: main[1].kind: expected a kind: 'chirp', 'csv', 'hold', 'multisine', 'points', 'ramp', 'sine' or "
+     "'step', not 'stepp' (did you mean 'step'?)"),
+    ('title = "T"\nmain = [{ time = 1 }]\n', "mine.toml:2: main[0]: expected a kind: 'chirp', 'csv'"),
+    ('title = "T"\nmain = [{ kind = "step", time = 1 }]\n',
+     "mine.toml:2: main[0]: expected also the key 'to', a number in m (N for a load)"),
+    ('title = "T"\nmain = [{ kind = "step", to = "far", time = 1 }]\n',
+     "mine.toml:2: main[0].to: expected a number in m (N for a load), not 'far'"),
+    ('title = "T"\nmain = [{ kind = "hold", tiem = 1 }]\n', "(did you mean 'time'?)"),
+    ('title = "T"\nmain = [{ kind = "hold", time = true }]\n',
+     "mine.toml:2: main[0].time: expected a number in s, not True"),
+    ('title = "T"\nmain = [{ kind = "hold", time = nan }]\n', "main[0].time: expected a number in s, not nan"),
+    ('title = "T"\nmain = [{ kind = "hold", time = -1 }]\n', "main[0].time: expected 0.001 to 3600 s, not -1"),
+    ('title = "T"\n[[main]]\nkind = "hold"\ntime = 1\n\n[[main]]\nkind = "hold"\ntime = 0.00001\n',
+     "mine.toml:8: main[1].time: expected 0.001 to 3600 s, not 1e-05"),
+    ('title = "T"\nmain = [\n{ kind = "hold", time = 1, name = "a" },\n{ kind = "hold", time = 1, name = "a" }]\n',
+     "mine.toml:4: main[1].name: expected a name used once, not a second 'a'"),
+    ('title = "T"\nmain = [{ kind = "hold", time = 1, name = "main" }]\n',
+     "mine.toml:2: main[0].name: expected another name than 'main'"),
+    ('title = "T"\nmain = [{ kind = "csv", file = "no.csv" }]\n',
+     "mine.toml:2: main[0].file: expected a readable command file; no.csv: expected a file that can be read"),
+    (HEAD + 'load = [{ kind = "csv", file = "tape.csv" }]\n',
+     "load[0].file: expected a file with the columns t and value"),
+    (HEAD + 'load = [{ kind = "hold", time = 2 }]\n',
+     "mine.toml:3: load: expected at most the 1 s that main lasts, not 2 s"),
+    (HEAD + 'load = [{ kind = "points", points = [[0, 1, 2]] }]\n',
+     "mine.toml:3: load[0].points[0]: expected [a number, a number], not [0, 1, 2]"),
+    (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.cloging", value = 1, start = 0 }]\n',
+     "mine.toml:3: faults[0].parameter: expected a field of filter"),
+    (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 1.5, start = 0 }]\n',
+     "mine.toml:3: faults[0].value: expected a number at least 0"),
+    (HEAD + 'faults = [{ kind = "lost", frame = "drives", start = 0 }]\n',
+     "faults[0].frame: expected 'command', 'drive', 'feedback' or 'valve_state', not 'drives' (did you mean 'drive'?)"),
+    (HEAD + 'faults = [{ kind = "lost", frame = "drive", start = 0, every = 1.5 }]\n',
+     "faults[0].every: expected a whole number, not 1.5"),
+    (HEAD + 'faults = [{ kind = "lost", frame = "drive", start = 0, probability = 2 }]\n',
+     "faults[0].probability: expected above 0 and at most 1, not 2"),
+    (HEAD + 'faults = [{ kind = "late", frame = "drive", start = 0, delay = 0 }]\n',
+     "faults[0].delay: expected above 0"),
+    (HEAD + 'faults = [{ kind = "stuck", signal = "xj", start = 2 }]\n',
+     "faults[0].start: expected a time within main's 1 s, not 2"),
+    (HEAD + 'faults = [{ kind = "stuck", signal = "xj", start = 0.5, end = 0.5 }]\n',
+     "faults[0].end: expected after the start at 0.5 s"),
+    (HEAD + 'faults = [\n{ kind = "parameter", parameter = "filter.clogging", value = 0.1, start = 0 },\n'
+     '{ kind = "parameter", parameter = "filter.clogging", value = 0.2, start = 0.5 }]\n',
+     "mine.toml:5: faults[1].start: expected a time when no other fault changes filter.clogging"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error" }]\n',
+     "mine.toml:3: checks[0]: expected a low, a high, or both"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1, band = 2 }]\n',
+     "checks[0].band: expected a key: 'high'"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1, unit = "bar" }]\n',
+     "checks[0].unit: expected 'm', 'mm' or 'um', not 'bar'"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1, window = "hold_2" }]\n',
+     "checks[0].window: expected a section: 'hold_1' or 'main', not 'hold_2' (did you mean 'hold_1'?)"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1, window = [0, 2] }]\n',
+     "checks[0].window: expected an end within main's 1 s, not 2"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1, window = 3 }]\n',
+     "checks[0].window: expected a text or [a number in s, a number in s], not 3"),
+    (HEAD + 'checks = [{ name = "c", kind = "max_error", high = 1 }, { name = "c", kind = "max_error", high = 1 }]\n',
+     "checks[0].name: expected a name used once, not 2 times 'c'"),
+    (HEAD + 'checks = [{ name = "c", kind = "response_within", after = "x", event = "EMCY", high = 1 }]\n',
+     "checks[0].after: expected a time or one fault"),
+    (HEAD + 'guards = [{ name = "g", signal = "xj" }]\n', "mine.toml:3: guards[0]: expected a low, a high, or both"),
+    (HEAD + 'ends = "never"\n', "mine.toml:3: ends: expected 'completed' or 'safe_state', not 'never'"),
+    (HEAD + "[model]\noverrides = { spool.mas = 1 }\n",
+     "mine.toml:4: model.overrides.spool.mas: expected a field of spool"),
+    (HEAD + '[model]\n[model.overrides]\nspool.mass = -1\n',
+     "mine.toml:5: model.overrides.spool.mass: expected a number"),
+    (HEAD + '[model]\noverrides = 3\n', "model.overrides: expected a table of names, each with a number, not 3"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD, ids=[message[:60] for _, message in BAD])
+def test_a_bad_sequence_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        parse(text)
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value) and str(refusal.value).startswith("mine.toml")
+
+
+def test_lines_of_keys() -> None:
+    text = ('a = "x [ {"\nb = [\n  { c = 1 }, # ]\n  { c = [1,\n 2] },\n]\n["d e".f]\ng.h = """\n\n"""\n'
+            "[[i]]\n[[i]]\nj = 2024-01-01 10:00:00\nk = 1\n")
+    found = toml_lines.lines(text)
+    assert found[("b", 1, "c", 1)] == 5 and found[("b", 0, "c")] == 3
+    assert found[("d e", "f", "g", "h")] == 8 and found[("i", 1)] == 12 and found[("i", 1, "k")] == 14
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_sequence_is_whole(name: str) -> None:
+    s = load_sequence(name)
+    assert s.title and s.description and s.checks and s.cleanup
+    assert Sequence.from_bundle(s.bundle()) == s
+    assert all(line == line.rstrip() for line in s.source.splitlines())
+    assert s.cleanup_profile(3e-3).end == 0.0
+
+
+def test_the_shipped_ones_show_what_there_is() -> None:
+    all_of_them = [load_sequence(name) for name in SHIPPED]
+    assert {"preflight", "clogging_in_flight", "lost_frames"} <= set(SHIPPED)
+    assert {"parameter", "lost", "late", "noise"} <= {fault.kind for s in all_of_them for fault in s.faults}
+    assert any(s.load for s in all_of_them) and any(s.ends == "safe_state" for s in all_of_them)
+
+
+def judge_preflight(changes: dict[str, float], seed: int) -> list[CheckResult]:
+    """The preflight on the model alone, without a bus."""
+    s = load_sequence("preflight")
+    setup, main = s.setup_profile().command, s.main_profile().command
+    run = simulate(load_model("eha").replace(changes), np.concatenate((setup, main)), seed=seed)
+    rows = {name: column[len(setup):] for name, column in run._asdict().items()}
+    return evaluate(s.checks, SimpleNamespace(**{**rows, "t": run.t[:len(main)]}), s.sections())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sound_plant_passes_the_preflight(seed: int) -> None:
+    assert [result for result in judge_preflight({}, seed) if not result.passed] == []
+
+
+@pytest.mark.parametrize(("changes", "felt"), [
+    ({"filter.clogging": 0.5}, {"overshoot, 5 mm", "overshoot, 1 mm", "settling, 5 mm", "error at rest"}),
+    ({"spool.static_friction": 70.0}, {"break-away, out", "break-away, in", "speed of the slip", "settling, 5 mm"}),
+])
+def test_faults_are_visible_in_the_preflight(changes: dict[str, float], felt: set[str]) -> None:
+    failed = {result.name for result in judge_preflight(changes, 1) if not result.passed}
+    assert felt <= failed
