@@ -1,8 +1,8 @@
 """Node 3, the plant emulator: the actuator behind a CANopen interface.
 
 At each SYNC it reads its transducers and sends them, then moves the plant one cycle with the current that was latched:
-the answer to cycle k acts from cycle k+1. Everything that is to go wrong was loaded before the start (object 0x2210), so
-a fault costs no bus time and begins in exactly the cycle the sequence says.
+the answer to cycle k acts from cycle k+1. All that is to go wrong was loaded before the start (object 0x2210), so a
+fault costs no bus time and begins in exactly the cycle the sequence says.
 """
 from __future__ import annotations
 

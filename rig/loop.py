@@ -1,8 +1,8 @@
 """The cycle of the bench: command, SYNC, answers, row. The only loop, for every bus and both paces.
 
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
-fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of firing a
-burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong.
+fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
+firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong.
 """
 from __future__ import annotations
 

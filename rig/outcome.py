@@ -27,6 +27,7 @@ class Outcome:
     checks: Sequence[CheckResult]
     events: Sequence[Happening]
     aborted: str  # why, or ""
+    safe: bool  # the safe state was entered
     interrupted: bool
     timing: dict[str, Any]
     counters: dict[str, int]
@@ -39,7 +40,14 @@ class Outcome:
             return "ABORTED"
         if self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]:
             return "INVALID_TIMING"
-        return "PASS" if all(check.passed for check in self.checks) else "FAIL"
+        return "PASS" if not self.failures else "FAIL"
+
+    @property
+    def failures(self) -> list[str]:
+        """The checks that did not pass, and an end other than the sequence's own."""
+        failed = [check.name for check in self.checks if not check.passed]
+        meant = self.job.sequence.ends == "safe_state"
+        return failed if self.safe or not meant else [*failed, "the run was to end in the safe state"]
 
     @property
     def status(self) -> int:

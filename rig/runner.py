@@ -66,7 +66,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         for check in checks:
             recorder.put(session.now(), _record(check))
         outcome = Outcome(
-            job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted,
+            job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
             interrupted=session.interrupted, timing=timing(loop.timings, loop.overruns, scheduler()),
             counters=_counters(loop.rows), speed=len(loop.rows) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted,

@@ -1,8 +1,7 @@
 """One run from bring-up to clean-up on a bus that is already there: the sequencer.
 
-Set-up, main and clean-up are cycles of one loop. Clean-up always runs. Trouble that a fault of the sequence explains
-puts the bench into its safe state (no current) and main goes on, for the response is what is being tested; trouble that
-none explains ends main.
+Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe state
+(no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it ends.
 """
 from __future__ import annotations
 
@@ -54,7 +53,8 @@ class Session:
         self.events: list[Happening] = []
         self.aborted = ""  # why main ended early
         self.interrupted = False
-        self._safe = False
+        self.safe = False  # no current from here on, until clean-up
+        self._powered = True  # clean-up may use current
         self._edges = sorted(self._faults.edges)
         self._clock = wire.clock
         self._master = Master(wire, self.now)
@@ -97,7 +97,7 @@ class Session:
 
     def _clean_up(self) -> None:
         assert self.loop is not None
-        self._safe = not self._recovered()
+        self._powered = self._recovered()
         self._run(CLEANUP, self._steps(CLEANUP))
         self.loop.finish()
         self._master.stop()
@@ -105,9 +105,9 @@ class Session:
 
     def _recovered(self) -> bool:
         """Try to have all nodes OPERATIONAL and without error again; whether clean-up may use current."""
-        if self._safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
+        if self.safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
             self._master.start()
-        return not self._safe or not self._master.errors()
+        return not self.safe or not self._master.errors()
 
     def _steps(self, phase: int) -> Iterator[tuple[str, Step]]:
         """Section name and step of every cycle of a phase."""
@@ -122,9 +122,9 @@ class Session:
             yield names[i], Step(phase, demand, loads[i] if loads else 0.0, self._control(phase, i))
 
     def _control(self, phase: int, i: int) -> int:
-        if self._safe:
+        if self.safe if phase != CLEANUP else not self._powered:
             return 0
-        if phase == CLEANUP and self.aborted and i == 0:
+        if phase == CLEANUP and self.safe and i == 0:
             return int(Control.RESET)
         return int(_ENABLING[i]) if i < len(_ENABLING) and phase == SETUP else int(Control.ACTIVE)
 
@@ -161,15 +161,13 @@ class Session:
         self.say("ERROR", kind, why)
 
     def _trouble(self, kind: str, what: str) -> None:
-        """A node is in trouble: no current from here on, and an end of main unless a fault was to cause it."""
+        """A node is in trouble: no current from here on, and the end of main unless the sequence is about that."""
         self.say("ERROR", kind, what)
-        k = self.loop.k if self.loop else -1
-        explained = any(edge.begins and edge.cycle <= k for edge in self._faults.edges)
-        if not self._safe:
-            self._safe = True
+        if not self.safe:
+            self.safe = True
             self.say("WARN", "safe_state", f"no current from here on: {what}")
-        if not explained and not self.aborted:
-            self._abort("abort", f"{what}, which no fault of the sequence explains")
+        if self.job.sequence.ends != "safe_state" and not self.aborted:
+            self._abort("abort", what)
 
     def _emcy(self, node: int, error: EmcyError) -> None:
         if error.code & 0xFF00 == 0:

@@ -28,7 +28,7 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
         yield lambda what, done, total: None
         return
     Console(highlight=False).print(f"[bold]{job.sequence.title}[/], {job.sequence.duration:g} s, {job.pace}, "
-                                   f"seed {job.seed}, {why}")
+                                   f"seed {job.seed}, {why}", soft_wrap=True)
     bar = Progress(TextColumn("{task.description:<14}"), BarColumn(40), TextColumn("{task.percentage:>3.0f} %"),
                    TimeElapsedColumn(), console=Console(stderr=True), transient=True)
     with bar:
@@ -94,9 +94,8 @@ def outcome(o: Outcome) -> None:
         if event.level != "INFO":
             console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {event.text}")
     console.print(f"results   {o.folder}/ trace.mcap, verdict.json, report.html")
-    failed = [c.name for c in o.checks if not c.passed]
-    words = o.aborted or (f"{', '.join(failed)}" if o.verdict == "FAIL" else MEANING[o.verdict])
-    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {words}")
+    words = o.aborted or (", ".join(o.failures) if o.verdict == "FAIL" else MEANING[o.verdict])
+    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {words}", soft_wrap=True)
 
 
 def number(value: float) -> str:
