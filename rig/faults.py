@@ -198,10 +198,11 @@ class Schedule:
         self.edges: tuple[Edge, ...] = ()
         for index, fault in enumerate(plan.faults):
             first, last = plan.cycles(fault)
-            self._add(fault, first, last, np.random.default_rng((plan.seed, index)))
+            last = self._add(fault, first, last, np.random.default_rng((plan.seed, index)))
             self.edges += (Edge(first, fault.label, True), Edge(last, fault.label, False))
 
-    def _add(self, fault: Fault, first: int, last: int, rng: np.random.Generator) -> None:
+    def _add(self, fault: Fault, first: int, last: int, rng: np.random.Generator) -> int:
+        """Lay a fault out; returns the cycle in which it is over, which a count of frames may bring forward."""
         match fault:
             case Parameter():
                 if fault.parameter not in self._base:
@@ -214,9 +215,12 @@ class Schedule:
                 self._signals.setdefault(fault.signal, []).append(_Held(fault, first, last))
             case _Frames():
                 action = Delay(round(fault.delay * 1e9)) if isinstance(fault, Late) else Drop()
-                self._frames.setdefault(fault.frame, []).append((first, _hits(fault, last - first, rng), action))
+                hits = _hits(fault, last - first, rng)
+                self._frames.setdefault(fault.frame, []).append((first, hits, action))
+                return first + len(hits)
             case Silent():
                 self._silent.setdefault(fault.node, []).append(range(first, last))
+        return last
 
     def parameters_at(self, cycle: int, since: int | None = None) -> dict[str, float]:
         """The parameters, SI, that differ from what they were in cycle `since` (default: the cycle before)."""
@@ -275,10 +279,10 @@ class _Held:
 
 
 def _hits(fault: _Frames, cycles: int, rng: np.random.Generator) -> bytes:
-    """One byte a cycle, 1 where the fault hits the frame."""
+    """One byte a cycle, 1 where the fault hits the frame; up to the last hit if they are counted."""
     hits = (np.arange(cycles) % fault.every == 0) & (rng.random(cycles) < fault.probability)
-    if fault.count is not None:
-        hits &= np.cumsum(hits) <= fault.count
+    if fault.count is not None and hits.sum() >= fault.count:
+        hits = hits[:np.flatnonzero(hits)[fault.count - 1] + 1]
     return bytes(hits.tobytes())
 
 

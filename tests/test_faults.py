@@ -71,6 +71,7 @@ def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
 def test_frames_are_lost_by_count_period_and_chance() -> None:
     three = schedule(Lost(frame="drive", start=0.01, count=3))
     assert [k for k in range(30) if three.frame("drive", k) is not None] == [10, 11, 12]
+    assert three.edges == ((10, "lost drive", True), (13, "lost drive", False))
     periodic = schedule(Lost(frame="feedback", start=0.0, end=0.1, every=20, count=4))
     assert [k for k in range(200) if periodic.frame("feedback", k) == Drop()] == [0, 20, 40, 60]
     chance = schedule(Lost(frame="command", start=0.0, probability=0.2), seed=3)
