@@ -76,23 +76,31 @@ class Flags(IntFlag):
 
 
 class Command(NamedTuple):
+    """What the rig asks for, frame 0x202."""
+
     position: float  # m
     control: int
     cycle: int
 
 
 class Feedback(NamedTuple):
+    """What the plant's transducers say, frame 0x183."""
+
     position: float  # XJ, m
     pressure: float  # P12, Pa
 
 
 class ValveState(NamedTuple):
+    """The spool and what the plant thinks of its input, frame 0x283."""
+
     spool: float  # XS, m
     flags: int
     cycle: int
 
 
 class Drive(NamedTuple):
+    """What the controller answers, frame 0x182."""
+
     current: float  # Cor, A
     status: int
     cycle: int
@@ -113,34 +121,42 @@ def _saturate(counts: float) -> int:
 # Counts per unit are whole numbers in binary while 1e-7 is not: multiply to encode and divide to decode, so that a raw
 # value decodes to the double nearest to its decimal (50000 -> 0.005) and survives the way there and back.
 def raw_position(metres: float) -> int:
+    """Counts of a position in m."""
     return _saturate(metres * 1e7)
 
 
 def raw_pressure(pascals: float) -> int:
+    """Counts of a pressure in Pa."""
     return _saturate(pascals / 10.0)
 
 
 def raw_spool(metres: float) -> int:
+    """Counts of a spool position in m."""
     return _saturate(metres * 1e9)
 
 
 def raw_current(amperes: float) -> int:
+    """Counts of a current in A."""
     return _saturate(amperes * 1e8)
 
 
 def position(raw: int) -> float:
+    """Metres of a position in counts."""
     return raw / 1e7
 
 
 def pressure(raw: int) -> float:
+    """Pascals of a pressure in counts."""
     return raw * 10.0
 
 
 def spool(raw: int) -> float:
+    """Metres of a spool position in counts."""
     return raw / 1e9
 
 
 def current(raw: int) -> float:
+    """Amperes of a current in counts."""
     return raw / 1e8
 
 

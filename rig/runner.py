@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -58,9 +57,9 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         progress("bring-up", 0, 0)
         session.bring_up()
         assert session.loop is not None
-        begun = time.perf_counter()
+        stopwatch = WallClock()
         session.play()
-        spent = time.perf_counter() - begun
+        spent = stopwatch.now() * 1e-9
         loop = session.loop
         checks = judge(job, session, loop.rows)
         for check in checks:

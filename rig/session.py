@@ -1,7 +1,7 @@
 """One run from bring-up to clean-up on a bus that is already there: the sequencer.
 
-Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe state
-(no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it ends.
+Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe
+state (no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it ends.
 """
 from __future__ import annotations
 

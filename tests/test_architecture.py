@@ -51,6 +51,7 @@ CLOCK_FILES = (
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
     "plant.effects": {"CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"},
+    "fdi": {"Trace"},
     "rig.device": {
         "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
     },
