@@ -14,6 +14,7 @@ from vcan.support import APT_LINE, guest_missing, kernel_has_vcan0
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
 GUEST_TESTS = pytest.StashKey[int]()  # socketcan tests that passed in the guest
+NOTES = pytest.StashKey[list[str]]()  # sentences for the summary, such as what the dissector found
 LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
 RUNNER = "tests/vcan/test_vcan_guest.py"
 
@@ -37,7 +38,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """One line: tests passed per bus; and what it takes where none ran on a real CAN interface."""
+    """The notes, the tests passed per bus, and what it takes where none ran on a real CAN interface."""
+    for note in config.stash.get(NOTES, []):
+        terminalreporter.write_line(note)
     passed = terminalreporter.stats.get("passed", [])
     counts = Counter(bus for report in passed if (bus := bus_of(report.nodeid)))
     in_guest = config.stash.get(GUEST_TESTS, 0)

@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST
+from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTES
 from vcan import dissect
 from vcan.support import APT_LINE, FOLDER, REQUIRED, guest_missing, in_guest, kernel_has_vcan0
 
@@ -65,7 +65,14 @@ def frames(out: Path) -> list[tuple[int, bytes]]:
     return dissect.candump_frames(out / "candump.log")
 
 
-def test_preflight_passes_with_three_processes(out: Path, frames: list[tuple[int, bytes]]) -> None:
+def note(config: pytest.Config, text: str) -> None:
+    """Say it in the session's summary."""
+    config.stash.setdefault(NOTES, []).append(text)
+
+
+def test_preflight_passes_with_three_processes(
+    out: Path, frames: list[tuple[int, bytes]], pytestconfig: pytest.Config
+) -> None:
     """Plant, controller and sequencer are processes that share nothing but vcan0."""
     facts = json.loads((out / "facts.json").read_text())
     logs = "\n".join(f"{name}: {(out / f'{name}.log').read_text()}" for name in ("plant", "controller", "run"))
@@ -75,7 +82,7 @@ def test_preflight_passes_with_three_processes(out: Path, frames: list[tuple[int
     assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
     counts = Counter(cob_id for cob_id, _ in frames)
     assert counts[0x080] >= answer["timing"]["cycles"] > 1000
-    print(f"\npreflight on vcan0, three processes: {counts[0x080]} cycles in {facts['seconds']:.1f} s")
+    note(pytestconfig, f"vcan0: preflight by three processes, {counts[0x080]} cycles in {facts['seconds']:.0f} s")
 
 
 def test_cyclic_frames_are_in_order(frames: list[tuple[int, bytes]]) -> None:
@@ -92,7 +99,9 @@ def test_log_holds_what_was_on_the_bus(out: Path, frames: list[tuple[int, bytes]
     assert all(logged[cob_id] <= heard[cob_id] for cob_id in logged)
 
 
-def test_wireshark_decodes_every_frame(out: Path, frames: list[tuple[int, bytes]]) -> None:
+def test_wireshark_decodes_every_frame(
+    out: Path, frames: list[tuple[int, bytes]], pytestconfig: pytest.Config
+) -> None:
     """tshark's CANopen dissector finds every service, counts the same frames, and calls none malformed."""
     if shutil.which("tshark") is None:
         unavailable("tshark is missing")
@@ -102,7 +111,7 @@ def test_wireshark_decodes_every_frame(out: Path, frames: list[tuple[int, bytes]
     assert counts == Counter(cob_id for cob_id, _ in frames)
     assert {cob_id: name for cob_id, name in SERVICES.items() if not counts[cob_id]} == {}
     named = ", ".join(f"{cob_id:03X}: {number}" for cob_id, number in sorted(counts.items()))
-    print(f"\ntshark decoded {len(rows)} CANopen frames, none malformed: {named}")
+    note(pytestconfig, f"vcan0: tshark decoded {len(rows)} CANopen frames, none malformed; {named}")
 
 
 def test_dissector_tells_a_broken_frame(tmp_path: Path) -> None:
