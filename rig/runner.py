@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +22,7 @@ from rig.job import Job
 from rig.link import Link
 from rig.master import CONTROLLER, NAMES, PLANT, BusError, Master
 from rig.outcome import Outcome, timing
+from rig.priority import elevated, scheduler, uncollected
 from rig.recorder import Check, Recorder, Signals
 from rig.recorder.provenance import provenance
 from rig.session import MAIN, Progress, Session
@@ -58,7 +58,12 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         session.bring_up()
         assert session.loop is not None
         stopwatch = WallClock()
-        session.play()
+        with contextlib.ExitStack() as rights:
+            if job.realtime:
+                rights.enter_context(elevated())
+                rights.enter_context(uncollected())
+            scheduled = scheduler()
+            session.play()
         spent = stopwatch.now() * 1e-9
         loop = session.loop
         checks = judge(job, session, loop.rows)
@@ -66,7 +71,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
             recorder.put(session.now(), _record(check))
         outcome = Outcome(
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-            interrupted=session.interrupted, timing=timing(loop.timings, loop.overruns, scheduler()),
+            interrupted=session.interrupted, timing=timing(loop.timings, loop.overruns, scheduled),
             counters=_counters(loop.rows), speed=len(loop.rows) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted,
                                       "overruns": str(loop.overruns)})
@@ -136,12 +141,6 @@ def _start(job: Job, name: str) -> subprocess.Popen[bytes]:
     effects = [word for path in job.effects for word in ("--effects", str(path))]
     command = [sys.executable, "-m", "rig.cli", "node", name, "--bus", job.bus, "--quiet", *effects]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL)
-
-
-def scheduler() -> str:
-    """How the kernel schedules this process."""
-    names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
-    return names.get(os.sched_getscheduler(0), "unknown") if hasattr(os, "sched_getscheduler") else "unknown"
 
 
 def _counters(rows: Sequence[Signals]) -> dict[str, int]:

@@ -28,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from rig.emulator import Emulator
     from rig.firmware import Firmware
     from rig.link import Link
+    from rig.priority import elevated
     from rig.runner import EMBEDDED
     from rig.wire import serve
 
@@ -44,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
     try:
-        serve(node, link, clock, lambda: bool(ended))
+        with elevated():
+            serve(node, link, clock, lambda: bool(ended))
     finally:
         link.close()
     if not args.quiet:
