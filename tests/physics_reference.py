@@ -1,0 +1,202 @@
+"""The reference model once more, written from the equations alone, to hold the plant against.
+
+`explicit` is a plain 1 us integration with Karnopp's friction; `piecewise` an adaptive implicit solver (Radau) with
+the stops as events; `linear` the matrix exponential where nothing saturates. None of them shares code or scheme with
+plant/.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+CYCLE = 1e-3  # s
+
+
+class Plant(NamedTuple):
+    """The symbols of the equations, filter law and clogging worked in."""
+
+    GAP: float
+    Imax: float
+    GM: float
+    JF: float
+    BF: float
+    KF: float
+    XFM: float
+    KSF: float
+    GQF1: float
+    GPF1: float
+    PS1: float
+    ASV: float
+    MS: float
+    CS: float
+    FSS: float
+    FDS: float
+    XSM: float
+    GQ: float
+    GP: float
+    PSR: float
+    AJ: float
+    MJ: float
+    CJ: float
+    FSJ: float
+    FDJ: float
+    CLK: float
+    XJM: float
+
+
+def plant(v: Mapping[str, float]) -> Plant:
+    """The symbols from "group.field" values; clogging after the law "sqrt"."""
+    left = 1 - v["filter.clogging"]
+    assert v["filter.law"] == 0.5
+    return Plant(
+        v["controller.proportional_gain"], v["controller.current_limit"], v["torque_motor.gain"], v["flapper.inertia"],
+        v["flapper.damping"], v["flapper.stiffness"], v["flapper.travel"], v["feedback_spring.stiffness"],
+        v["pilot.flow_gain"] * left**0.5, v["pilot.pressure_gain"] * left, v["supply.pressure"] * left,
+        v["spool.end_area"], v["spool.mass"], v["spool.damping"], v["spool.static_friction"],
+        v["spool.dynamic_friction"], v["spool.travel"], v["valve.flow_gain"], v["valve.pressure_gain"],
+        v["supply.pressure"], v["jack.area"], v["jack.mass"], v["jack.damping"], v["jack.static_friction"],
+        v["jack.dynamic_friction"], v["jack.leakage"], v["jack.travel"])
+
+
+@numba.njit
+def _dry(v: float, force: float, static: float, dynamic: float) -> float:
+    """Net force on a body at speed v after dry friction (Karnopp with a band of zero width)."""
+    if v > 0.0:
+        return force - dynamic
+    if v < 0.0:
+        return force + dynamic
+    if abs(force) <= static:
+        return 0.0
+    return force - dynamic if force > 0.0 else force + dynamic
+
+
+@numba.njit
+def _move(x: float, v: float, acceleration: float, h: float, travel: float) -> tuple[float, float]:
+    new = v + h * acceleration
+    if new * v < 0.0:
+        new = 0.0
+    x = x + h * new
+    if abs(x) >= travel:
+        return (travel if x > 0.0 else -travel), 0.0
+    return x, new
+
+
+@numba.njit
+def _explicit(p: Any, com: Any, measured: Any, replay: bool, load: Any, substeps: int, out: Any) -> None:
+    xf = vf = xs = vs = xj = vj = p12 = current = 0.0
+    h = 1e-3 / substeps
+    for k in range(len(com)):
+        wanted = p.GAP * (com[k] - xj)
+        answer = measured[k] if replay else min(max(wanted, -p.Imax), p.Imax)
+        out[0, k], out[1, k], out[2, k], out[3, k] = xj, answer, p12, xs
+        for _ in range(substeps):
+            acceleration = (p.GM * current - p.KSF * xs - p.KF * xf - p.BF * vf) / p.JF
+            vf = vf + h * acceleration
+            xf = xf + h * vf
+            if abs(xf) >= p.XFM:
+                xf, vf = (p.XFM if xf > 0.0 else -p.XFM), 0.0
+            p1 = p.GPF1 * xf - p.GPF1 / p.GQF1 * p.ASV * vs
+            p1 = min(max(p1, -p.PS1), p.PS1)
+            xs, vs = _move(xs, vs, _dry(vs, p.ASV * p1 - p.CS * vs, p.FSS, p.FDS) / p.MS, h, p.XSM)
+            # P12 = GP XS - GP/GQ (AJ XJ' + CLK P12), solved for P12
+            p12 = (p.GP * xs - p.GP / p.GQ * p.AJ * vj) / (1.0 + p.GP / p.GQ * p.CLK)
+            p12 = min(max(p12, -p.PSR), p.PSR)
+            force = _dry(vj, p.AJ * p12 - p.CJ * vj - load[k], p.FSJ, p.FDJ)
+            xj, vj = _move(xj, vj, force / p.MJ, h, p.XJM)
+        current = answer
+
+
+def explicit(v: Mapping[str, float], com: Any, load: Any = None, measured: Any = None, substeps: int = 1000) -> Any:
+    """Rows XJ, Cor, P12, XS, shape (4, n), at 1 us (semi-implicit Euler); `measured` current instead of the law's."""
+    out = np.empty((4, len(com)))
+    force = np.zeros(len(com)) if load is None else np.asarray(load, float)
+    replayed = np.zeros(len(com)) if measured is None else np.asarray(measured, float)
+    _explicit(plant(v), np.asarray(com, float), replayed, measured is not None, force, substeps, out)
+    return out
+
+
+class _Modes(NamedTuple):
+    flapper: float = 0.0  # +-1: held at that stop
+    spool: float = 0.0
+
+
+def piecewise(v: Mapping[str, float], com: Any) -> Any:
+    """Rows XJ, Cor, P12, XS without friction: Radau at tight tolerance, inelastic stops as events."""
+    p, out, y, current, modes = plant(v), np.empty((4, len(com))), np.zeros(6), 0.0, _Modes()
+    assert p.FSS == p.FSJ == 0
+    for k, demand in enumerate(com):
+        answer = float(np.clip(p.GAP * (demand - y[4]), -p.Imax, p.Imax))
+        out[:, k] = y[4], answer, _p12(p, y), y[2]
+        y, modes = _cycle(p, y, current, modes)
+        current = answer
+    return out
+
+
+def _p12(p: Plant, y: Any) -> float:
+    line = (p.GP * y[2] - p.GP / p.GQ * p.AJ * y[5]) / (1 + p.GP / p.GQ * p.CLK)
+    return float(np.clip(line, -p.PSR, p.PSR))
+
+
+def _forces(p: Plant, y: Any, current: float) -> tuple[float, float, float]:
+    xf, vf, xs, vs, _, vj = y
+    p1 = float(np.clip(p.GPF1 * (xf - p.ASV * vs / p.GQF1), -p.PS1, p.PS1))
+    return (p.GM * current - p.KSF * xs - p.KF * xf - p.BF * vf, p.ASV * p1 - p.CS * vs,
+            p.AJ * _p12(p, y) - p.CJ * vj)
+
+
+def _cycle(p: Plant, y: Any, current: float, modes: _Modes) -> tuple[Any, _Modes]:
+    """One cycle, restarted at each arrival at a stop and each departure from one."""
+    t = 0.0
+    while t < CYCLE:
+        torque, push, _ = _forces(p, y, current)  # a body that is pushed away from its stop leaves it
+        modes = _Modes(0.0 if torque * modes.flapper < 0 else modes.flapper,
+                       0.0 if push * modes.spool < 0 else modes.spool)
+
+        def rates(_: float, y: Any, m: _Modes = modes) -> Any:
+            torque, push, pull = _forces(p, y, current)
+            flapper = (0.0, 0.0) if m.flapper else (y[1], torque / p.JF)
+            spool = (0.0, 0.0) if m.spool else (y[3], push / p.MS)
+            return (*flapper, *spool, y[5], pull / p.MJ)
+
+        events = [lambda _, y, m=modes: _forces(p, y, current)[0] * m.flapper if m.flapper else abs(y[0]) - p.XFM,
+                  lambda _, y, m=modes: _forces(p, y, current)[1] * m.spool if m.spool else abs(y[2]) - p.XSM]
+        for event, held in zip(events, modes, strict=True):
+            event.terminal, event.direction = True, -1 if held else 1
+        run = solve_ivp(rates, (t, CYCLE), y, "Radau", events=events, rtol=1e-9,
+                        atol=[1e-13, 1e-9, 1e-12, 1e-8, 1e-12, 1e-9], max_step=1e-4)
+        t, y = run.t[-1], run.y[:, -1].copy()
+        if run.status == 1:
+            at_flapper, at_spool = (len(hits) > 0 for hits in run.t_events)
+            if at_flapper:
+                modes = modes._replace(flapper=0.0 if modes.flapper else float(np.sign(y[0])))
+                y[1] = 0.0
+            if at_spool:
+                modes = modes._replace(spool=0.0 if modes.spool else float(np.sign(y[2])))
+                y[3] = 0.0
+    return y, modes
+
+
+def linear(v: Mapping[str, float], com: Any) -> Any:
+    """Rows XJ, Cor, P12, XS without friction, exact to rounding; asserts that nothing saturates."""
+    p, out, y, current = plant(v), np.empty((4, len(com))), np.zeros(6), 0.0
+    unit = np.eye(6)
+    wide = p._replace(PS1=np.inf, PSR=np.inf)
+
+    def rates(y: Any, current: float) -> Any:
+        torque, push, pull = _forces(wide, y, current)
+        return np.array([y[1], torque / p.JF, y[3], push / p.MS, y[5], pull / p.MJ])
+
+    a = np.column_stack([rates(column, 0.0) for column in unit] + [rates(np.zeros(6), 1.0)])
+    one = expm(CYCLE * np.vstack([a, np.zeros(7)]))
+    for k, demand in enumerate(com):
+        answer = p.GAP * (demand - y[4])
+        out[:, k] = y[4], answer, _p12(wide, y), y[2]
+        y = one[:6, :6] @ y + one[:6, 6] * current
+        current = answer
+    assert np.abs(out[1]).max() < p.Imax and np.abs(out[2]).max() < p.PSR and np.abs(out[3]).max() < p.XSM
+    return out
