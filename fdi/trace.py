@@ -160,7 +160,7 @@ def _from_csv(path: Path) -> Trace:
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")
-    typical = float(np.median(np.diff(t)))
+    typical = float(np.percentile(np.diff(t), 50, method="lower"))
     rows = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / typical).astype(int))])
     if (np.diff(rows) < 1).any():
         line = int(np.argmin(np.diff(rows))) + 3

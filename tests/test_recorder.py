@@ -35,7 +35,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_packed_record_is_what_protobuf_reads(kind: type, data: st.DataObject) -> None:
     from mcap.records import Schema
 
-    hints = get_type_hints(kind)
+    hints = get_type_hints(kind, include_extras=True)
     values = {f.name: data.draw(VALUES[hints[f.name]]) for f in fields(kind)}
     t_ns = data.draw(st.integers(0, 2**63))
     item = Frame(t_ns, values["cob_id"], values["data"]) if kind is CanFrame else kind(**values)
