@@ -35,11 +35,12 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, INVALID_TIMING or ABORTED."""
+        """PASS, FAIL, INVALID_TIMING or ABORTED. A bench that was late itself blames nobody else for what came of it."""
+        late = self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]
+        if late and not self.interrupted:
+            return "INVALID_TIMING"
         if self.aborted:
             return "ABORTED"
-        if self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]:
-            return "INVALID_TIMING"
         return "PASS" if not self.failures else "FAIL"
 
     @property

@@ -16,8 +16,9 @@ from rich.table import Table
 from rig.job import Job
 from rig.outcome import Outcome
 
+EVENTS = 12  # shown in the terminal
 COLOURS = {"PASS": "green", "FAIL": "red", "ABORTED": "red", "INVALID_TIMING": "yellow"}
-MEANING = {"PASS": "every check passed", "FAIL": "a check did not pass", "ABORTED": "the run was ended early",
+MEANING = {"PASS": "every check passed",
            "INVALID_TIMING": "the bench itself was too late too often: nothing can be said of the controller"}
 
 
@@ -90,11 +91,13 @@ def outcome(o: Outcome) -> None:
     missing = {name: count for name, count in o.counters.items() if count}
     if missing:
         console.print("missing   " + ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in missing.items()))
-    for event in o.events:
-        if event.level != "INFO":
-            console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {event.text}")
+    notable = [event for event in o.events if event.level != "INFO"]
+    for event in notable[:EVENTS]:
+        console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {event.text}", soft_wrap=True)
+    if len(notable) > EVENTS:
+        console.print(f"            and {len(notable) - EVENTS} more in the report")
     console.print(f"results   {o.folder}/ trace.mcap, verdict.json, report.html")
-    words = o.aborted or (", ".join(o.failures) if o.verdict == "FAIL" else MEANING[o.verdict])
+    words = {"FAIL": ", ".join(o.failures), "ABORTED": o.aborted}.get(o.verdict, MEANING.get(o.verdict))
     console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {words}", soft_wrap=True)
 
 
