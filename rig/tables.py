@@ -61,7 +61,7 @@ def read(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) 
     pairs = dict(table)
     if cls in kinds:
         kind = pairs.pop("kind", None)
-        if kind not in kinds[cls]:
+        if not isinstance(kind, str) or kind not in kinds[cls]:
             raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {one_of(kind, kinds[cls])}")
         cls = kinds[cls][kind]
     hints = get_type_hints(cls, include_extras=True)

@@ -115,6 +115,7 @@ BAD = [  # text, then what the user reads
      "mine.toml:4: main[1].kind: expected a kind: 'chirp', 'csv', 'hold', 'multisine', 'points', 'ramp', 'sine' or "
      "'step', not 'stepp' (did you mean 'step'?)"),
     ('title = "T"\nmain = [{ time = 1 }]\n', "mine.toml:2: main[0]: expected a kind: 'chirp', 'csv'"),
+    ('title = "T"\nmain = [{ kind = [], time = 1 }]\n', "mine.toml:2: main[0].kind: expected a kind: 'chirp', 'csv'"),
     ('title = "T"\nmain = [{ kind = "step", time = 1 }]\n',
      "mine.toml:2: main[0]: expected also the key 'to', a number in m (N for a load)"),
     ('title = "T"\nmain = [{ kind = "step", to = "far", time = 1 }]\n',
