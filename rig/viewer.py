@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import socket
 import subprocess
@@ -228,8 +229,13 @@ def _blueprint(rr: Any, trace: Trace) -> Any:
 
 
 def open_viewer(rrd: Path) -> None:
-    """Open the viewer's window on a recording and leave it open; it listens on 127.0.0.1 only."""
+    """Open the viewer's window on a recording and leave it open; it listens on 127.0.0.1 only.
+
+    Raises ViewerError without rerun and without a display.
+    """
     rerun()
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or ask for --screenshot")
     subprocess.Popen(_command(rrd, "auto"), start_new_session=True)
 
 

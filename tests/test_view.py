@@ -58,6 +58,15 @@ def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: py
         viewer.write_rrd(Trace.read(folder), folder / "none.rrd")
 
 
+def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    if importlib.util.find_spec("rerun") is None or sys.platform != "linux":
+        pytest.skip("no rerun, or no Linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(viewer.ViewerError, match="no display"):
+        viewer.open_viewer(Path("x.rrd"))
+
+
 def test_it_listens_on_this_machine_only() -> None:
     words = viewer._command(Path("x.rrd"), "9999")
     assert words[words.index("--bind") + 1] == "127.0.0.1"

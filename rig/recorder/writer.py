@@ -1,6 +1,6 @@
 """The log of a run: the loop appends to a queue, a thread of its own packs and writes.
 
-The thread wakes every 10 ms, so that it holds the interpreter lock for some 0.1 ms at a time and not for milliseconds;
+The thread wakes every 10 ms, so that it holds the interpreter lock for some 0.15 ms at a time and not for milliseconds;
 compression and disk writes release the lock. A chunk is closed at 64 KiB, 0.25 s of run time or 0.2 s of wall time,
 whichever comes first: that bounds what a killed process loses.
 """
