@@ -35,7 +35,7 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, INVALID_TIMING or ABORTED. A bench that was late itself blames nobody else for what came of it."""
+        """PASS, FAIL, INVALID_TIMING or ABORTED. A bench that was late itself blames nobody else for what follows."""
         late = self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]
         if late and not self.interrupted:
             return "INVALID_TIMING"

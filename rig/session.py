@@ -1,7 +1,8 @@
 """One run from bring-up to clean-up on a bus that is already there: the sequencer.
 
 Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe
-state (no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it ends.
+state (no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it
+ends.
 """
 from __future__ import annotations
 
@@ -171,7 +172,7 @@ class Session:
 
     def _emcy(self, node: int, error: EmcyError) -> None:
         if error.code & 0xFF00 == 0:
-            self.say("INFO", "emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} no error")
+            self.say("INFO", "recovered", f"node {node} {NAMES[node]}: no error any more")
         else:
             self._trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
 

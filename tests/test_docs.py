@@ -1,0 +1,74 @@
+"""What the documentation says is there, is there; what it shows, works."""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plant import Model, segments, simulate
+from plant.effects import CATALOGUE, load_effects
+from rig import checks, cli, faults
+from rig.guards import Guard
+from rig.sequence import Sequence, parse_sequence
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
+
+
+def blocks(text: str) -> list[str]:
+    """The indented blocks of a Markdown text, without their indentation."""
+    found = re.findall(r"(?:^    .*\n(?:\s*\n(?=    ))?)+", text, re.MULTILINE)
+    return [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in found]
+
+
+def keys() -> Iterator[tuple[str, str]]:
+    for kinds in (segments.KINDS, faults.KINDS, checks.KINDS):
+        for kind, cls in kinds.items():
+            yield kind, kind
+            yield from ((kind, f.name) for f in fields(cls) if f.metadata.get("key", True))
+    yield from (("sequence", f.name) for f in fields(Sequence) if f.metadata.get("key", True))
+    yield from (("guard", f.name) for f in fields(Guard))
+
+
+@pytest.mark.parametrize(("where", "key"), sorted(set(keys())))
+def test_every_key_of_a_sequence_is_described(where: str, key: str) -> None:
+    assert re.search(rf"`{key}`", SEQUENCES), f"docs/sequences.md says nothing about {key} of {where}"
+
+
+def test_the_sequence_in_the_readme_is_one() -> None:
+    text = next(block for block in blocks(README) if block.startswith("title ="))
+    sequence = parse_sequence(text, "readme.toml", lambda name: b"")
+    assert sequence.faults and sequence.checks and sequence.guards and sequence.load
+
+
+def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
+    text = next(block for block in blocks(README) if block.startswith("# my_effects.py")).split("\nrig run")[0]
+    (tmp_path / "my_effects.py").write_text(text)
+    try:
+        assert load_effects(tmp_path / "my_effects.py") == ["cogging"]
+        command = np.full(50, 1e-3)
+        plain, cogged = (simulate(model, command).xj for model in (Model(), Model().replace({"cogging.force": 2e3})))
+        assert np.abs(plain - cogged).max() > 1e-6
+    finally:
+        CATALOGUE.pop("cogging", None)
+
+
+def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
+    said = set(re.findall(r"\brig ([a-z]+)\b", "\n".join(blocks(README)))) | set(re.findall(r"`rig ([a-z]+)", README))
+    assert said == set(cli.command_modules())
+
+
+@pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))
+def test_every_page_is_linked(page: str) -> None:
+    assert f"docs/{page}" in README + (ROOT / "ARCHITECTURE.md").read_text()
+
+
+def test_every_link_leads_somewhere() -> None:
+    for page in [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
