@@ -107,7 +107,7 @@ def spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float
     xf, m_nozzle = at_nozzle(xf, s.memory.nozzle, s, u, p)
     force, m_force = at_spool_force(0.0, s.memory.spool_force, s, u, p)
     v0, g = s.spool_speed, p.spool
-    dry = u.h * (g.static_friction if v0 == 0.0 else g.dynamic_friction)
+    dry = u.h * g.static_friction if v0 == 0.0 else u.h * g.dynamic_friction
     v = slide(v0, g.mass * v0 + u.h * force, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry,
               k.spool_free, k.spool_coupled)
     x, v = travel(s.spool_position, v0, v, u.h, g.travel)
@@ -127,7 +127,7 @@ def jack(s: State, u: Input, p: Any, k: Coefficients, xs: float
     free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
     same = drag.damping == 0.0 and line.slope == k.valve_slope
     coupled = k.jack_coupled if same else 1.0 / (mass + push * line.slope)
-    dry = h * (drag.static if v0 == 0.0 else drag.dynamic)
+    dry = h * drag.static if v0 == 0.0 else h * drag.dynamic
     impulse = g.mass * v0 - h * (load + drag.force)
     v = slide(v0, impulse, push, line.offset, line.slope, k.valve_limit, dry, free, coupled)
     x, v = travel(s.jack_position, v0, v, h, g.travel)

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,8 +56,8 @@ class Accuracy(NamedTuple):
     largest_friction: float
 
 
-def medians(runs: Mapping[str, Run], rounds: int) -> dict[str, float]:
-    """Median duration of each run, s, after one to warm up; the rounds alternate."""
+def durations(runs: Mapping[str, Run], rounds: int) -> dict[str, Array]:
+    """Durations of each run, (rounds,) s, after one to warm up; the rounds alternate."""
     clock = WallClock()
     taken: dict[str, list[int]] = {name: [] for name in runs}
     for turn in range(rounds + 1):
@@ -67,7 +66,12 @@ def medians(runs: Mapping[str, Run], rounds: int) -> dict[str, float]:
             run()
             if turn:
                 taken[name].append(clock.now() - start)
-    return {name: median(times) * 1e-9 for name, times in taken.items()}
+    return {name: np.array(times) * 1e-9 for name, times in taken.items()}
+
+
+def duration(run: Run, rounds: int) -> float:
+    """Median duration of a run, s."""
+    return float(np.median(durations({"": run}, rounds)[""]))
 
 
 def step_vs_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
@@ -82,11 +86,11 @@ def step_vs_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost 
         for name, flags in (("c", FLAGS), ("c_same_rounding", SAME_ROUNDING)):
             library = _built(gcc, flags, Path(folder) / f"{name}.so")
             runs[name], outs[name] = _c_run(library, model, command, draws, steps)
-        seconds = medians(runs, rounds)
-    each = {name: t / (len(command) * steps) * 1e9 for name, t in seconds.items()}
+        seconds = durations(runs, rounds)
+    each = {name: float(np.median(t)) / (len(command) * steps) * 1e9 for name, t in seconds.items()}
+    ratios = {name: float(np.median(seconds["python"] / t)) for name, t in seconds.items()}  # round by round
     version = subprocess.run([gcc, "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
-    return StepCost(each["python"], each["c"], each["c_same_rounding"], each["python"] / each["c"],
-                    each["python"] / each["c_same_rounding"],
+    return StepCost(each["python"], each["c"], each["c_same_rounding"], ratios["c"], ratios["c_same_rounding"],
                     float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
                     bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version}")
 
@@ -124,13 +128,13 @@ def cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
         for _ in range(cycles):
             plant.advance(1e-3 * plant.sample()[0])
 
-    return medians({"cycle": run}, rounds)["cycle"] / cycles
+    return duration(run, rounds) / cycles
 
 
 def speed(command: Array, rounds: int = 9) -> float:
     """How many times faster than real time a whole simulated run is, its noise and its columns included."""
     model = Model()
-    return len(command) * model["controller.period"] / medians({"": lambda: simulate(model, command)}, rounds)[""]
+    return len(command) * model["controller.period"] / duration(lambda: simulate(model, command), rounds)
 
 
 def accuracy(command: Array, steps: tuple[int, ...] = (20, 50, 100, 200, 500), finest: int = FINEST) -> list[Accuracy]:

@@ -87,13 +87,13 @@ static inline State step(State s, double current, double load, const Model *rest
                     - p->feedback_spring.stiffness * (s.xs + 0.5 * h * s.vs);
     travel(&s.xf, &s.vf, k.keep * s.vf + k.push * torque, h, p->flapper.travel);
 
-    double dry = h * (s.vs == 0.0 ? p->spool.static_friction : p->spool.dynamic_friction);
+    double dry = s.vs == 0.0 ? h * p->spool.static_friction : h * p->spool.dynamic_friction;
     double v = slide(s.vs, p->spool.mass * s.vs, k.spool_push, k.pilot_gain * s.xf, k.pilot_slope, k.pilot_limit,
                      dry, k.spool_free, k.spool_coupled);
     travel(&s.xs, &s.vs, v, h, p->spool.travel);
 
     double line = k.valve_gain * s.xs;
-    dry = h * (s.vj == 0.0 ? p->jack.static_friction : p->jack.dynamic_friction);
+    dry = s.vj == 0.0 ? h * p->jack.static_friction : h * p->jack.dynamic_friction;
     v = slide(s.vj, p->jack.mass * s.vj - h * load, h * p->jack.area, line, k.valve_slope, k.valve_limit, dry,
               k.jack_free, k.jack_coupled);
     travel(&s.xj, &s.vj, v, h, p->jack.travel);

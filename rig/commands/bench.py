@@ -43,11 +43,15 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from rig.bench import GET_GCC
+
     console = Console()
     table = Table("The plant", "", "Python / C", "against Python", box=None, pad_edge=False)
     for row in _costs(answer):
         table.add_row(*row)
     console.print(table)
+    if answer["step"] is None:
+        console.print(f"step beside C: skipped, there is no gcc; to get it: {GET_GCC}")
     if rows:
         console.print()
         console.print("Error of XJ over the preflight, closed loop, against steps of 0.2 us, um")
@@ -60,17 +64,15 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
 
 def _costs(answer: dict[str, Any]) -> list[tuple[str, ...]]:
     """Rows of the table: what, cost, ratio, how far the results are apart."""
-    from rig.bench import GET_GCC
-
     step = answer["step"]
     rows: list[tuple[str, ...]] = [("preflight, simulated", f"{answer['times_real_time']:.0f} x real time"),
                                    ("cycle of Actuator from Python", f"{answer['cycle'] * 1e6:.1f} us")]
     if step is None:
-        return [*rows, ("step beside C", f"skipped: no gcc ({GET_GCC})")]
+        return rows
     same = "equal bit for bit" if step["identical"] else "NOT equal"
     return [*rows,
             ("step, compiled Python", f"{step['python']:.1f} ns"),
-            (f"step, C, {step['compiler']} -O3 -march=native", f"{step['c']:.1f} ns", f"{step['ratio']:.2f}",
+            (f"step, {step['compiler']} -O3 -march=native", f"{step['c']:.1f} ns", f"{step['ratio']:.2f}",
              f"within {step['difference'] * 1e6:.0e} um"),
-            ("step, C, and -ffp-contract=off", f"{step['c_same_rounding']:.1f} ns",
+            ("step, gcc, and -ffp-contract=off", f"{step['c_same_rounding']:.1f} ns",
              f"{step['ratio_same_rounding']:.2f}", same)]
