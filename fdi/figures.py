@@ -22,7 +22,8 @@ STYLE: Any = {  # matplotlib's types want each key as a literal
 COLUMNS = 1400  # a line is drawn by its extremes in this many columns; more cannot be seen
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
           ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
-          ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"), ("load", "load [kN]", 1e-3, "#57606a"))
+          ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
+          ("load", "load [kN]", 1e-3, "#57606a"))
 
 
 def signals(trace: Trace) -> str:

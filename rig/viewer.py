@@ -1,231 +1,22 @@
-"""A trace in the rerun viewer: columns sent whole, and a blueprint made for this bench."""
+"""Running the rerun viewer: its window, or a picture without a display that is checked for errors and empty views."""
 from __future__ import annotations
 
-import math
 import os
-import re
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fdi.sections import Section
-from fdi.trace import Check, Trace
-from plant.errors import RigError
-from rig.units import IN_SI
+from fdi.trace import Trace
+from rig.recording import PLOTS, ViewerError, lines, rerun
 
-if TYPE_CHECKING:
-    import rerun as rr
-
-Floats = NDArray[np.float64]
-TIMELINE = "run"
 SEEN = 500  # pixels; the marks in a legend have some 60 each
 FADING = 5.0  # s; the viewer's own greeting covers a corner for that long
-COMMAND, MEASURED, LIMIT, PASS, FAIL, NEUTRAL = 0xC9CFD6FF, 0x3D8FE0FF, 0xE5534BFF, 0x3FA65AFF, 0xE5534BFF, 0x6B7785FF
-STATES = {"operational": PASS, "pre-operational": 0xD9A441FF, "stopped": FAIL, "boot-up": NEUTRAL}
-
-
-class Line(NamedTuple):
-    """One line of a plot."""
-
-    path: str
-    name: str
-    colour: int
-    width: float = 1.5
-
-
-class Plot(NamedTuple):
-    """One time-series view."""
-
-    origin: str
-    title: str
-    lines: tuple[Line, ...]
-
-
-PLOTS = (
-    Plot("position", "Position [mm]", (Line("command", "Com command [mm]", COMMAND, 4.0),
-                                       Line("ram", "XJ ram [mm]", MEASURED))),
-    Plot("error", "Following error [um]", (Line("error", "Com - XJ [um]", 0xE8A33DFF),)),
-    Plot("current", "Current [mA]", (Line("current", "Cor current [mA]", 0xB57EDCFF),)),
-    Plot("pressure", "Differential pressure [MPa]", (Line("pressure", "P12 pressure [MPa]", 0x45B8ACFF),)),
-    Plot("spool", "Spool position [um]", (Line("spool", "XS spool [um]", 0xD96BA0FF),)),
-    Plot("timing", "Cycle timing [us]", (Line("lateness", "SYNC lateness [us]", 0xF2C94CFF, 1.0),
-                                         Line("response", "controller's response [us]", 0x7FD46BFF, 1.0),
-                                         Line("work", "bench's own work [us]", 0x8C7AE6FF, 1.0))),
-)
-SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
-SHOWN_IN = {"xj": ("position", 1e3), "com": ("position", 1e3), "error": ("error", 1e6), "cor": ("current", 1e3),
-            "p12": ("pressure", 1e-6), "xs": ("spool", 1e6)}  # signal -> plot, scale from SI
-LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
-
-
-class ViewerError(RigError):
-    """The viewer cannot be had or does not show what it should."""
-
-    status = 1
-
-
-def rerun() -> Any:
-    """The rerun package. Raises ViewerError with the way to get it."""
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise ViewerError("the viewer is not installed; to get it: pip install 'eha-rig[view]'") from error
-    return rr
-
-
-def write_rrd(trace: Trace, path: Path) -> None:
-    """Write a trace with its blueprint as a rerun recording; set-up has negative times, main starts at 0."""
-    rr = rerun()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with rr.RecordingStream("eha-rig", recording_id=str(path.stem)) as stream:
-        stream.save(path, default_blueprint=_blueprint(rr, trace))
-        stream.send_recording_name(trace.provenance.get("sequence", trace.provenance.get("source", "trace")))
-        _series(rr, stream, trace)
-        _limits(rr, stream, trace.checks)
-        _states(rr, stream, trace)
-        _texts(rr, stream, trace)
-        stream.flush()
-
-
-def _values(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
-    """Path of each line -> times, s, and values in the plot's unit."""
-    timing = trace.timing
-    out = {"position/command": trace.com * 1e3, "position/ram": trace.xj * 1e3,
-           "error/error": (trace.com - trace.xj) * 1e6, "current/current": trace.cor * 1e3,
-           "pressure/pressure": trace.p12 * 1e-6, "spool/spool": trace.xs * 1e6}
-    lines = {path: (trace.t, values) for path, values in out.items()}
-    lines |= {f"timing/{name}": (timing.t, column * 1e6) for name, column in
-              (("lateness", timing.lateness), ("response", timing.response), ("work", timing.work))}
-    known = {path: (t, values) for path, (t, values) in lines.items() if not np.isnan(values).all()}
-    if not np.nan_to_num(timing.lateness).any():  # in lockstep nothing is ever late
-        known.pop("timing/lateness", None)
-    return known
-
-
-def _series(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
-    for plot in PLOTS:
-        for line in plot.lines:
-            path = f"{plot.origin}/{line.path}"
-            if path in _values(trace):
-                t, values = _values(trace)[path]
-                _send(rr, stream, path, line.name, line.colour, line.width, t, values)
-
-
-def _send(rr: Any, stream: rr.RecordingStream, path: str, name: str, colour: int, width: float, t: Floats,
-          values: Floats) -> None:
-    line = rr.SeriesLines(colors=[colour], widths=[width], names=[name], aggregation_policy="MinMax")  # keeps the peaks
-    stream.log(path, line, static=True)
-    rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=t)], rr.Scalars.columns(scalars=values), recording=stream)
-
-
-def _limits(rr: Any, stream: rr.RecordingStream, checks: tuple[Check, ...]) -> None:
-    """Limits of a plotted signal as red lines over the check's window."""
-    for number, check in enumerate(checks):
-        if check.kind not in LIMITS_OF or math.isnan(check.t0):
-            continue
-        origin, shown = SHOWN_IN.get("error" if check.kind == "max_error" else check.signal, ("", 0.0))
-        level = check.high * IN_SI.get(check.unit, ("", 1.0))[1] * shown
-        if origin and not math.isnan(level):  # both kinds judge the size of the signal
-            for name, sign in (("high", 1.0), ("low", -1.0)):
-                _send(rr, stream, f"{origin}/limit_{number}_{name}", f"limit: {check.name}", LIMIT, 1.0,
-                      np.array([check.t0, check.t1]), sign * np.array([level, level]))
-
-
-def _states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
-    """Lanes: phase, sections of the command, each node's NMT state, each check over its window."""
-    names = np.array(["set-up", "main", "clean-up"])
-    turns = np.flatnonzero(np.diff(trace.phase, prepend=-1))
-    _lane(rr, stream, "1 phase", [(float(trace.t[k]), str(names[trace.phase[k]])) for k in turns],
-          {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL})
-    sections = [(float(trace.t[s.start]), s.kind, _asked(s)) for s in trace.sections()]
-    _lane(rr, stream, "2 command", [(t, text) for t, _, text in sections],
-          {text: SECTIONS[kind] for _, kind, text in sections})
-    for node in sorted({state.node for state in trace.nmt}):
-        _lane(rr, stream, f"3 node {node} NMT", [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
-    end = float(trace.t[-1])
-    for check in trace.checks:
-        start, stop = (float(trace.t[0]), end) if math.isnan(check.t0) else (check.t0, check.t1)
-        word = f"{'PASS' if check.passed else 'FAIL'} {_quantity(check.value, check.unit)}"
-        _lane(rr, stream, f"4 {check.name}", [(start, word), (stop, "")], {word: PASS if check.passed else FAIL})
-
-
-def _asked(section: Section) -> str:
-    if section.kind == "ramp":
-        return f"ramp {section.rate * 1e3:.3g} mm/s"
-    return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * 1e3:.3g} mm"
-
-
-def _lane(rr: Any, stream: rr.RecordingStream, name: str, states: list[tuple[float, str]],
-          colours: dict[str, int]) -> None:
-    path = f"states/{re.sub('[^A-Za-z0-9.]+', '_', name)}"
-    if colours:
-        stream.log(path, rr.StateConfiguration(values=list(colours), colors=np.array([*colours.values()], np.uint32)),
-                   static=True)
-    for t, state in states:
-        stream.set_time(TIMELINE, duration=t)
-        stream.log(path, rr.StateChange(state=state))
-
-
-def _measured(check: Check) -> str:
-    limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
-                          if not math.isnan(limit))
-    return _quantity(check.value, check.unit) + (f" (limit {limits})" if limits else "")
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f"{value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
-
-
-def _texts(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
-    for event in trace.events:
-        stream.set_time(TIMELINE, duration=event.t)
-        text = f"{event.t:8.3f} s  {event.kind}: {event.text}"
-        stream.log("log/events", rr.TextLog(text, level=event.level))
-    for check in trace.checks:
-        t = check.t0 if not math.isnan(check.t0) else float(trace.t[-1])
-        stream.set_time(TIMELINE, duration=t)
-        text = f"{t:8.3f} s  {'PASS' if check.passed else 'FAIL'} {check.name}: {_measured(check)} {check.detail}"
-        stream.log("log/checks", rr.TextLog(text.rstrip(), level="INFO" if check.passed else "ERROR"))
-    facts = [f"{key}: {value}" for key, value in trace.provenance.items()]
-    stream.log("log/provenance", rr.TextDocument("\n".join(f"- {fact}" for fact in facts), media_type="text/markdown"),
-               static=True)
-
-
-def _axis(rrb: Any, trace: Trace, plot: Plot) -> Any:
-    """The timing view ends where nearly all cycles do: one long pause of the machine must not flatten the rest."""
-    if plot.origin != "timing":
-        return None
-    lines = [values for path, (_, values) in _values(trace).items() if path.startswith("timing/")]
-    return rrb.ScalarAxis(range=(0.0, 1.5 * max(float(np.nanpercentile(values, 99.5)) for values in lines)))
-
-
-def _blueprint(rr: Any, trace: Trace) -> Any:
-    import rerun.blueprint as rrb
-    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
-
-    linked = rrb.TimeAxis(link="LinkToGlobal")
-    there = {path.split("/")[0] for path in _values(trace)}
-    plots = [rrb.TimeSeriesView(origin=f"/{p.origin}", name=p.title, axis_x=linked, axis_y=_axis(rrb, trace, p),
-                                plot_legend=rrb.PlotLegend("RightTop")) for p in PLOTS if p.origin in there]
-    half = (len(plots) + 1) // 2
-    columns = rrb.TextLogColumns(timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
-                                 text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")])
-    texts = rrb.Tabs(rrb.TextLogView(contents=["/log/events", "/log/checks"], name="Events and checks",
-                                     columns=columns),
-                     rrb.TextDocumentView(origin="/log/provenance", name="Provenance"))
-    states = rrb.StateTimelineView(origin="/states", name="Phase, NMT states, checks", time_view=linked)
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*plots[:half]), rrb.Vertical(*plots[half:]),
-                       rrb.Vertical(states, texts, row_shares=[3, 2])),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
-        rrb.BlueprintPanel(state="hidden"), rrb.SelectionPanel(state="hidden"))
 
 
 def open_viewer(rrd: Path) -> None:
@@ -262,7 +53,7 @@ def _pixels(trace: Trace, image: Path) -> dict[str, int]:
     from matplotlib.image import imread
 
     shades = (imread(str(image))[..., :3] * 255).astype(int)
-    there = _values(trace)
+    there = lines(trace)
     out: dict[str, int] = {}
     for plot in PLOTS:
         for line in plot.lines:

@@ -11,7 +11,7 @@ import pytest
 from synthetic import record
 
 from fdi.trace import Trace
-from rig import viewer
+from rig import recording, viewer
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
 
@@ -36,7 +36,7 @@ def test_headless_screenshot_shows_every_line(folder: Path, capsys: pytest.Captu
         pytest.skip(missing)
     assert not missing
     trace = Trace.read(folder, all=True)
-    viewer.write_rrd(trace, folder / "view.rrd")
+    recording.write_rrd(trace, folder / "view.rrd")
     pixels = viewer.screenshot(trace, folder / "view.rrd", folder / "view.png")
     assert len(pixels) == 6 and (folder / "view.png").stat().st_size > 50_000
     with capsys.disabled():
@@ -48,14 +48,14 @@ def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
         pytest.skip("no rerun")
     (tmp_path / "x.rrd").write_bytes(b"")
     trace = Trace.read(folder)
-    with pytest.raises(viewer.ViewerError, match="does not draw"):
+    with pytest.raises(recording.ViewerError, match="does not draw"):
         viewer.screenshot(trace, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
 def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(viewer.ViewerError, match=r"pip install 'eha-rig\[view\]'"):
-        viewer.write_rrd(Trace.read(folder), folder / "none.rrd")
+    with pytest.raises(recording.ViewerError, match=r"pip install 'eha-rig\[view\]'"):
+        recording.write_rrd(Trace.read(folder), folder / "none.rrd")
 
 
 def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,7 +63,7 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> 
         pytest.skip("no rerun, or no Linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(viewer.ViewerError, match="no display"):
+    with pytest.raises(recording.ViewerError, match="no display"):
         viewer.open_viewer(Path("x.rrd"))
 
 

@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     if args.headless and not args.screenshot:
         raise InputError("--headless", "", "--screenshot FILE.png with it")
     from fdi.trace import Trace
-    from rig import viewer
+    from rig import recording, viewer
 
     source = Path(args.trace)
     trace = Trace.read(source, all=True)
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         rrd = Path(args.screenshot).with_suffix(".rrd")
     else:
         rrd = (source if source.is_dir() else source.parent) / (source.name.split(".")[0] + ".rrd")
-    viewer.write_rrd(trace, rrd)
+    recording.write_rrd(trace, rrd)
     answer: dict[str, object] = {"rrd": str(rrd)}
     if args.screenshot:
         answer["screenshot"] = args.screenshot
