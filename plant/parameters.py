@@ -153,7 +153,7 @@ def resolve(where: object, name: str, groups: Mapping[str, type[Any]]) -> Quanti
         raise InputError(where, name, f"a known group{_nearest(group, groups)}")
     known = quantities(groups[group])
     if field not in known:
-        raise InputError(where, name, f"a field of {group} ({', '.join(known)}){_nearest(field, known)}")
+        raise InputError(where, name, f"a field of {group}{_nearest(field, known) or ' (' + ', '.join(known) + ')'}")
     return known[field]
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -63,10 +64,24 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
     out = np.empty((len(com), 4))
     record = model.record()
-    kernel("closed_loop", model.effects, fast)(model.state(), com, force, noise(seed, len(com)), record, steps, out)
+    with _laws(model):
+        kernel("closed_loop", model.effects, fast)(model.state(), com, force, noise(seed, len(com)), record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)
+
+
+@contextmanager
+def _laws(model: Model) -> Iterator[None]:
+    """What a user's own law does wrong is told as bad input: numba and Python raise what they like."""
+    try:
+        yield
+    except Exception as error:
+        if not model.effects:
+            raise
+        said = next((line.strip() for line in reversed(str(error).splitlines()) if line.strip()), "")
+        raise InputError("effects", ", ".join(model.effects),
+                         f"laws that can be compiled and run ({type(error).__name__}: {said})") from error
 
 
 class Actuator:
@@ -92,8 +107,13 @@ class Actuator:
         return cast(State, self._unpack(self._flat.tolist()))
 
     def warm(self) -> None:
-        """Compile now, so that the first cycle is not late."""
-        self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
+        """Compile now, so that the first cycle is not late.
+
+        Raises:
+            InputError: an effect's law that cannot be compiled.
+        """
+        with _laws(self.model):
+            self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
 
     def sample(self) -> tuple[float, float, float]:
         """What the transducers read now: XJ m, P12 Pa, XS m. Once a cycle: it draws the cycle's noise."""

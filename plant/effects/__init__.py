@@ -95,6 +95,7 @@ def load_effects(path: Path) -> list[str]:
     Raises:
         InputError: unreadable, not Python, or it registers nothing.
     """
+    path = path.absolute()  # as the code of its functions will say where it comes from
     spec = importlib.util.spec_from_file_location(f"effects_of_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
         raise InputError(path, "", "a Python file with effects")
