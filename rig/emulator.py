@@ -7,6 +7,7 @@ fault costs no bus time and begins in exactly the cycle the sequence says.
 from __future__ import annotations
 
 import heapq
+from math import isfinite
 from typing import cast
 
 from dbc import EDS
@@ -41,18 +42,26 @@ class Emulator:
         self.load_scenario(Scenario(Model(), Plan(stop=0)))
 
     def load_scenario(self, scenario: Scenario) -> None:
-        """Take a plant with its faults and loads; it is compiled now, not in the first cycle."""
-        self._scenario = scenario
-        self._restart()
-        self._plant.warm()
+        """Take a plant with its faults and loads; it is compiled now, not in the first cycle.
+
+        Raises:
+            InputError: one that cannot be run; the one before stays.
+        """
+        plant, faults = Actuator(scenario.model, scenario.seed), Schedule(scenario.plan, scenario.model.values)
+        plant.warm()
+        self._scenario, self._load = scenario, scenario.load()
+        self._begin(plant, faults)
 
     def _restart(self) -> None:
         s = self._scenario
-        self._resuming = False
-        self._plant = Actuator(s.model, s.seed)
-        self._faults = Schedule(s.plan, s.model.values)
-        self._load = s.load()
+        self._begin(Actuator(s.model, s.seed), Schedule(s.plan, s.model.values))
+
+    def _begin(self, plant: Actuator, faults: Schedule) -> None:
+        self._plant, self._faults = plant, faults
         self._cycle = 0  # of the SYNC to come
+        self._changed = -1  # the last cycle whose parameters are in force
+        self._begun = False  # SYNCs are counted from the first start
+        self._first = True  # of the cycles after a start: no drive can have answered yet
         self._moved = True
         self._missed = 0  # drive frames missing in a row
         self._current = 0.0
@@ -70,6 +79,8 @@ class Emulator:
                 heapq.heappush(self._late, (frame.t_ns + action.ns, len(self._late), frame))
             if action is not None:
                 return
+        elif frame.cob_id == codec.SYNC and self._begun and self.device.state is not NmtState.OPERATIONAL:
+            self._cycle += 1  # time goes on while the plant pauses
         self.device.receive(frame)
         if not self._moved:  # after the answer to a SYNC has gone out
             self._move()
@@ -97,9 +108,9 @@ class Emulator:
         self._send(cob_id, data)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
-        """The first start begins a run; after a pause the plant goes on where it stood."""
+        """The first start begins a run; after a pause the plant goes on from where it stood."""
         if new is NmtState.OPERATIONAL:
-            self._resuming = self._cycle > 0
+            self._begun = self._first = True
         elif new is NmtState.INITIALISING:
             self._restart()
 
@@ -115,9 +126,13 @@ class Emulator:
 
     def _on_sync(self) -> None:
         """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""
-        flags = self._judge(self._cycle) if self._cycle else Flags(0)
         k, od = self._cycle, self._od
+        flags = Flags(0) if self._first else self._judge(k)
+        self._first = False
         xj, p12, xs = self._plant.sample()
+        if not isfinite(xj + p12 + xs):
+            self._diverged()
+            return
         faulty = self._faults.signal
         od[0x2200, 0] = codec.raw_position(faulty("xj", xj, k))
         od[0x2201, 0] = codec.raw_pressure(faulty("p12", p12, k))
@@ -133,10 +148,6 @@ class Emulator:
         answers come again.
         """
         fresh = self.device.pdo.rpdos[1].fresh
-        if fresh and self._resuming:  # SYNCs have gone by meanwhile
-            self._resuming = False
-            k += (cast(int, self._od[0x2207, 0]) + 1 - k) & 0xFFFF
-            self._cycle = k
         if fresh and cast(int, self._od[0x2207, 0]) == (k - 1) & 0xFFFF:
             self._current = codec.current(cast(int, self._od[0x2205, 0]))
             if self._missed >= MISSED_LIMIT:
@@ -152,6 +163,11 @@ class Emulator:
             self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
         return flags
 
+    def _diverged(self) -> None:
+        """The plant has no value any more (a parameter far out, a law that divides by zero): no number is made up."""
+        self.device.emcy.raise_(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+        self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more
+
     def _count(self, what: str) -> None:
         self._counts[what] += 1
         self._od[COUNTERS, 1 if what == "missing" else 2] = self._counts[what]
@@ -159,8 +175,9 @@ class Emulator:
     def _move(self) -> None:
         """The plant goes on to the next cycle, with the faults and the load of this one."""
         k = self._cycle
-        for name, value in self._faults.parameters_at(k).items():
+        for name, value in self._faults.parameters_at(k, self._changed).items():
             self._plant.set(name, value)
+        self._changed = k
         self._plant.advance(self._current, self._load[k] if k < len(self._load) else 0.0)
         self._moved = True
         self._cycle += 1

@@ -141,8 +141,9 @@ class Device:
         for rpdo in self.pdo.latched:
             rpdo.latch()
         self.on_sync()
-        for tpdo in self.pdo.cyclic:
-            tpdo.on_sync()
+        if self.nmt.state is NmtState.OPERATIONAL:  # the application may have given up just now
+            for tpdo in self.pdo.cyclic:
+                tpdo.on_sync()
 
     def _upload(self, index: int, sub: int) -> bytes:
         if index == HISTORY and sub > self.od.number(HISTORY, 0):
