@@ -5,6 +5,8 @@ ACTIVE without a fault; any fault is latched until it has gone and the control w
 """
 from __future__ import annotations
 
+import struct
+from math import isfinite
 from typing import NamedTuple, cast
 
 from dbc import EDS
@@ -12,7 +14,7 @@ from plant.controller import Loop, answer
 from plant.model import Model
 from rig import codec
 from rig.codec import Control, Status
-from rig.device import Device, EmcyCode, ErrorRegister, NmtState
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.frame import Send
 
 NODE = 2
@@ -44,20 +46,28 @@ class Firmware:
         self.device.on_rpdo = self._on_rpdo
         self.device.on_nmt = self._on_nmt
         self.device.on_heartbeat_lost = self._trip
+        self.device.on_write = self._on_write
         self._od = self.device.od.values
+        self._silent = 0  # SYNCs since the last feedback
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick
 
     def _restart(self) -> None:
         self._loop = Loop()
         self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
-        self._silent = 0  # SYNCs since the last feedback
         self._fault = False
         self._acknowledged = True
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         if new is NmtState.OPERATIONAL:
             self._restart()
+        elif new is NmtState.INITIALISING:
+            self._silent = 0
+
+    def _on_write(self, index: int, sub: int, data: bytes) -> None:
+        """A gain that is no number would make a current that is none."""
+        if index == GAINS and not isfinite(struct.unpack("<d", data)[0]):
+            raise SdoAbort(Abort.VALUE)
 
     def _trip(self, node: int = 0) -> None:
         self._fault = True
@@ -72,7 +82,7 @@ class Firmware:
 
     def _on_rpdo(self, n: int) -> None:
         """Feedback arrived: close the loop."""
-        if self._silent > LOST_AFTER:
+        if self._silent > LOST_AFTER:  # counted on over a restart, or the error would stand for ever
             self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
         self._silent = 0
         status = self._status()
