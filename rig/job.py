@@ -12,8 +12,10 @@ from plant import InputError, Model
 from plant.effects import load_effects
 from plant.model import parse_model
 from plant.parameters import parse_toml
+from rig.scenario import Scenario
 from rig.sequence import Sequence
 
+_SAID = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECTS, _FILES = "effects/", "sequence/"  # folders of the attachments
 
 
@@ -41,6 +43,11 @@ class Job:
         """Length of a cycle, ns."""
         return round(self.model["controller.period"] * 1e9)
 
+    def scenario(self) -> Scenario:
+        """What the plant is to be told."""
+        sequence = self.sequence
+        return Scenario.of(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
+
     def attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""
         found = {"model.toml": ("application/toml", self.model.to_toml().encode())}
@@ -64,7 +71,7 @@ def repeat(path: Path) -> Job:
     trace = Trace.read(path, all=True)
     said = trace.provenance
     bundle = _folder(trace.attachments, _FILES)
-    if "model.toml" not in trace.attachments or not bundle or "seed" not in said:
+    if "model.toml" not in trace.attachments or not bundle or not said.keys() >= _SAID:
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
     effects = _unpack(_folder(trace.attachments, _EFFECTS))
     for effect in effects:

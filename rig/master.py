@@ -27,6 +27,7 @@ NODE, CONTROLLER, PLANT = 1, 2, 3
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
+_OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
 NAMES = {NODE: "rig", CONTROLLER: "controller", PLANT: "plant"}
 
 
@@ -76,15 +77,20 @@ class Master:
         self.on_state: Callable[[int, int], None] = lambda node, state: None
         self.on_lost: Callable[[int], None] = lambda node: None
         self.on_back: Callable[[int], None] = lambda node: None
+        self.on_rival: Callable[[int], None] = lambda cob_id: None
         self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
         self.silent = False  # a fault: no heartbeat of ours
         self.states = {CONTROLLER: -1, PLANT: -1}
         self._booted: set[int] = set()
+        self._rivals: set[int] = set()  # COB-IDs of ours that somebody else sends
         self.network = _Network(wire, self.send)
         self._nodes = {node: self._join(node) for node in (CONTROLLER, PLANT)}
         self._beat = HeartbeatProducer(NODE, lambda cob_id, data: None if self.silent else self.send(cob_id, data))
         self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
         self._state = NmtState.PRE_OPERATIONAL
+        # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
+        self._services = {base + node: length for base, length in ((0x080, 8), (0x580, 8), (0x700, 1))
+                          for node in self._nodes}
         wire.receive = self.receive
 
     def _join(self, node: int) -> Any:  # the library's node; its types are too loose to help
@@ -114,10 +120,14 @@ class Master:
         if cyclic is not None:
             cyclic(frame)
             return
+        if frame.cob_id in _OURS and frame.cob_id not in self._rivals:
+            self._rivals.add(frame.cob_id)
+            self.on_rival(frame.cob_id)
+        if self._services.get(frame.cob_id) != len(frame.data):
+            return
         if frame.cob_id in self._watch.cob_ids:
             self._watch.receive(Frame(self.wire.clock.now(), frame.cob_id, frame.data))
-        if len(frame.data) or frame.cob_id == codec.SYNC:
-            self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
+        self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 
     def tick(self) -> None:
         """Send the heartbeat when it is due, and notice who has fallen silent."""
@@ -144,12 +154,9 @@ class Master:
         self._nodes[node].nmt.send_command(130)
         return self.wire.wait(lambda: node in self._booted, seconds)
 
-    def present_within(self, node: int, seconds: float) -> bool:
-        """The same for a node that is about to start: its own boot-up counts, and it is asked again and again."""
-        for _ in range(round(seconds)):
-            if self.wire.wait(lambda: node in self._booted, 0.2) or self.present(node, 0.8):
-                return True
-        return False
+    def rival(self, seconds: float) -> bool:
+        """Whether another rig is at work on the bus; listens only, up to `seconds`."""
+        return self.wire.wait(lambda: bool(self._rivals), seconds)
 
     def configure(self, scenario: bytes, gains: Gains | None, period: float) -> None:
         """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.

@@ -19,10 +19,9 @@ from rig.faults import Schedule
 from rig.guards import Watch
 from rig.job import Job
 from rig.loop import Loop, Step
-from rig.master import NAMES, Master
+from rig.master import NAMES, NODE, Master
 from rig.recorder import U32, Event, Recorder, Signals
 from rig.recorder import NmtState as NmtRecord
-from rig.scenario import Scenario
 from rig.wire import Wire
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
@@ -46,8 +45,7 @@ class Session:
     def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
         self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
         self._plan = job.sequence.plan(job.seed)
-        self._load = job.sequence.load_profile()
-        self.scenario = Scenario.of(job.model, self._plan, self._load, job.seed)
+        self.scenario = job.scenario()
         self._faults = Schedule(self._plan, self.scenario.model.values)
         self._watch = Watch(job.sequence.guards)
         self.loop: Loop | None = None
@@ -56,6 +54,9 @@ class Session:
         self.interrupted = False
         self.safe = False  # no current from here on, until clean-up
         self._powered = True  # clean-up may use current
+        self._playing = True  # until the nodes are stopped by us
+        self._demand = 0.0  # m, of the last cycle
+        self._operational: set[int] = set()
         self._edges = sorted(self._faults.edges)
         self._clock = wire.clock
         self._master = Master(wire, self.now)
@@ -63,6 +64,8 @@ class Session:
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
         self._master.on_lost = self._silent
+        self._master.on_rival = lambda cob_id: self._trouble("bus", f"somebody else sends 0x{cob_id:03X}, a frame of "
+                                                             f"node {NODE} {NAMES[NODE]}")
         self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is back")
 
     def now(self) -> int:
@@ -90,19 +93,19 @@ class Session:
         self.loop = Loop(self._master, self._faults, self.recorder, job.period_ns, job.realtime)
 
     def play(self) -> None:
-        """All three phases."""
+        """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""
+        assert self.loop is not None
         try:
             self._run(SETUP, self._steps(SETUP)) and self._run(MAIN, self._steps(MAIN))
         finally:
-            self._clean_up()
-
-    def _clean_up(self) -> None:
-        assert self.loop is not None
-        self._powered = self._recovered()
-        self._run(CLEANUP, self._steps(CLEANUP))
-        self.loop.finish()
-        self._master.stop()
-        self.say("INFO", "phase", "end")
+            try:
+                self._powered = self._recovered()
+                self._run(CLEANUP, self._steps(CLEANUP))
+                self.loop.finish()
+            finally:
+                self._playing = False
+                self._master.stop()
+                self.say("INFO", "phase", "end")
 
     def _recovered(self) -> bool:
         """Try to have all nodes OPERATIONAL and without error again; whether clean-up may use current."""
@@ -113,8 +116,8 @@ class Session:
     def _steps(self, phase: int) -> Iterator[tuple[str, Step]]:
         """Section name and step of every cycle of a phase."""
         sequence = self.job.sequence
-        last = self.loop.rows[-1].com if self.loop and self.loop.rows else 0.0
-        profile = (sequence.setup_profile, sequence.main_profile, lambda: sequence.cleanup_profile(last))[phase]()
+        profile = (sequence.setup_profile, sequence.main_profile,
+                   lambda: sequence.cleanup_profile(self._demand))[phase]()
         names = [""] * len(profile.command)
         for section in profile.sections:
             names[section.start:section.stop] = [section.name] * (section.stop - section.start)
@@ -133,18 +136,19 @@ class Session:
         """The cycles of one phase; False when it was ended early."""
         assert self.loop is not None
         self.say("INFO", "phase", PHASES[phase])
-        section, begun, total = "", self.loop.k, self._plan.stop
+        section, total = "", self._plan.stop
         for name, step in steps:
             if name != section:
                 section = name
                 self.say("INFO", "section", f"{PHASES[phase]}: {name}")
             self._announce_faults()
+            self._demand = step.demand
             closed = self.loop.cycle(step)
             if self.loop.k % 50 == 0:
                 self._progress(name if phase == MAIN else PHASES[phase], self.loop.k, max(total, self.loop.k))
             if phase != CLEANUP and self._must_end(closed):
                 return False
-        return self.loop.k > begun or phase != MAIN
+        return True
 
     def _must_end(self, row: Signals | None) -> bool:
         if self._stop() and not self.aborted:
@@ -183,6 +187,12 @@ class Session:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
         name = known.get(state, f"state {state}") if state else "boot-up"
         self.recorder.put(self.now(), NmtRecord(U32(node), U32(state), name))
+        if state == NmtState.OPERATIONAL:
+            self._operational.add(node)
+        elif node in self._operational:
+            self._operational.discard(node)
+            if self._playing:  # a watchdog's reset, a node switched off and on, somebody else's command
+                self._trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}")
 
     def _announce_faults(self) -> None:
         assert self.loop is not None

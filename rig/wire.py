@@ -10,6 +10,7 @@ from rig.frame import Frame, Node, Send
 from rig.link import Link
 
 MS = 1_000_000  # ns
+_PATIENCE = 5  # cycles: a node that is gone must not make clean-up last minutes
 Done = Callable[[], bool]
 
 
@@ -88,6 +89,7 @@ class LinkWire:
     def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
         self.clock: Clock = clock
         self.link, self._grace = link, grace
+        self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _nowhere
         self.send: Send = link.send
 
@@ -102,8 +104,9 @@ class LinkWire:
         return True
 
     def settle(self, t_ns: int, done: Done) -> None:
-        """See `Wire`; a frame that does not come within the grace time is missing."""
-        self.wait(done, self._grace)
+        """See `Wire`; a frame that does not come within the grace time is missing, and then less is waited for it."""
+        patient = self._missed < _PATIENCE
+        self._missed = 0 if self.wait(done, self._grace if patient else 0.1 * self._grace) else self._missed + 1
 
     def run_until(self, t_ns: int) -> None:
         """See `Wire`."""
