@@ -7,6 +7,7 @@ import importlib
 import os
 import pkgutil
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
 from types import ModuleType
@@ -15,6 +16,7 @@ from typing import NoReturn
 from plant.errors import RigError
 from rig import commands
 
+INTERNAL = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130
 
 
@@ -51,8 +53,9 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit status."""
     args = parser().parse_args(argv)
+    status: int = 0
     try:
-        status: int = args.run(args)
+        status = args.run(args)
         sys.stdout.flush()
         return status
     except RigError as error:
@@ -62,7 +65,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has gone: nothing to say, and nobody to say it to
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return status
+    except Exception:  # a bug of ours: Python's own exit status 1 would read as a failed check
+        traceback.print_exc()
+        return INTERNAL
 
 
 def _complain(args: argparse.Namespace, message: str, status: int) -> int:

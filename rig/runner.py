@@ -2,7 +2,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plant import InputError
+from plant import Actuator, InputError
 from rig.bus import open_can
 from rig.checks import CheckResult, evaluate
 from rig.clock import VirtualClock, WallClock
@@ -29,6 +31,7 @@ from rig.session import MAIN, Progress, Session
 from rig.wire import EmbeddedWire, LinkWire, Wire
 
 EMBEDDED = ("embedded", "virtual")
+LISTEN = 0.25  # s: a rig at work is heard within this
 ANSWER = 0.7  # s: a node that is there boots within this
 START = 60.0  # s: a node of our own may have to compile the plant first
 
@@ -51,8 +54,9 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
     Raises:
         RigError: bad input, a bus or node that is not there, or a log that cannot be written. The log is closed first.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with nodes_and_wire(job) as wire, log(job, folder) as recorder:
+    if job.plant != "external":  # here, where a law that cannot be compiled can be told in words
+        Actuator(job.scenario().model).warm()
+    with taken(folder), nodes_and_wire(job) as wire, log(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
         progress("bring-up", 0, 0)
         session.bring_up()
@@ -89,6 +93,29 @@ def judge(job: Job, session: Session, rows: Sequence[Signals]) -> list[CheckResu
 
 
 @contextlib.contextmanager
+def taken(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, without the results of an earlier run, and locked against a second one.
+
+    Raises:
+        InputError: it cannot be made or written, or another run is writing there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for name in ("verdict.json", "report.html"):
+            (folder / name).unlink(missing_ok=True)
+        yield
+    except BlockingIOError as error:
+        raise InputError("--out", str(folder), "a folder that no other run is writing to") from error
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
 def log(job: Job, folder: Path) -> Iterator[Recorder]:
     """The run's log, closed whatever happens."""
     recorder = Recorder(folder / "trace.mcap", job.attachments(), provenance(**job.settings()))
@@ -106,7 +133,7 @@ def nodes_and_wire(job: Job) -> Iterator[Wire]:
         InputError: an external node was asked for on a bus that no other program can reach.
         BusError: an external node does not answer.
     """
-    if job.bus in EMBEDDED:
+    if job.bus.partition(":")[0] in EMBEDDED:
         if "external" in (job.controller, job.plant):
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = [Emulator, Firmware]
@@ -117,6 +144,8 @@ def nodes_and_wire(job: Job) -> Iterator[Wire]:
     children: list[subprocess.Popen[bytes]] = []
     try:
         master = Master(wire, clock.now)
+        if master.rival(LISTEN):  # before the first word: a reset would end somebody's test
+            raise BusError(f"another rig is at work on {job.bus}: a SYNC or heartbeat of node 1 was heard")
         for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
             there = (wanted != "builtin" or node == CONTROLLER) and master.present(node, ANSWER)
             if wanted == "external" and not there:
@@ -125,22 +154,39 @@ def nodes_and_wire(job: Job) -> Iterator[Wire]:
                 raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
             if not there:
                 children.append(_start(job, NAMES[node]))
-                if not master.present_within(node, START):
-                    raise BusError(f"our own node {node} ({NAMES[node]}) did not start on {job.bus}")
+                _await(master, node, children[-1])
         yield wire
     finally:
         for child in children:
             child.terminate()
         for child in children:
-            child.wait(10)
+            try:
+                child.wait(5)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
         wire.close()
 
 
 def _start(job: Job, name: str) -> subprocess.Popen[bytes]:
-    """A node of our own in its own process: it shares neither interpreter lock nor fate with the rig."""
+    """A node of our own in its own process, which ends when this one does.
+
+    It has its own session, so that Ctrl-C reaches the rig alone: clean-up needs its plant.
+    """
     effects = [word for path in job.effects for word in ("--effects", str(path))]
-    command = [sys.executable, "-m", "rig.cli", "node", name, "--bus", job.bus, "--quiet", *effects]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "rig.cli", "node", name, "--bus", job.bus, "--quiet", "--parent",
+               str(os.getpid()), *effects]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+
+
+def _await(master: Master, node: int, child: subprocess.Popen[bytes]) -> None:
+    """Until a node of our own answers. Raises BusError when it does not."""
+    for _ in range(round(START)):
+        if master.present(node, 1.0):
+            return
+        if child.poll() is not None:
+            break
+    raise BusError(f"our own node {node} ({NAMES[node]}) did not start")
 
 
 def _counters(rows: Sequence[Signals]) -> dict[str, int]:

@@ -43,20 +43,29 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM end main and let clean-up run; a second one ends the program."""
+    """Ctrl-C and SIGTERM end main and let clean-up run; a second one ends the program.
+
+    As long as nobody has asked, nothing moves that would have to be brought to rest: then the first ends the program.
+    """
     asked: list[int] = []
+    listening = False
 
     def handler(number: int, frame: FrameType | None) -> None:
-        if asked:
+        if asked or not listening:
             raise KeyboardInterrupt
         asked.append(number)
+
+    def stop() -> bool:
+        nonlocal listening
+        listening = True
+        return bool(asked)
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(asked)
+        yield stop
     finally:
         for number, old in before.items():
             signal.signal(number, old)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from rig import options
@@ -14,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("node", choices=("plant", "controller"), help="which node to be")
     parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                         help="such as socketcan:vcan0 or udp_multicast (default: what EHA_RIG_BUS names)")
+    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # ends when this process does
     parser.add_argument("--effects", action="append", default=[], type=Path, metavar="FILE.py",
                         help="your own effects, for the plant (repeatable)")
 
@@ -33,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from rig.wire import serve
 
     bus, _ = choose(args.bus)
-    if bus in EMBEDDED:
+    if bus.partition(":")[0] in EMBEDDED:
         raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     options.load_user_effects(args.effects)
     clock = WallClock()
@@ -46,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
     try:
         with elevated():
-            serve(node, link, clock, lambda: bool(ended))
+            serve(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
     finally:
         link.close()
     if not args.quiet:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("sequence", nargs="?", metavar="SEQUENCE", help="a .toml file, or the name of a shipped one (preflight)")
     options.add_model(parser)
+    parser.set_defaults(seed=None)  # so that one given beside --from is noticed
     add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
         help="virtual: embedded in this process (default); socketcan:can0, udp_multicast, ...")
     add("--pace", choices=("lockstep", "realtime"), default=None,
@@ -34,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run a sequence; results go to --out (default: a new folder in runs/)."""
     from fdi.report import write_report
-
     from rig import show
     from rig.bus import choose
     from rig.runner import run as do
@@ -48,10 +49,11 @@ def run(args: argparse.Namespace) -> int:
         outcome = do(job, folder, progress, stop)
         progress("report", 0, 0)
         write_report(folder / "trace.mcap", folder / "report.html")
-    if args.json:
-        show.as_json(outcome)
-    elif not args.quiet:
-        show.outcome(outcome)
+    with contextlib.suppress(BrokenPipeError):  # who does not read on has no bearing on the verdict
+        if args.json:
+            show.as_json(outcome)
+        elif not args.quiet:
+            show.outcome(outcome)
     return outcome.status
 
 
@@ -69,8 +71,8 @@ def asked(args: argparse.Namespace) -> Job:
         raise InputError("--set", "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
-    return replaced(Job(sequence=sequence, model=model, seed=args.seed, effects=tuple(args.effects)), pace=args.pace,
-                    controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
+    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=tuple(args.effects))
+    return replaced(job, pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
 
 
 def repeated(args: argparse.Namespace) -> Job:
@@ -78,8 +80,9 @@ def repeated(args: argparse.Namespace) -> Job:
     from plant import InputError
     from rig.job import repeat
 
-    if args.sequence or args.set or args.model or args.effects:
-        raise InputError("--from", str(args.source), "no SEQUENCE, --model, --set or --effects: the log has them")
+    if args.sequence or args.set or args.model or args.effects or args.seed is not None:
+        raise InputError("--from", str(args.source), "no SEQUENCE, --model, --set, --seed or --effects: the log has "
+                         "them")
     return replaced(repeat(args.source), pace=args.pace, controller=args.controller, plant=args.plant,
                     max_overruns=args.max_overruns)
 
@@ -94,8 +97,18 @@ def replaced(job: Job, **given: object) -> Job:
 
 
 def fresh_folder(parent: Path, name: str) -> Path:
-    """A folder that is not there yet: parent/name, name-2, name-3, ..."""
-    number = 1
-    while (folder := parent / (name if number == 1 else f"{name}-{number}")).exists():
-        number += 1
-    return folder
+    """A folder that was not there: parent/name, name-2, name-3, ... Made at once, so that no two runs take it."""
+    from itertools import count
+
+    from plant import InputError
+
+    for number in count(1):
+        folder = parent / (name if number == 1 else f"{name}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError("--out", str(folder), f"a place that can be written ({error.strerror})") from error
+        return folder
+    raise AssertionError
