@@ -2,14 +2,13 @@
 
 The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls,
 puts the model's effects in place of the port functions, and compiles the lot as one, inlined: a call that passes the
-state through memory costs as much as the step. The result is kept on disk under a hash of all the sources that went in,
+state through memory costs as much as the step. The result is kept on disk under a hash of all the code that went in,
 so a changed effect is never served by stale code: numba's own cache looks at one file only.
 """
 from __future__ import annotations
 
 import dis
 import hashlib
-import inspect
 import os
 import tempfile
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 
 Function = Any  # a plain function, or numba's dispatcher of one
 
@@ -85,7 +85,10 @@ def _calls(function: Function) -> dict[str, Function]:
 
 
 def fingerprint(function: Function) -> str:
-    """Changes when the source of `function` or of anything it calls changes, or a constant or field that they name."""
+    """Changes when the code of `function` or of anything it calls changes, or a constant, table or field they name.
+
+    The code that runs counts, not its file: that may have been edited since it was loaded.
+    """
     seen: dict[Function, str] = {}
 
     def text(f: Function) -> str:
@@ -94,23 +97,26 @@ def fingerprint(function: Function) -> str:
             calls = _calls(f)
             below = [f"{name}={text(g)}" for name, g in calls.items()]
             constants = [f"{name}={_constant(value)}" for name, value in _globals(f).items() if name not in calls]
-            whole = "\n".join([_source(f), *below, *constants])
+            whole = "\n".join([_code(f), *below, *constants])
             seen[f] = hashlib.sha256(whole.encode()).hexdigest()
         return seen[f]
 
     return text(function)[:20]
 
 
-def _source(f: Function) -> str:
-    try:
-        return inspect.getsource(f)
-    except OSError:  # typed in at a prompt: its code stands for it
-        code: CodeType = f.__code__
-        return f"{code.co_code.hex()} {code.co_consts} {code.co_names}"
+def _code(f: Function) -> str:
+    f = getattr(f, "py_func", f)
+    held = [cell.cell_contents for cell in f.__closure__ or ()]
+    return " ".join([_constant(f.__code__), *map(_constant, (*(f.__defaults__ or ()), *held))])
 
 
 def _constant(value: Any) -> str:
     if isinstance(value, ModuleType):
         return value.__name__
+    if isinstance(value, CodeType):
+        inner = " ".join(_constant(constant) for constant in value.co_consts)
+        return f"{value.co_code.hex()} {inner} {value.co_names} {value.co_varnames}"
+    if isinstance(value, np.ndarray):  # its repr would leave out the middle
+        return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
     fields = getattr(value, "_fields", None)
-    return f"{fields}" if fields else repr(value)
+    return f"{fields}" if fields and isinstance(value, type) else repr(value)
