@@ -5,6 +5,7 @@ import ast
 import fnmatch
 import importlib
 import re
+import shutil
 import subprocess
 import tomllib
 from collections.abc import Iterator
@@ -45,7 +46,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "rig/clock.py", "rig/loop.py", "rig/link.py", "rig/bus.py", "rig/lateness.py", "rig/commands/",
     "rig/recorder/",  # its thread must close a chunk in time
-    "rig/viewer.py",  # waits for the viewer to come up
+    "rig/viewer.py", "rig/screenshot.py",  # wait for the viewer to come up
 )
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
@@ -83,10 +84,11 @@ def imported(path: Path) -> Iterator[str]:
 
 def tracked() -> list[Path]:
     """Text files of the project: what git knows, or everything outside hidden and generated folders."""
-    git = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
-    if git.returncode == 0 and git.stdout:
+    paths = []
+    if (ROOT / ".git").exists() and shutil.which("git"):
+        git = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
         paths = [ROOT / line for line in git.stdout.split("\0") if line]
-    else:
+    if not paths:
         folders = [*PACKAGES, "tests"]
         paths = [path for folder in folders for path in (ROOT / folder).rglob("*") if "__pycache__" not in path.parts]
     return [path for path in paths if path.is_file() and b"\0" not in path.read_bytes()[:4096]]
