@@ -158,8 +158,10 @@ class Master:
         """Whether another rig is at work on the bus; listens only, up to `seconds`."""
         return self.wire.wait(lambda: bool(self._rivals), seconds)
 
-    def configure(self, scenario: bytes, gains: Gains | None, period: float) -> None:
+    def configure(self, scenario: bytes, gains: Gains | None, period_ns: int) -> None:
         """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
+
+        `period_ns` 0: nodes must not miss a SYNC, for in lockstep they come when they come.
 
         Raises:
             BusError: a node refused or did not answer.
@@ -169,7 +171,7 @@ class Master:
             self._write(CONTROLLER, GAINS, sub, value)
         for node in (CONTROLLER, PLANT):
             if node == PLANT or gains is not None:
-                self._write(node, 0x1006, 0, round(period * 1e6))
+                self._write(node, 0x1006, 0, period_ns // 1000)
             self._write(node, 0x1017, 0, HEARTBEAT)
         self._watch.configure([node << 16 | HEARTBEAT_LIMIT for node in (CONTROLLER, PLANT)])
         self._beat.configure(HEARTBEAT, self.wire.clock.now())

@@ -20,7 +20,7 @@ from rig.guards import Watch
 from rig.job import Job
 from rig.loop import Loop, Step
 from rig.master import NAMES, NODE, Master
-from rig.recorder import U32, Event, Recorder, Signals
+from rig.recorder import Event, Recorder, Signals
 from rig.recorder import NmtState as NmtRecord
 from rig.wire import Wire
 
@@ -88,7 +88,7 @@ class Session:
         self.say("INFO", "phase", "bring-up")
         self._master.reset()
         gains = firmware.gains_of(job.model) if job.controller == "builtin" else None
-        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns / 1e9)
+        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0)
         self._master.start()
         self.loop = Loop(self._master, self._faults, self.recorder, job.period_ns, job.realtime)
 
@@ -186,7 +186,7 @@ class Session:
     def _state(self, node: int, state: int) -> None:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
         name = known.get(state, f"state {state}") if state else "boot-up"
-        self.recorder.put(self.now(), NmtRecord(U32(node), U32(state), name))
+        self.recorder.put(self.now(), NmtRecord(node, state, name))
         if state == NmtState.OPERATIONAL:
             self._operational.add(node)
         elif node in self._operational:
