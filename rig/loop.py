@@ -15,7 +15,7 @@ from rig.clock import WallClock
 from rig.faults import Delay, Schedule
 from rig.frame import Frame
 from rig.master import Master
-from rig.recorder import U32, Signals, Timing
+from rig.recorder import Signals, Timing
 
 _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
 
@@ -49,14 +49,14 @@ class Loop:
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._seen = 0
         self._wall = WallClock()
-        self._origin = self._t_ns = self._wire.clock.now() + period_ns
+        self._t_ns = self._wire.clock.now() + period_ns  # when the cycle under way, or to come, is due
         self._sync = 0
         self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
         read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
         master.on_cyclic.update(read)
 
     def now(self) -> int:
-        """Time for the log, ns since the run began: the cycle's in lockstep, the clock's in real time."""
+        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
         return self._wire.clock.now() if self._realtime else self._t_ns
 
     def cycle(self, step: Step) -> Signals | None:
@@ -64,9 +64,9 @@ class Loop:
         lateness = self._wait_until_due()
         closed = self._close()
         master, k = self._master, self.k
-        row = Signals(U32(k), U32(step.phase), codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
-                      step.load, U32(step.control), U32(0), U32(0))
-        timing = Timing(U32(k), lateness > self._period, lateness * 1e-9, nan, nan)
+        row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
+                      step.load, step.control, 0, 0)
+        timing = Timing(k, lateness > self._period, lateness * 1e-9, nan, nan)
         self._open, self._seen = (self._t_ns, row, timing), 0
         master.silent = not self._faults.heartbeat_alive("rig", k)
         self._command(codec.pack_command(step.demand, step.control, k))
@@ -77,6 +77,7 @@ class Loop:
             self._send_held(self._t_ns + self._period)
         master.tick()
         self.k += 1
+        self._t_ns += self._period
         return closed
 
     def finish(self) -> Signals | None:
@@ -86,7 +87,6 @@ class Loop:
 
     def _wait_until_due(self) -> int:
         """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
-        self._t_ns = self._origin + self.k * self._period
         if not self._realtime:
             return 0
         while self._held and self._held[0][0] < self._t_ns:
@@ -98,7 +98,7 @@ class Loop:
         if late > self._period:
             lost = late // self._period
             self.overruns += lost
-            self._origin += lost * self._period
+            self._t_ns += lost * self._period
         return late
 
     def _command(self, data: bytes) -> None:
@@ -123,7 +123,7 @@ class Loop:
         if self._open is not None and len(frame.data) == 8:
             row, state = self._open[1], codec.unpack_valve_state(frame.data)
             if state.cycle == row.cycle & 0xFFFF:
-                row.xs, row.flags = state.spool, U32(state.flags)
+                row.xs, row.flags = state.spool, state.flags
                 self._answered(_XS)
 
     def _drive(self, frame: Frame) -> None:
@@ -131,7 +131,7 @@ class Loop:
             _, row, timing = self._open
             drive = codec.unpack_drive(frame.data)
             if drive.cycle == row.cycle & 0xFFFF:
-                row.cor, row.status = drive.current, U32(drive.status)
+                row.cor, row.status = drive.current, drive.status
                 timing.response = (self._wall.now() - self._sync) * 1e-9
                 self._answered(_COR)
 

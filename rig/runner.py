@@ -197,5 +197,5 @@ def _counters(rows: Sequence[Signals]) -> dict[str, int]:
 
 
 def _record(check: CheckResult) -> Check:
-    return Check(name=check.name, signal=check.signal, value=check.value, unit=check.unit, low=check.low,
-                 high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)
+    return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
+                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)

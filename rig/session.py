@@ -66,7 +66,7 @@ class Session:
         self._master.on_lost = self._silent
         self._master.on_rival = lambda cob_id: self._trouble("bus", f"somebody else sends 0x{cob_id:03X}, a frame of "
                                                              f"node {NODE} {NAMES[NODE]}")
-        self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is back")
+        self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
 
     def now(self) -> int:
         """Time for the log, ns since the run began."""
