@@ -48,13 +48,14 @@ class Firmware:
         self.device.on_heartbeat_lost = self._trip
         self.device.on_write = self._on_write
         self._od = self.device.od.values
-        self._silent = 0  # SYNCs since the last feedback
+        self._lost = False  # feedback, announced by EMCY; a restart does not take that back
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick
 
     def _restart(self) -> None:
         self._loop = Loop()
         self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
+        self._silent = 0  # SYNCs since the last feedback
         self._fault = False
         self._acknowledged = True
 
@@ -62,7 +63,7 @@ class Firmware:
         if new is NmtState.OPERATIONAL:
             self._restart()
         elif new is NmtState.INITIALISING:
-            self._silent = 0
+            self._lost = False
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         """A gain that is no number would make a current that is none."""
@@ -76,13 +77,15 @@ class Firmware:
         """The command of this cycle is latched; feedback follows. Without it the loop must not stay as it was."""
         self._silent += 1
         if self._silent > LOST_AFTER:
+            self._lost = True
             self._trip()
             self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x02")
             self._drive(0.0, self._status())
 
     def _on_rpdo(self, n: int) -> None:
         """Feedback arrived: close the loop."""
-        if self._silent > LOST_AFTER:  # counted on over a restart, or the error would stand for ever
+        if self._lost:
+            self._lost = False
             self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
         self._silent = 0
         status = self._status()

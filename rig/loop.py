@@ -18,6 +18,7 @@ from rig.master import Master
 from rig.recorder import Signals, Timing
 
 _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
+_ALL = _XJ | _XS | _COR
 
 
 class Log(Protocol):
@@ -73,7 +74,7 @@ class Loop:
         self._sync = self._wall.now()
         master.send(codec.SYNC, b"")
         if not self._realtime:
-            self._wire.settle(self._t_ns, lambda: self._seen == _XJ | _XS | _COR)
+            self._wire.settle(self._t_ns, lambda: self._seen == _ALL)
             self._send_held(self._t_ns + self._period)
         master.tick()
         self.k += 1
@@ -127,17 +128,18 @@ class Loop:
                 self._answered(_XS)
 
     def _drive(self, frame: Frame) -> None:
-        if self._open is not None and not self._seen & _COR and len(frame.data) == 8:
+        if self._open is not None and len(frame.data) == 8:  # of several the last: the plant latches that one
             _, row, timing = self._open
             drive = codec.unpack_drive(frame.data)
             if drive.cycle == row.cycle & 0xFFFF:
                 row.cor, row.status = drive.current, drive.status
-                timing.response = (self._wall.now() - self._sync) * 1e-9
+                if not self._seen & _COR:
+                    timing.response = (self._wall.now() - self._sync) * 1e-9
                 self._answered(_COR)
 
     def _answered(self, what: int) -> None:
-        self._seen |= what
-        if self._seen == _XJ | _XS | _COR and self._open is not None:
+        complete, self._seen = self._seen == _ALL, self._seen | what
+        if self._seen == _ALL and not complete and self._open is not None:
             self._open[2].work = (self._wall.now() - self._sync) * 1e-9
 
     def _close(self) -> Signals | None:

@@ -13,6 +13,7 @@ from rig.faults import Plan
 
 FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 LARGEST = 1 << 26  # bytes of JSON: six hours of random load
+LONGEST = 20_000_000  # cycles; noise is drawn for all of them beforehand
 WHERE = "scenario (object 0x2210)"
 
 
@@ -53,7 +54,10 @@ class Scenario(NamedTuple):
             named = table["model"]
             model = Model(str(named["name"])).having(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
-            return cls(model, Plan.from_json(table["plan"]), tuple(force), int(table["seed"]))
+            plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
+            if seed < 0 or not 0 <= plan.start <= plan.stop <= LONGEST:
+                raise InputError(WHERE, "plan", f"a seed from 0, and at most {LONGEST} cycles")
+            return cls(model, plan, tuple(force), seed)
         except InputError:
             raise
         except Exception as error:  # anybody may send anything
