@@ -1,6 +1,7 @@
 """A model: the reference plant, its parameter values, and the effects it has. Data; it becomes code when it is run."""
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -75,7 +76,8 @@ class Model:
     def to_toml(self) -> str:
         """The model file that `load_model` reads back."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
-        lines = [f'name = "{self.name}"', f"effects = [{effects}]"]
+        name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
+        lines = [f"name = {name}", f"effects = [{effects}]"]
         group = ""
         for name, value in self.differences().items():
             head, _, tail = name.partition(".")
@@ -124,9 +126,10 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     tables.pop("provenance", None)
     if not isinstance(name, str) or not name:
         raise InputError(where, "name", f"a text, not {name!r}")
-    if not isinstance(effects, list) or any(e not in CATALOGUE for e in effects):
-        unknown = next((e for e in effects if e not in CATALOGUE), effects) if isinstance(effects, list) else effects
-        raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown!r}")
+    known = list(CATALOGUE)  # a list, as what stands in a file need not be hashable
+    unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
+    if unknown:
+        raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}")
     return Model(name).having(effects).replace(flatten(where, tables, known_groups()), where)
 
 

@@ -8,6 +8,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -202,6 +203,11 @@ def flatten(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[
 
 def nominal() -> dict[str, float]:
     """The nominal actuator, "group.field" to SI value."""
+    return dict(_nominal())
+
+
+@cache
+def _nominal() -> Mapping[str, float]:
     source = files("plant") / "nominal.toml"
     return flatten("nominal.toml", tomllib.loads(source.read_text(encoding="utf-8")), GROUPS)
 

@@ -1,0 +1,61 @@
+"""Effect files as a user would write them, and a catalogue that forgets them after the test."""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from plant.effects import CATALOGUE
+
+HEAD = """
+from math import pi, sin
+from typing import Annotated, NamedTuple
+from plant.effects import effect
+from plant.quantity import Quantity
+"""
+
+COGGING = HEAD + '''
+class Cogging(NamedTuple):
+    """A force periodic in position."""
+    force: Annotated[float, Quantity("N")] = 0.0
+    length: Annotated[float, Quantity("m", above=0)] = 1e-3
+
+@effect("load", Cogging, law="FR = FR + F sin(2 pi XJ / L)")
+def cogging(x, s, u, p):
+    return x + p.cogging.force * sin(2.0 * pi * s.jack_position / p.cogging.length)
+'''
+
+STIFF = HEAD + '''
+SCALE = {scale}
+
+class Spring(NamedTuple):
+    stiffness: Annotated[float, Quantity("N/m")] = 0.0
+
+@effect("load", Spring, law="FR = FR + K XJ")
+def spring(x, s, u, p):
+    return x + SCALE * p.spring.stiffness * s.jack_position
+'''
+
+MEMORY = HEAD + '''
+class Wear(NamedTuple):
+    rate: Annotated[float, Quantity("N/m", low=0)] = 0.0
+
+class Way(NamedTuple):
+    travelled: float = 0.0
+    last: float = 0.0
+
+@effect("load", Wear, law="FR = FR + k * way travelled", memory=Way)
+def wear(x, m, s, u, p):
+    way = m.travelled + abs(s.jack_position - m.last)
+    return x + p.wear.rate * way, Way(way, s.jack_position)
+'''
+
+
+@contextmanager
+def restored_catalogue() -> Iterator[None]:
+    """Takes out again what was registered meanwhile."""
+    before = dict(CATALOGUE)
+    try:
+        yield
+    finally:
+        CATALOGUE.clear()
+        CATALOGUE.update(before)
