@@ -25,6 +25,7 @@ from rig.wire import Wire
 
 NODE, CONTROLLER, PLANT = 1, 2, 3
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
+PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
 _OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
@@ -158,10 +159,11 @@ class Master:
         """Whether another rig is at work on the bus; listens only, up to `seconds`."""
         return self.wire.wait(lambda: bool(self._rivals), seconds)
 
-    def configure(self, scenario: bytes, gains: Gains | None, period_ns: int) -> None:
+    def configure(self, scenario: bytes, gains: Gains | None, period_ns: int, limit_ms: int = HEARTBEAT_LIMIT) -> None:
         """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
 
-        `period_ns` 0: nodes must not miss a SYNC, for in lockstep they come when they come.
+        `period_ns` 0: nodes must not miss a SYNC, for in lockstep they come when they come. `limit_ms`: silence after
+        which a node counts as gone. A foreign controller (no `gains`) may refuse what it does not have.
 
         Raises:
             BusError: a node refused or did not answer.
@@ -170,10 +172,15 @@ class Master:
         for sub, value in enumerate(gains or (), 1):
             self._write(CONTROLLER, GAINS, sub, value)
         for node in (CONTROLLER, PLANT):
-            if node == PLANT or gains is not None:
-                self._write(node, 0x1006, 0, period_ns // 1000)
-            self._write(node, 0x1017, 0, HEARTBEAT)
-        self._watch.configure([node << 16 | HEARTBEAT_LIMIT for node in (CONTROLLER, PLANT)])
+            foreign = node == CONTROLLER and gains is None
+            settings = ((0x1006, 0, period_ns // 1000), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, HEARTBEAT))
+            for index, sub, value in settings:
+                try:
+                    self._write(node, index, sub, value)
+                except BusError:
+                    if not foreign:
+                        raise
+        self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
         self._beat.configure(HEARTBEAT, self.wire.clock.now())
 
     def start(self) -> None:

@@ -32,6 +32,8 @@ from rig.wire import EmbeddedWire, LinkWire, Wire
 
 EMBEDDED = ("embedded", "virtual")
 LISTEN = 0.25  # s: a rig at work is heard within this
+GRACE = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
+BRIEF = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
 ANSWER = 0.7  # s: a node that is there boots within this
 START = 60.0  # s: a node of our own may have to compile the plant first
 
@@ -140,7 +142,7 @@ def nodes_and_wire(job: Job) -> Iterator[Wire]:
         yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         return
     clock = WallClock()
-    wire = LinkWire(Link(open_can(job.bus), clock.now), clock)
+    wire = LinkWire(Link(open_can(job.bus), clock.now), clock, BRIEF if job.sequence.loses_frames else GRACE)
     children: list[subprocess.Popen[bytes]] = []
     try:
         master = Master(wire, clock.now)

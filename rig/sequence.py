@@ -96,6 +96,11 @@ class Sequence:
         start = round(sum(segment.duration for segment in self.setup) * RATE)
         return Plan(faults=self.faults, start=start, stop=start + round(self.duration * RATE), seed=seed)
 
+    @property
+    def loses_frames(self) -> bool:
+        """Whether a fault keeps frames from arriving."""
+        return any(isinstance(fault, faults.Lost | faults.Late) for fault in self.faults)
+
     def fault_starts(self) -> dict[str, float]:
         """When each fault begins, s of main, by its label."""
         return {fault.label: fault.start for fault in self.faults}

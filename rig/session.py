@@ -13,13 +13,14 @@ from canopen.emcy import EmcyError
 
 from plant.segments import RATE
 from rig import firmware
+from rig.clock import WallClock
 from rig.codec import Control
 from rig.device.nmt import NmtState
 from rig.faults import Schedule
 from rig.guards import Watch
 from rig.job import Job
 from rig.loop import Loop, Step
-from rig.master import NAMES, NODE, Master
+from rig.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
 from rig.recorder import Event, Recorder, Signals
 from rig.recorder import NmtState as NmtRecord
 from rig.wire import Wire
@@ -88,7 +89,9 @@ class Session:
         self.say("INFO", "phase", "bring-up")
         self._master.reset()
         gains = firmware.gains_of(job.model) if job.controller == "builtin" else None
-        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0)
+        patient = not job.realtime and isinstance(self._clock, WallClock)
+        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
+                               PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
         self.loop = Loop(self._master, self._faults, self.recorder, job.period_ns, job.realtime)
 

@@ -1,7 +1,9 @@
 """Running the rerun viewer: its window, or a picture without a display that is checked for errors and empty views."""
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -73,7 +75,7 @@ def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
     image.unlink(missing_ok=True)
     with tempfile.TemporaryFile("w+") as output:
         viewer = subprocess.Popen([*_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],
-                                  stdout=output, stderr=output)
+                                  stdout=output, stderr=output, start_new_session=True)
         try:
             views = _when_loaded(viewer, f"rerun+http://127.0.0.1:{port}/proxy", patience)
             ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image.resolve()))
@@ -82,7 +84,8 @@ def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
             last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it said nothing")
             raise ViewerError(f"the viewer does not draw: {error}; its last line: {last.strip()}") from error
         finally:
-            viewer.kill()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
             viewer.wait()
     return views
 
