@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     status: int = 0
     try:
         status = args.run(args)
-        sys.stdout.flush()
+        print(end="", flush=True)  # here, where a pipe that broke can be told; there may be no standard output at all
         return status
     except RigError as error:
         return _complain(args, str(error), error.status)

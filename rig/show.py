@@ -4,7 +4,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -22,20 +24,35 @@ MEANING = {"PASS": "every check passed",
            "INVALID_TIMING": "the bench itself was too late too often: nothing can be said of the controller"}
 
 
+class _Console(Console):
+    """Goes on in silence when the reader of a pipe has gone: a verdict does not depend on who listens."""
+
+    def on_broken_pipe(self) -> None:
+        """In place of rich's, which ends the program with status 1."""
+        self.quiet = True
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 @contextlib.contextmanager
 def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, int], None]]:
     """A bar on standard error, and who is who on standard output; nothing at all if `silent`."""
     if silent:
         yield lambda what, done, total: None
         return
-    Console(highlight=False).print(f"[bold]{job.sequence.title}[/], {job.sequence.duration:g} s, {job.pace}, "
-                                   f"seed {job.seed}, {why}", soft_wrap=True)
+    errors = Console(stderr=True)
     bar = Progress(TextColumn("{task.description:<14}"), BarColumn(40), TextColumn("{task.percentage:>3.0f} %"),
-                   TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+                   TimeElapsedColumn(), console=errors, transient=True, disable=not errors.is_terminal)
     with bar:
         task = bar.add_task("bring-up", total=None)
+        told = False
 
         def update(what: str, done: int, total: int) -> None:
+            nonlocal told
+            if not told:  # not before there is a bus and a place for the results: an error is one line
+                told = True
+                _Console(highlight=False).print(f"[bold]{job.sequence.title}[/], {job.sequence.duration:g} s, "
+                                                f"{job.pace}, seed {job.seed}, {why}", soft_wrap=True)
             bar.update(task, description=what, completed=done, total=total or None)
 
         yield update
@@ -78,7 +95,7 @@ def as_json(outcome: Outcome) -> None:
 
 def outcome(o: Outcome) -> None:
     """The table of checks, the timing and the verdict."""
-    console = Console(highlight=False)
+    console = _Console(highlight=False)
     table = Table(box=None, pad_edge=False)
     table.add_column("check")
     table.add_column("measured", justify="right")

@@ -40,7 +40,12 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         from pathlib import Path
 
-        Path(args.out).write_text(text + "\n", encoding="utf-8")
+        from plant import InputError
+
+        try:
+            Path(args.out).write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise InputError("--out", args.out, f"a file that can be written ({error.strerror})") from error
     if args.json:
         print(text)
     elif not args.quiet:
