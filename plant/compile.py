@@ -36,7 +36,8 @@ def cache_folder() -> Path:
 
 def rebind(function: Function, **names: Any) -> Function:
     """A copy of `function` that sees `names` in place of its module's globals."""
-    there = function.__globals__ | names
+    # said to be at home here: numba imports that home again when it reads its cache, and a user's file is no module
+    there = function.__globals__ | names | {"__name__": __name__}
     return FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
 
 
@@ -87,7 +88,7 @@ def _calls(function: Function) -> dict[str, Function]:
 def fingerprint(function: Function) -> str:
     """Changes when the code of `function` or of anything it calls changes, or a constant, table or field they name.
 
-    The code that runs counts, not its file: that may have been edited since it was loaded.
+    The code that runs counts, not its file: that may have been edited since it was loaded. So does how it is compiled.
     """
     seen: dict[Function, str] = {}
 
@@ -101,7 +102,10 @@ def fingerprint(function: Function) -> str:
             seen[f] = hashlib.sha256(whole.encode()).hexdigest()
         return seen[f]
 
-    return text(function)[:20]
+    return hashlib.sha256((_THIS_FILE + text(function)).encode()).hexdigest()[:20]
+
+
+_THIS_FILE = Path(__file__).read_text(encoding="utf-8")
 
 
 def _code(f: Function) -> str:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from effect_files import COGGING, restored_catalogue
 from physics_cases import QUIET
 
 from fdi.trace import Trace
 from plant import Actuator, Model
+from plant.effects import load_effects
 
 FOLDER = Path(__file__).parents[2] / "shared/practice"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
@@ -67,6 +69,17 @@ def test_only_sensor_noise_is_left(case: str, name: str) -> None:
 def test_a_finer_step_makes_the_break_away_that_the_default_misses() -> None:
     xj, p12, xs = rms(residuals("01", "est", EXACT["01"], steps=1000))
     assert (xj, p12, xs) == pytest.approx((2.0, 0.2, 1.0), rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["est", "repeat", "holdout"])
+def test_an_effect_that_nobody_listed_is_ten_lines_of_a_users_file(name: str, tmp_path: Path) -> None:
+    """09 hides a force periodic in position, 2750 N every 2.5 mm."""
+    with restored_catalogue():
+        (tmp_path / "cogging.py").write_text(COGGING)
+        load_effects(tmp_path / "cogging.py")
+        found = rms(residuals("09", name, {"cogging.force": 2750.0, "cogging.length": 2.5e-3}))
+        assert found == pytest.approx([2.0, 0.2, 1.0], rel=0.05)
+        assert rms(residuals("09", name, {}))[1] > 5.0  # bar, without it
 
 
 @pytest.mark.parametrize("case", BENCH)

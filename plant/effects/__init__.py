@@ -16,10 +16,11 @@ The effects marked as fitted (`base`) are parameters of the reference model itse
 from __future__ import annotations
 
 import importlib
-import importlib.util
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from plant.compile import Function, rebind
@@ -96,11 +97,13 @@ def load_effects(path: Path) -> list[str]:
         InputError: unreadable, not Python, or it registers nothing.
     """
     path = path.absolute()  # as the code of its functions will say where it comes from
-    spec = importlib.util.spec_from_file_location(f"effects_of_{path.stem}", path)
-    if spec is None or spec.loader is None or not path.is_file():
+    if not path.is_file():
         raise InputError(path, "", "a Python file with effects")
-    try:
-        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    module = ModuleType(f"effects_of_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # where annotations written as text are looked up
+    try:  # not by an import: its .pyc cannot tell two edits within a second apart
+        exec(compile(path.read_bytes(), path, "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
     new = [name for name, entry in CATALOGUE.items() if _file(entry) == path]

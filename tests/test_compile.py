@@ -1,0 +1,163 @@
+"""Compiled code: kept on disk, never stale; and the ways to run the plant that must agree bit for bit."""
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_files import MEMORY, STIFF, restored_catalogue
+
+from plant import Actuator, InputError, Model, compile, flat, simulate
+from plant.compile import cache_folder, compiled, fingerprint, interpreted, rebind
+from plant.controller import Loop, answer
+from plant.effects import load_effects
+from plant.model import initial
+from plant.run import draws, noise
+
+COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
+
+RUN = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from plant import Model, simulate
+from plant.effects import load_effects
+
+file = Path(sys.argv[1])
+load_effects(file)
+if len(sys.argv) > 2:  # somebody edits it after it was read, before it is compiled
+    file.write_text(Path(sys.argv[2]).read_text())
+run = simulate(Model().replace({"spring.stiffness": 4e5}), np.full(60, 2e-3))
+print(json.dumps(run.xj.tolist()))
+"""
+
+
+def by_actuator(model: Model, seed: int, fast: bool = True, steps: int = 100, cycles: int = 300) -> np.ndarray:
+    """Rows XJ, Cor, P12, XS, as the emulator and the firmware would make them."""
+    plant = Actuator(model, seed, steps, fast)
+    p = model.record()[0].controller
+    loop, current, out = Loop(), 0.0, np.empty((cycles, 4))
+    for k in range(cycles):
+        xj, p12, xs = plant.sample()
+        cor, loop = answer(loop, COMMAND[k], xj, p)
+        out[k] = xj, cor, p12, xs
+        plant.advance(current)
+        current = float(cor)
+    return out
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"sensor_lag.time": 1e-3, "current_noise.white": 1e-4, "current_noise.hum": 2e-4}])
+def test_actuator_equals_simulate(changes: dict[str, float]) -> None:
+    model = Model().replace(changes)
+    run = simulate(model, COMMAND, seed=7)
+    stepped = by_actuator(model, 7)
+    assert (stepped == np.column_stack([run.xj, run.cor, run.p12, run.xs])).all()
+
+
+def test_actuator_interpreted_equals_compiled() -> None:
+    model = Model().replace({"sensor_lag.time": 1e-3, "aero_stiffness.stiffness": 1e5})
+    fast, slow = (by_actuator(model, 2, fast, steps=10, cycles=30) for fast in (True, False))
+    assert (fast == slow).all()
+
+
+def test_seeds() -> None:
+    one, same, other = (simulate(Model(), COMMAND, seed=seed).xj for seed in (1, 1, 2))
+    assert (one == same).all() and (one != other).any()
+    rows = draws(5)
+    assert (np.array([next(rows) for _ in range(200)]) == noise(5, 200)).all()
+
+
+def test_flat_state_and_back(tmp_path: Path) -> None:
+    with restored_catalogue():
+        (tmp_path / "m.py").write_text(MEMORY)
+        load_effects(tmp_path / "m.py")
+        state = initial(("constant_load", "sensor_offset", "sensor_lag", "wear"))
+        pack, unpack = flat.packers(state)
+        numbers = flat.values(state)
+        assert len(numbers) == 8 + 4  # two memories of two
+        filled = unpack([float(i) for i in range(12)])
+        assert filled.memory.load[1]._fields == ("travelled", "last")
+        assert type(filled) is type(state)
+        array = np.zeros(12)
+        pack(filled, array)
+        assert (array == np.arange(12)).all()
+
+
+def child(folder: Path, *arguments: Path) -> list[float]:
+    done = subprocess.run([sys.executable, "-c", RUN, *map(str, arguments)], capture_output=True, text=True, check=True,
+                          env=os.environ | {"EHA_RIG_CACHE": str(folder / "cache")})
+    return json.loads(done.stdout)
+
+
+def test_a_changed_effect_is_never_served_by_old_code(tmp_path: Path) -> None:
+    file, changed = tmp_path / "mine.py", tmp_path / "changed.py"
+    file.write_text(STIFF.format(scale=1.0))
+    changed.write_text(STIFF.format(scale=1.0).replace("SCALE * p", "2.0 * SCALE * p"))
+    first = child(tmp_path, file, changed)  # compiled after the edit, from the code read before it
+    kept = sorted(path.name for path in (tmp_path / "cache").iterdir())
+    second = child(tmp_path, file)  # the edited file
+    assert first != second
+    file.write_text(STIFF.format(scale=2.0))  # only a constant differs from the first
+    assert child(tmp_path, file) == second
+    file.write_text(STIFF.format(scale=1.0))
+    assert child(tmp_path, file) == first
+    after = sorted(path.name for path in (tmp_path / "cache").iterdir())
+    assert set(kept) < set(after) and len(after) == 3  # the last run found the first one's code
+
+
+def test_fingerprint_sees_what_a_function_depends_on() -> None:
+    def made(source: str, **names) -> str:
+        scope = dict(names)
+        exec(source, scope)
+        return fingerprint(scope["f"])
+
+    base = "def f(x):\n    return x * K + g(x)\ndef g(x):\n    return x"
+    assert made(base, K=1.0) == made(base, K=1.0)
+    assert made(base, K=1.0) == made("# a remark\n" + base, K=1.0)
+    assert made(base, K=1.0) != made(base, K=2.0)
+    assert made(base, K=1.0) != made(base.replace("return x\n", "return x\n") + " + 1.0", K=1.0)
+    table, other = np.zeros(5000), np.zeros(5000)
+    other[2500] = 1.0  # where repr shows dots
+    assert made(base, K=table) != made(base, K=other)
+    assert made(base.replace("f(x)", "f(x, y=1.0)"), K=1.0) != made(base.replace("f(x)", "f(x, y=2.0)"), K=1.0)
+
+    def factor(k: float):
+        return lambda x: x * k
+
+    assert fingerprint(factor(1.0)) != fingerprint(factor(2.0))
+
+
+def test_linking_leaves_the_original_alone() -> None:
+    def twice(x: float) -> float:
+        return inner(x)
+
+    outer = rebind(twice, inner=lambda x: 2.0 * x)
+    assert interpreted(outer, {"inner": lambda x: 5.0 * x})(1.0) == 5.0
+    assert outer(1.0) == 2.0
+    assert compiled(outer)(1.5) == 3.0
+
+
+def inner(x: float) -> float:
+    return x
+
+
+def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "a"))
+    assert cache_folder() == tmp_path / "a"
+    monkeypatch.delenv("EHA_RIG_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+    assert cache_folder() == tmp_path / "b/eha-rig"
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "file"))  # cannot be made: fall back
+    monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
+    assert cache_folder() == tmp_path / f"eha-rig-{os.getuid()}"
+
+
+def test_a_live_change_names_what_is_missing() -> None:
+    with pytest.raises(InputError, match=r"jack\.moss"):
+        Actuator(Model()).set("jack.moss", 1.0)
