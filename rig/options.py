@@ -59,9 +59,15 @@ def model_of(args: argparse.Namespace) -> Model:
 
 
 def load_user_effects(files: list[Path]) -> None:
-    """Put the user's own effects into the catalogue."""
+    """Put the user's own effects into the catalogue.
+
+    Raises:
+        InputError: a file that cannot be used, or two of one name: a log keeps them by name.
+    """
     if files:
         from plant.effects import load_effects
 
-        for file in files:
+        for i, file in enumerate(files):
+            if file.name in [other.name for other in files[:i]]:
+                raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")
             load_effects(file)
