@@ -48,10 +48,10 @@ def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str]) 
 
 
 def pack(s: State, a: Any) -> None:
-    """Write `s` into the array `a` (bound to a model's own)."""
-    raise NotImplementedError
+    """Write `s` into the array `a`. This one stands for a model's own, which is put in its place."""
+    raise TypeError("no model is bound")
 
 
 def unpack(a: Any) -> Any:
-    """The state that the array `a` holds (bound to a model's own)."""
-    raise NotImplementedError
+    """The state that the array `a` holds. This one stands for a model's own."""
+    raise TypeError("no model is bound")

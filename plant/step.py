@@ -1,4 +1,4 @@
-"""One step of the reference model (Fig. 5 of the paper) in three parts: coefficients, servovalve, jack.
+"""One step of the reference model (Fig. 5 of the paper), component by component along the signal path.
 
 Stiff terms are implicit: the pressure-flow damping has time constants of 3 us and 22 us, and dry friction is a set.
 Positions follow the mean of the old and the new velocity, the flapper the trapezoidal rule with the spool where it
@@ -11,6 +11,18 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from plant.friction import clip, slide
+from plant.ports import (
+    at_current,
+    at_feedback,
+    at_jack_drag,
+    at_load,
+    at_metering,
+    at_nozzle,
+    at_position,
+    at_spool_force,
+    at_supply,
+    at_valve,
+)
 from plant.state import Drag, Input, Line, Memory, Ports, State
 
 
@@ -30,15 +42,6 @@ class Coefficients(NamedTuple):
     valve_limit: float  # PSR, Pa
     jack_free: float  # 1/kg
     jack_coupled: float  # 1/kg
-
-
-def through(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
-    """A port without effects: the signal passes."""
-    return x, m
-
-
-at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
-at_valve = at_load = at_jack_drag = at_position = at_supply = through
 
 
 def coefficients(p: Any, ratio: float, h: float) -> Coefficients:
@@ -114,12 +117,16 @@ def spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float
     return x, v, m_nozzle, m_force
 
 
-def jack(s: State, u: Input, p: Any, k: Coefficients, xs: float
-         ) -> tuple[float, float, float, Memory, Memory, Memory, Memory]:
-    """Metering edges and ram: XJ, XJ', P12, memory of the metering, valve, load and drag."""
-    g, h, v0 = p.jack, u.h, s.jack_speed
+def metering(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
+    """Metering edges with leakage: P12 against the ram's speed, memory of the metering and of the valve."""
     opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
     line, m_valve = at_valve(Line(k.valve_gain * opening, k.valve_slope), s.memory.valve, s, u, p)
+    return line, m_metering, m_valve
+
+
+def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line) -> tuple[float, float, float, Memory, Memory]:
+    """The ram: XJ, XJ', P12, memory of the load and of the drag."""
+    g, h, v0 = p.jack, u.h, s.jack_speed
     load, m_load = at_load(u.load, s.memory.load, s, u, p)
     drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
     # an effect that changes slope or damping pays for its division; without one these two fold away
@@ -131,7 +138,7 @@ def jack(s: State, u: Input, p: Any, k: Coefficients, xs: float
     impulse = g.mass * v0 - h * (load + drag.force)
     v = slide(v0, impulse, push, line.offset, line.slope, k.valve_limit, dry, free, coupled)
     x, v = travel(s.jack_position, v0, v, h, g.travel)
-    return x, v, clip(line.offset - line.slope * v, k.valve_limit), m_metering, m_valve, m_load, m_drag
+    return x, v, clip(line.offset - line.slope * v, k.valve_limit), m_load, m_drag
 
 
 def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
@@ -139,7 +146,8 @@ def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
     k, m_supply = supplied(k, s.memory.supply, s, u, p)
     xf, vf, m_current, m_feedback = flapper(s, u, p, k)
     xs, vs, m_nozzle, m_force = spool(s, u, p, k, xf)
-    xj, vj, p12, m_metering, m_valve, m_load, m_drag = jack(s, u, p, k, xs)
+    line, m_metering, m_valve = metering(s, u, p, k, xs)
+    xj, vj, p12, m_load, m_drag = jack(s, u, p, k, line)
     sensed, m_position = at_position(xj, s.memory.position, s, u, p)
     return State(xf, vf, xs, vs, xj, vj, p12, sensed, Ports(
         m_current, m_supply, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load, m_drag, m_position))

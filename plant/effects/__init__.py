@@ -23,12 +23,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from plant.compile import Function, rebind
+from plant.compile import Function
 from plant.errors import InputError
 from plant.parameters import GROUPS
+from plant.ports import chain
 from plant.quantity import Quantity, quantities
 from plant.state import Memory, Ports
-from plant.step import through
 
 __all__ = ["CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"]
 
@@ -118,38 +118,9 @@ def _file(entry: Effect) -> Path | None:
 
 def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
     """All of the named effects that act at `port` as one function, with their initial memory."""
-    chain: Law = through
-    remembered: Memory = 0.0
-    for entry in (CATALOGUE[name] for name in names):
-        if entry.port != port:
-            continue
-        law, own = _with_memory(entry)
-        if chain is not through:
-            law, own = rebind(_then, first=chain, second=law), (remembered, own)
-        chain, remembered = law, own
-    return chain, remembered
+    acting = [entry for entry in (CATALOGUE[name] for name in names) if entry.port == port]
+    return chain((entry.function, entry.memory) for entry in acting)
 
-
-def _with_memory(entry: Effect) -> tuple[Law, Memory]:
-    assert entry.function is not None
-    if entry.memory is None:
-        return rebind(_forgetful, law=entry.function), 0.0
-    return entry.function, entry.memory()
-
-
-def _forgetful(x: Any, m: Memory, s: Any, u: Any, p: Any) -> tuple[Any, Memory]:
-    return law(x, s, u, p), m
-
-
-def _then(x: Any, m: Memory, s: Any, u: Any, p: Any) -> tuple[Any, Memory]:
-    x, a = first(x, m[0], s, u, p)
-    x, b = second(x, m[1], s, u, p)
-    return x, (a, b)
-
-
-law: Law = through
-first: Law = through
-second: Law = through  # these three are bound for each chain
 
 for _family in ("base", "servovalve", "jack", "sensors"):
     importlib.import_module(f"plant.effects.{_family}")

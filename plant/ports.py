@@ -1,0 +1,52 @@
+"""The ports of the signal path: places where effects act, and how several effects become one function.
+
+`plant.step` calls `at_<port>` at each place. Here these let the signal through; a model's kernels are compiled with
+its effects in their stead (`plant.compile`). A function at a port gets the signal, what it remembers, the state at the
+start of the step, the inputs and the parameters; it returns the signal and what it will remember.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from plant.compile import Function, rebind
+from plant.state import Input, Memory, State
+
+
+def through(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+    """A port without effects: the signal passes."""
+    return x, m
+
+
+at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
+at_valve = at_load = at_jack_drag = at_position = at_supply = through
+
+
+def chain(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:
+    """Laws with the type of their memory (None: they remember nothing) as one function, and its first memory.
+
+    They act in the order given. Memories nest as the functions do: ((first, second), third).
+    """
+    whole: Function = through
+    remembered: Memory = 0.0
+    for function, memory in laws:
+        one, own = (rebind(_forgetful, law=function), 0.0) if memory is None else (function, memory())
+        if whole is not through:
+            one, own = rebind(_then, first=whole, second=one), (remembered, own)
+        whole, remembered = one, own
+    return whole, remembered
+
+
+law: Function = through
+first: Function = through
+second: Function = through  # these three are bound in each link of a chain
+
+
+def _forgetful(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+    return law(x, s, u, p), m
+
+
+def _then(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+    x, a = first(x, m[0], s, u, p)
+    x, b = second(x, m[1], s, u, p)
+    return x, (a, b)
