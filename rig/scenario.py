@@ -12,6 +12,7 @@ from plant.segments import Array
 from rig.faults import Plan
 
 FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
+SENT = 1 << 20  # bytes in one SDO download, as the node's server has it
 LARGEST = 1 << 26  # bytes of JSON: six hours of random load
 LONGEST = 20_000_000  # cycles; noise is drawn for all of them beforehand
 WHERE = "scenario (object 0x2210)"
@@ -36,11 +37,19 @@ class Scenario(NamedTuple):
         return [count * FORCE for count in self.force]
 
     def to_bytes(self) -> bytes:
-        """JSON, compressed. Loads are second differences: constant and ramp are zeros."""
+        """JSON, compressed. Loads are second differences: constant and ramp are zeros.
+
+        Raises:
+            InputError: it is more than a node takes.
+        """
         changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
-        return zlib.compress(json.dumps({
+        data = zlib.compress(json.dumps({
             "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.differences()},
             "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
+        if len(data) > SENT:
+            raise InputError("load", "", f"a load (and faults) of at most {SENT >> 10} KiB compressed, not "
+                                         f"{len(data) >> 10} KiB: fewer recorded cycles, or fewer digits")
+        return data
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Scenario:

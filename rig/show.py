@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -41,8 +42,9 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
         yield lambda what, done, total: None
         return
     errors = Console(stderr=True)
-    bar = Progress(TextColumn("{task.description:<14}"), BarColumn(40), TextColumn("{task.percentage:>3.0f} %"),
-                   TimeElapsedColumn(), console=errors, transient=True, disable=not errors.is_terminal)
+    bar = Progress(TextColumn("{task.description:<14}", markup=False), BarColumn(40),
+                   TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
+                   console=errors, transient=True, disable=not errors.is_terminal)
     with bar:
         task = bar.add_task("bring-up", total=None)
         told = False
@@ -51,8 +53,8 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
             nonlocal told
             if not told:  # not before there is a bus and a place for the results: an error is one line
                 told = True
-                _Console(highlight=False).print(f"[bold]{job.sequence.title}[/], {job.sequence.duration:g} s, "
-                                                f"{job.pace}, seed {job.seed}, {why}", soft_wrap=True)
+                _Console(highlight=False).print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
+                                                f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
             bar.update(task, description=what, completed=done, total=total or None)
 
         yield update
@@ -105,7 +107,8 @@ def outcome(o: Outcome) -> None:
     table.add_column("", overflow="fold")
     for c in o.checks:
         mark = "[green]pass[/]" if c.passed else "[bold red]FAIL[/]"
-        table.add_row(c.name, number(c.value), limits(c.low, c.high), c.unit, mark, f"[dim]{c.detail}[/]")
+        table.add_row(escape(c.name), number(c.value), limits(c.low, c.high), c.unit, mark,
+                      f"[dim]{escape(c.detail)}[/]")
     console.print(table)
     timing = o.timing
     late = timing["lateness_us"]
@@ -119,12 +122,12 @@ def outcome(o: Outcome) -> None:
         console.print("missing   " + ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in missing.items()))
     notable = [event for event in o.events if event.level != "INFO"]
     for event in notable[:EVENTS]:
-        console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {event.text}", soft_wrap=True)
+        console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {escape(event.text)}", soft_wrap=True)
     if len(notable) > EVENTS:
         console.print(f"            and {len(notable) - EVENTS} more in the report")
-    console.print(f"results   {o.folder}/ trace.mcap, verdict.json, report.html")
-    words = {"FAIL": ", ".join(o.failures), "ABORTED": o.aborted}.get(o.verdict, MEANING.get(o.verdict))
-    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {words}", soft_wrap=True)
+    console.print(f"results   {escape(str(o.folder))}/ trace.mcap, verdict.json, report.html")
+    words = {"FAIL": ", ".join(o.failures), "ABORTED": o.aborted}.get(o.verdict) or MEANING[o.verdict]
+    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {escape(words)}", soft_wrap=True)
 
 
 def number(value: float) -> str:

@@ -130,6 +130,13 @@ def test_a_run_that_fails(short: Path, tmp_path: Path) -> None:
     assert [check["name"] for check in said.json["checks"] if not check["passed"]] == ["overshoot"]
 
 
+def test_brackets_in_names_are_brackets(tmp_path: Path) -> None:
+    """rich would take them for mark-up, and end a run that passed with a traceback."""
+    text = SHORT.replace("A short one", "[red]A[/] short one").replace('"overshoot",', '"[/b] overshoot",', 1)
+    said = rig("run", written(tmp_path / "odd.toml", text.replace('"rest"', '"[rest"')), "--out", tmp_path / "[out]")
+    assert said.status == 0 and "[red]A[/] short one" in said.out and "[/b] overshoot" in said.out, said
+
+
 def test_a_run_for_people(short: Path, tmp_path: Path) -> None:
     said = rig("run", short, "--out", tmp_path / "out")
     assert said.status == 0 and "PASS" in said.out and "overshoot" in said.out and "times real time" in said.out

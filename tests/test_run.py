@@ -1,18 +1,19 @@
 """Whole runs: the same bytes for the same seed, whatever the pace and the bus; and what a killed one leaves behind."""
 from __future__ import annotations
 
+import os
 import signal
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import finished, gone, nodes_on, rig, started
+from command import finished, gone, grown, nodes_on, rig, started
 from mcap.reader import make_reader
 from plays import SHORT, job, play
 from stations import spec
 
-from fdi.trace import Trace
+from fdi.trace import CLEANUP, Trace
 from plant import simulate
 from rig import codec
 from rig.bus import open_can
@@ -72,7 +73,8 @@ def test_processes_on_a_bus_give_the_same_signals(tmp_path: Path, reference: np.
     """Plant and controller as processes of their own: same signals, and nobody is left behind."""
     where = spec("udp_multicast")
     outcome = play(job(seed=1, bus=where), tmp_path / "b")
-    assert outcome.verdict == "PASS" and np.array_equal(columns(tmp_path / "b"), reference)
+    assert (outcome.verdict, outcome.aborted, set(outcome.counters.values())) == ("PASS", "", {0})
+    assert np.array_equal(columns(tmp_path / "b"), reference)
     assert nodes_on(where) == []
 
 
@@ -119,6 +121,19 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     kept = round((trace.t[-1] - trace.t[0]) * 1000) + 1
     assert last - 500 <= kept <= last + 1
     assert {"model.toml", "sequence/long.toml"} <= trace.attachments.keys()
+
+
+def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path) -> None:
+    """A terminal interrupts all its processes; clean-up needs the plant."""
+    where = spec("udp_multicast")
+    (tmp_path / "long.toml").write_text(LONG)
+    process = started("run", tmp_path / "long.toml", "--bus", where, "--out", tmp_path, "--quiet",
+                      start_new_session=True)
+    grown(tmp_path / "trace.mcap", 60_000)
+    os.killpg(process.pid, signal.SIGINT)
+    assert finished(process).status == 130 and gone(where)
+    trace = Trace.read(tmp_path, all=True)
+    assert (trace.phase == CLEANUP).sum() == 50 and not np.isnan(trace.xj).any()
 
 
 def test_an_external_node_that_does_not_answer(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from rig.emulator import Emulator
 from rig.firmware import Firmware
 from rig.frame import Frame
 from rig.recorder import RecorderError
+from rig.sequence import parse_sequence
 from rig.session import Session
 from rig.wire import EmbeddedWire
 
@@ -223,3 +225,13 @@ def test_a_law_that_cannot_be_compiled_is_bad_input(tmp_path: Path, monkeypatch:
     with pytest.raises(InputError, match="mine: expected laws"):
         play(job(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
+    """White noise does not compress: said before a word is sent, and not as "out of memory"."""
+    rows = "\n".join(f"{k / 1000:.3f},{value:.3f}" for k, value in enumerate(np.random.default_rng(0).normal(
+        0.0, 1e6, 250_000)))
+    text = 'title = "x"\nmain = [{ kind = "hold", time = 250 }]\nload = [{ kind = "csv", file = "x.csv" }]'
+    sequence = parse_sequence(text, "x.toml", lambda name: f"t,value\n{rows}\n".encode())
+    with pytest.raises(InputError, match="KiB compressed"):
+        play(replace(job(), sequence=sequence), tmp_path)
