@@ -1,6 +1,8 @@
 """A run as data: everything that decides what happens, from the command line or from an earlier run's log."""
 from __future__ import annotations
 
+import atexit
+import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -91,6 +93,7 @@ def _unpack(files: Mapping[str, bytes]) -> tuple[Path, ...]:
     if not files:
         return ()
     folder = Path(tempfile.mkdtemp(prefix="eha-rig-effects-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, data in files.items():
         (folder / Path(name).name).write_bytes(data)
     return tuple(folder / Path(name).name for name in files)

@@ -197,8 +197,8 @@ class Master:
         self.network.nmt.send_command(specifier)
 
     def errors(self) -> list[int]:
-        """Error codes that the nodes have announced and not yet taken back."""
-        return [error.code for node in self._nodes.values() for error in node.emcy.active]
+        """Nodes with an error, by the register in their last EMCY: code 0 takes back one error, others may stand."""
+        return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
 
     def _write(self, node: int, index: int, sub: int, value: Any) -> None:
         try:

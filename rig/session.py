@@ -133,7 +133,8 @@ class Session:
             return 0
         if phase == CLEANUP and self.safe and i == 0:
             return int(Control.RESET)
-        return int(_ENABLING[i]) if i < len(_ENABLING) and phase == SETUP else int(Control.ACTIVE)
+        started = self.loop.k if self.loop else 0  # without set-up main is where it is enabled
+        return int(_ENABLING[started]) if started < len(_ENABLING) else int(Control.ACTIVE)
 
     def _run(self, phase: int, steps: Iterator[tuple[str, Step]]) -> bool:
         """The cycles of one phase; False when it was ended early."""
@@ -179,7 +180,8 @@ class Session:
 
     def _emcy(self, node: int, error: EmcyError) -> None:
         if error.code & 0xFF00 == 0:
-            self.say("INFO", "recovered", f"node {node} {NAMES[node]}: no error any more")
+            left = "an error is gone, others stand" if error.register else "no error any more"
+            self.say("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
         else:
             self._trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
 

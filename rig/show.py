@@ -4,9 +4,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -16,6 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from rig.console import console
 from rig.job import Job
 from rig.outcome import Outcome
 
@@ -23,16 +22,6 @@ EVENTS = 12  # shown in the terminal
 COLOURS = {"PASS": "green", "FAIL": "red", "ABORTED": "red", "INVALID_TIMING": "yellow"}
 MEANING = {"PASS": "every check passed",
            "INVALID_TIMING": "the bench itself was too late too often: nothing can be said of the controller"}
-
-
-class _Console(Console):
-    """Goes on in silence when the reader of a pipe has gone: a verdict does not depend on who listens."""
-
-    def on_broken_pipe(self) -> None:
-        """In place of rich's, which ends the program with status 1."""
-        self.quiet = True
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
@@ -53,7 +42,7 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
             nonlocal told
             if not told:  # not before there is a bus and a place for the results: an error is one line
                 told = True
-                _Console(highlight=False).print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
+                console().print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
                                                 f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
             bar.update(task, description=what, completed=done, total=total or None)
 
@@ -97,7 +86,7 @@ def as_json(outcome: Outcome) -> None:
 
 def outcome(o: Outcome) -> None:
     """The table of checks, the timing and the verdict."""
-    console = _Console(highlight=False)
+    out = console()
     table = Table(box=None, pad_edge=False)
     table.add_column("check")
     table.add_column("measured", justify="right")
@@ -109,25 +98,25 @@ def outcome(o: Outcome) -> None:
         mark = "[green]pass[/]" if c.passed else "[bold red]FAIL[/]"
         table.add_row(escape(c.name), number(c.value), limits(c.low, c.high), c.unit, mark,
                       f"[dim]{escape(c.detail)}[/]")
-    console.print(table)
+    out.print(table)
     timing = o.timing
     late = timing["lateness_us"]
     if o.job.realtime:
-        console.print(f"\ntiming    {timing['cycles']} cycles, {timing['overruns']} overruns; lateness "
+        out.print(f"\ntiming    {timing['cycles']} cycles, {timing['overruns']} overruns; lateness "
                       f"p50 {late['p50']:g}, p99 {late['p99']:g}, max {late['max']:g} us ({timing['scheduler']})")
     else:
-        console.print(f"\ntiming    {timing['cycles']} cycles in lockstep, {o.speed:.1f} times real time")
+        out.print(f"\ntiming    {timing['cycles']} cycles in lockstep, {o.speed:.1f} times real time")
     missing = {name: count for name, count in o.counters.items() if count}
     if missing:
-        console.print("missing   " + ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in missing.items()))
+        out.print("missing   " + ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in missing.items()))
     notable = [event for event in o.events if event.level != "INFO"]
     for event in notable[:EVENTS]:
-        console.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {escape(event.text)}", soft_wrap=True)
+        out.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {escape(event.text)}", soft_wrap=True)
     if len(notable) > EVENTS:
-        console.print(f"            and {len(notable) - EVENTS} more in the report")
-    console.print(f"results   {escape(str(o.folder))}/ trace.mcap, verdict.json, report.html")
+        out.print(f"            and {len(notable) - EVENTS} more in the report")
+    out.print(f"results   {escape(str(o.folder))}/ trace.mcap, verdict.json, report.html")
     words = {"FAIL": ", ".join(o.failures), "ABORTED": o.aborted}.get(o.verdict) or MEANING[o.verdict]
-    console.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {escape(words)}", soft_wrap=True)
+    out.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {escape(words)}", soft_wrap=True)
 
 
 def number(value: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -217,5 +218,5 @@ def test_output_that_nobody_reads_changes_no_verdict(how: str, short: Path, tmp_
 
 
 def test_the_installed_command_is_this_one() -> None:
-    done = subprocess.run(["rig", "effects", "--json"], capture_output=True, text=True)
+    done = subprocess.run([Path(sys.executable).parent / "rig", "effects", "--json"], capture_output=True, text=True)
     assert done.returncode == 0 and '"spool_friction"' in done.stdout

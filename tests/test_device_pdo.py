@@ -159,17 +159,21 @@ def test_sync_with_data_is_refused_and_said_once() -> None:
     assert rack.sync() == [(0x083, NO_ERROR), (0x183, bytes(8)), (0x283, bytes(8))]
 
 
-def test_sync_lost_after_ten_periods_and_back() -> None:
+def test_sync_lost_after_a_hundred_periods_and_back() -> None:
     rack = running()
-    assert rack.wait(50) == []  # none came yet: none is missed
+
+    def wait(ms: int) -> list[tuple[int, bytes]]:
+        return [frame for frame in rack.wait(ms) if frame[0] != 0x703]  # heartbeats go on
+
+    assert wait(500) == []  # none came yet: none is missed
     rack.sync()
-    assert rack.wait(10) == []
-    assert rack.wait(1) == [(0x083, bytes.fromhex("0081110000000000"))]
-    assert rack.wait(20) == []
+    assert wait(100) == []
+    assert wait(1) == [(0x083, bytes.fromhex("0081110000000000"))]
+    assert wait(200) == []
     assert rack.sync()[0] == (0x083, NO_ERROR)
     download(rack, 0x1006, 0, 0, 4)
     rack.sync()
-    assert rack.wait(50) == [(0x703, b"\5")]  # not watched any more
+    assert wait(500) == []  # not watched any more
 
 
 def test_sync_is_not_missed_outside_operational() -> None:

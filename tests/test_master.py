@@ -125,7 +125,7 @@ def test_a_short_sdo_response_is_none() -> None:
 def test_emergencies_come_and_go() -> None:
     master = alone()
     master.receive(Frame(0, 0x083, bytes.fromhex("5082110100000000")))
-    assert master.errors() == [0x8250]
+    assert master.errors() == [3]
     master.receive(Frame(0, 0x083, bytes(8)))
     assert master.errors() == []
 

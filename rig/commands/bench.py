@@ -40,26 +40,26 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     from rig.bench import GET_GCC
+    from rig.console import console
 
-    console = Console()
+    out = console()
     table = Table("The plant", "", "Python / C", "against Python", box=None, pad_edge=False)
     for row in _costs(answer):
         table.add_row(*row)
-    console.print(table)
+    out.print(table)
     if answer["step"] is None:
-        console.print(f"step beside C: skipped, there is no gcc; to get it: {GET_GCC}")
+        out.print(f"step beside C: skipped, there is no gcc; to get it: {GET_GCC}")
     if rows:
-        console.print()
-        console.print("Error of XJ over the preflight, closed loop, against steps of 0.2 us, um")
+        out.print()
+        out.print("Error of XJ over the preflight, closed loop, against steps of 0.2 us, um")
         table = Table("step, us", "friction off: RMS", "max", "friction on: RMS", "max", box=None, pad_edge=False)
         for r in rows:
             table.add_row(f"{1000 / r.steps:g}", f"{r.rms:.4f}", f"{r.largest:.4f}", f"{r.rms_friction:.2f}",
                           f"{r.largest_friction:.2f}")
-        console.print(table)
+        out.print(table)
 
 
 def _costs(answer: dict[str, Any]) -> list[tuple[str, ...]]:

@@ -43,9 +43,10 @@ def run(args: argparse.Namespace) -> int:
 
 def show(findings: list[Finding]) -> None:
     """The table: one row for each finding, under its area's name."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from rig.console import console
 
     table = Table(box=None, pad_edge=False)
     for column in ("What this machine can do", "", "found", "for", "how to get it"):
@@ -57,4 +58,4 @@ def show(findings: list[Finding]) -> None:
             area = finding.area
         texts = [escape(text) for text in (finding.found, finding.purpose, finding.remedy)]
         table.add_row(f"  {escape(finding.name)}", MARKS[finding.status], *texts)
-    Console().print(table)
+    console().print(table)

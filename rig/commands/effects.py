@@ -66,8 +66,9 @@ def describe(e: Effect) -> dict[str, Any]:
 
 def table(chosen: list[Effect]) -> None:
     """The catalogue as a table."""
-    from rich.console import Console
     from rich.table import Table
+
+    from rig.console import console
 
     t = Table(box=None, pad_edge=False, title_justify="left")
     for column in ("effect", "acts on", "parameters", "what tells it apart"):
@@ -75,21 +76,22 @@ def table(chosen: list[Effect]) -> None:
     for e in chosen:
         names = "\n".join(f"{name} [dim]{q.unit}[/]" for name, q in e.parameters.items())
         t.add_row(f"[bold]{e.name}[/]", e.port or "[dim]reference model[/]", names, e.symptoms)
-    console = Console()
-    console.print(t)
-    console.print("\nGive a model an effect with [bold]--set NAME.PARAMETER=VALUE[/]; "
+    out = console()
+    out.print(t)
+    out.print("\nGive a model an effect with [bold]--set NAME.PARAMETER=VALUE[/]; "
                   "[bold]rig effects NAME[/] tells its law.", highlight=False)
 
 
 def tell(e: Effect) -> None:
     """One effect at length."""
-    from rich.console import Console
 
-    console = Console(highlight=False)
+    from rig.console import console
+
+    out = console()
     doc = (e.function.__doc__ or "") if e.function else ""
-    console.print(f"[bold]{e.name}[/]  {doc.splitlines()[0] if doc else ''}")
+    out.print(f"[bold]{e.name}[/]  {doc.splitlines()[0] if doc else ''}")
     port = e.port or "the reference model itself"
-    console.print(f"  law        {e.law}\n  acts on    {port}\n  symptoms   {e.symptoms}")
+    out.print(f"  law        {e.law}\n  acts on    {port}\n  symptoms   {e.symptoms}")
     for name, p in describe(e)["parameters"].items():
         typical = f", typically {p['typical']}" if p["typical"] else ""
-        console.print(f"  parameter  [bold]{name}[/] in {p['unit']}: {p['expected']}; off at {p['off']:g}{typical}")
+        out.print(f"  parameter  [bold]{name}[/] in {p['unit']}: {p['expected']}; off at {p['off']:g}{typical}")

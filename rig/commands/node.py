@@ -27,11 +27,11 @@ def run(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.bus import choose, open_can
     from rig.clock import WallClock
+    from rig.crew import EMBEDDED
     from rig.emulator import Emulator
     from rig.firmware import Firmware
     from rig.link import Link
     from rig.priority import elevated
-    from rig.runner import EMBEDDED
     from rig.wire import serve
 
     bus, _ = choose(args.bus)

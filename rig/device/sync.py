@@ -7,8 +7,8 @@ from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.frame import Frame
 
 # 0x1006 says when a SYNC is due but not when it is lost. A late one is the bench's own business, it measures lateness;
-# ten missing in a row mean that the producer is gone.
-_LOST_AFTER = 10  # periods
+# a hundred missing in a row mean that the producer is gone.
+_LOST_AFTER = 100  # periods
 
 
 class SyncConsumer:
