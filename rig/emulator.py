@@ -16,9 +16,9 @@ from plant.errors import InputError
 from rig import codec
 from rig.codec import Flags
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
-from rig.faults import Delay, Plan, Schedule
 from rig.frame import Frame, Send
 from rig.scenario import Scenario
+from rig.sequences.faults import Delay, Plan, Schedule
 
 NODE = 3
 SCENARIO, COUNTERS = 0x2210, 0x2211

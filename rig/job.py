@@ -15,7 +15,7 @@ from plant.effects import load_effects
 from plant.model import parse_model
 from plant.parameters import parse_toml
 from rig.scenario import Scenario
-from rig.sequence import Sequence
+from rig.sequences import Sequence
 
 _SAID = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECTS, _FILES = "effects/", "sequence/"  # folders of the attachments

@@ -12,10 +12,10 @@ from typing import NamedTuple, Protocol
 
 from rig import codec
 from rig.clock import WallClock
-from rig.faults import Delay, Schedule
 from rig.frame import Frame
 from rig.master import Master
 from rig.recorder import Signals, Timing
+from rig.sequences.faults import Delay, Schedule
 
 _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
 _ALL = _XJ | _XS | _COR

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rig.checks import CheckResult
 from rig.job import Job
 from rig.recorder import Timing
+from rig.sequences.checks import CheckResult
 from rig.session import Happening
 
 STATUS = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}

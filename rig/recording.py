@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fdi.sections import Section
 from fdi.trace import Check, Trace
 from plant.errors import RigError
-from rig.units import IN_SI
+from rig.sequences.units import IN_SI
 
 if TYPE_CHECKING:
     import rerun as rr

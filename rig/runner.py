@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from plant import Actuator, InputError
-from rig.checks import CheckResult, evaluate
 from rig.clock import WallClock
 from rig.crew import crew
 from rig.job import Job
@@ -20,6 +19,7 @@ from rig.outcome import Outcome, timing
 from rig.priority import elevated, scheduler, uncollected
 from rig.recorder import Check, Recorder, Signals
 from rig.recorder.provenance import provenance
+from rig.sequences.checks import CheckResult, evaluate
 from rig.session import MAIN, Progress, Session
 
 

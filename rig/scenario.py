@@ -9,7 +9,7 @@ import numpy as np
 
 from plant import InputError, Model
 from plant.segments import Array
-from rig.faults import Plan
+from rig.sequences.faults import Plan
 
 FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 SENT = 1 << 20  # bytes in one SDO download, as the node's server has it

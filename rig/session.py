@@ -16,13 +16,13 @@ from rig import firmware
 from rig.clock import WallClock
 from rig.codec import Control
 from rig.device.nmt import NmtState
-from rig.faults import Schedule
-from rig.guards import Watch
 from rig.job import Job
 from rig.loop import Loop, Step
 from rig.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
 from rig.recorder import Event, Recorder, Signals
 from rig.recorder import NmtState as NmtRecord
+from rig.sequences.faults import Schedule
+from rig.sequences.guards import Watch
 from rig.wire import Wire
 
 SETUP, MAIN, CLEANUP = 0, 1, 2

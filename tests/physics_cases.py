@@ -4,7 +4,7 @@ from __future__ import annotations
 from plant import Model
 from plant.profile import build
 from rig.bench import FRICTIONLESS, QUIET
-from rig.sequence import load_sequence
+from rig.sequences.sequence import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 SILENT = Model().replace(QUIET)

@@ -8,7 +8,7 @@ from plant import load_model
 from rig.job import Job
 from rig.outcome import Outcome
 from rig.runner import run
-from rig.sequence import parse_sequence
+from rig.sequences.sequence import parse_sequence
 
 SHORT = """
 title = "A short one"

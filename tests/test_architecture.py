@@ -56,6 +56,7 @@ PUBLIC = {
     "rig.device": {
         "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
     },
+    "rig.sequences": {"Sequence", "load_sequence"},
     "rig.recorder": {
         "U32", "CanFrame", "Check", "Event", "NmtState", "Record", "Recorder", "RecorderError", "Signals", "Timing",
     },

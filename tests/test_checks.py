@@ -11,9 +11,9 @@ import pytest
 from plant.errors import InputError
 from plant.profile import build
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
-from rig import checks, measures
-from rig.checks import CheckResult, evaluate
-from rig.guards import Guard, Watch
+from rig.sequences import checks, measures
+from rig.sequences.checks import CheckResult, evaluate
+from rig.sequences.guards import Guard, Watch
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower

@@ -11,9 +11,10 @@ import pytest
 
 from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, load_effects
-from rig import checks, cli, faults
-from rig.guards import Guard
-from rig.sequence import Sequence, parse_sequence
+from rig import cli
+from rig.sequences import checks, faults
+from rig.sequences.guards import Guard
+from rig.sequences.sequence import Sequence, parse_sequence
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -14,8 +14,8 @@ from rig import codec
 from rig.codec import Flags
 from rig.device import Abort, NmtState
 from rig.emulator import COUNTERS, MISSED_LIMIT
-from rig.faults import Fault, Late, Lost, Noise, Offset, Parameter, Plan, Silent, Stuck
 from rig.scenario import Scenario
+from rig.sequences.faults import Fault, Late, Lost, Noise, Offset, Parameter, Plan, Silent, Stuck
 
 QUIET_MODEL = Model().replace({f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spool")})
 STOP = 200

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError
-from rig import faults
-from rig.faults import Delay, Drop, Fault, Late, Lost, Noise, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences import faults
+from rig.sequences.faults import Delay, Drop, Fault, Late, Lost, Noise, Offset, Parameter, Plan, Schedule, Silent, Stuck
 
 BASE = {"filter.clogging": 0.0, "spool.static_friction": 5.0}
 

@@ -8,12 +8,12 @@ import pytest
 
 from rig import codec
 from rig.clock import VirtualClock, WallClock
-from rig.faults import Fault, Late, Lost, Plan, Schedule, Silent
 from rig.frame import Frame
 from rig.link import Link
 from rig.loop import Loop, Step
 from rig.master import Master
 from rig.recorder import Signals, Timing
+from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
 from rig.wire import EmbeddedWire, LinkWire
 
 MS = 1_000_000  # ns

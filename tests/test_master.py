@@ -12,12 +12,12 @@ from plant import Model
 from rig.bus import open_can
 from rig.clock import VirtualClock, WallClock
 from rig.emulator import Emulator
-from rig.faults import Plan
 from rig.firmware import Firmware, gains_of
 from rig.frame import Frame
 from rig.link import Link
 from rig.master import CONTROLLER, PLANT, BusError, Master
 from rig.scenario import Scenario
+from rig.sequences.faults import Plan
 from rig.wire import EmbeddedWire, LinkWire, Wire, serve
 
 SCENARIO = Scenario(Model(), Plan(stop=10)).to_bytes()

@@ -10,9 +10,9 @@ import pytest
 
 from plant import load_model, simulate
 from plant.errors import InputError
-from rig import toml_lines
-from rig.checks import CheckResult, evaluate
-from rig.sequence import Sequence, load_sequence, parse_sequence
+from rig.sequences import toml_lines
+from rig.sequences.checks import CheckResult, evaluate
+from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
 SHIPPED = sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
 FULL = """\

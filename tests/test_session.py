@@ -17,7 +17,7 @@ from rig.emulator import Emulator
 from rig.firmware import Firmware
 from rig.frame import Frame
 from rig.recorder import RecorderError
-from rig.sequence import parse_sequence
+from rig.sequences.sequence import parse_sequence
 from rig.session import Session
 from rig.wire import EmbeddedWire
 

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from rig import bench
-    from rig.sequence import load_sequence
+    from rig.sequences import load_sequence
 
     command = load_sequence("preflight").main_profile().command
     answer = bench.report(command)

@@ -61,7 +61,7 @@ def asked(args: argparse.Namespace) -> Job:
     """The job the options describe; the sequence's own model choice comes first, --model and --set on top."""
     from plant import InputError, load_model
     from rig.job import Job
-    from rig.sequence import load_sequence
+    from rig.sequences import load_sequence
 
     options.load_user_effects(args.effects)
     sequence = load_sequence(args.sequence or "preflight")

@@ -61,7 +61,7 @@ def _command(file: str | None) -> tuple[Any, Any, str]:
     if file is not None:
         com, load = read_command(file)
         return com, load, file
-    from rig.sequence import load_sequence
+    from rig.sequences import load_sequence
 
     sequence = load_sequence("preflight")
     return sequence.main_profile().command, sequence.load_profile(), "preflight"

@@ -7,7 +7,7 @@ from math import inf
 from typing import Literal
 
 from plant.errors import InputError
-from rig.units import OF_SIGNAL, scale
+from rig.sequences.units import OF_SIGNAL, scale
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from plant.errors import InputError
 from plant.segments import RATE, Array, Second
-from rig import tables
+from rig.sequences import tables
 
 Sensor = Literal["xj", "p12", "xs"]
 FrameName = Literal["feedback", "valve_state", "drive", "command"]

@@ -19,12 +19,12 @@ from plant.errors import InputError
 from plant.model import meaning
 from plant.profile import Profile, build, names, parse_columns
 from plant.segments import RATE, Array, Csv, Segment
-from rig import checks, faults, tables
-from rig.checks import Check, ResponseWithin
-from rig.faults import Fault, Parameter, Plan
-from rig.guards import Guard
-from rig.scene import MAIN
-from rig.tables import Place
+from rig.sequences import checks, faults, tables
+from rig.sequences.checks import Check, ResponseWithin
+from rig.sequences.faults import Fault, Parameter, Plan
+from rig.sequences.guards import Guard
+from rig.sequences.scene import MAIN
+from rig.sequences.tables import Place
 
 Known = Callable[[str], object]  # raises InputError for a name that no parameter has
 ReadFile = Callable[[str], bytes]

@@ -1,6 +1,6 @@
 """Checks as data: what is measured in which window of a run, within which limits, and whether it passed.
 
-Every kind measures one number (rig/measures.py says how) that is held against `low` and `high`, all three in `unit`.
+Every kind measures one number (measures.py says how) that is held against `low` and `high`, all three in `unit`.
 A check never raises: what cannot be measured has failed, and `detail` says why.
 """
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 
 from plant.errors import InputError
 from plant.segments import RATE, Hertz, Second
-from rig import measures
-from rig.measures import NotMeasurable
-from rig.scene import MAIN, EventLike, Scene, TraceLike
-from rig.units import OF_SIGNAL, scale
+from rig.sequences import measures
+from rig.sequences.measures import NotMeasurable
+from rig.sequences.scene import MAIN, EventLike, Scene, TraceLike
+from rig.sequences.units import OF_SIGNAL, scale
 
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InUnit = Annotated[float, "the check's unit"]

@@ -17,7 +17,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plant.errors import InputError
-from rig.toml_lines import Path, lines
+from rig.sequences.toml_lines import Path, lines
 
 T = TypeVar("T")
 Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: subclass}

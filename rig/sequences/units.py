@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from plant.errors import InputError
-from rig import tables
+from rig.sequences import tables
 
 IN_SI: dict[str, tuple[str, float]] = {  # unit: (SI unit, how many of those it is)
     "m": ("m", 1.0), "mm": ("m", 1e-3), "um": ("m", 1e-6),

@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from plant.segments import RATE, Array
-from rig import measures
-from rig.measures import NotMeasurable
+from rig.sequences import measures
+from rig.sequences.measures import NotMeasurable
 
 MAIN = "main"  # the window that is all of the main phase
 MISSING_ALLOWED = 0.01  # of a window; fewer missing samples are bridged by straight lines, and the detail says so
