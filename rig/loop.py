@@ -22,10 +22,10 @@ _ALL = _XJ | _XS | _COR
 
 
 class Log(Protocol):
-    """The part of the recorder that the loop uses."""
+    """Who is told of a cycle when it is over."""
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        """Record one cycle."""
+        """A cycle is over."""
 
 
 class Step(NamedTuple):
@@ -38,15 +38,13 @@ class Step(NamedTuple):
 
 
 class Loop:
-    """Runs cycles one by one; `rows` and `timings` are those that are closed."""
+    """Runs cycles one by one and tells `log` of each when it is closed."""
 
     def __init__(self, master: Master, faults: Schedule, log: Log, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire
         self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
         self.k = 0  # the cycle to come
         self.overruns = 0
-        self.rows: list[Signals] = []
-        self.timings: list[Timing] = []
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._seen = 0
         self._wall = WallClock()
@@ -148,7 +146,5 @@ class Loop:
             return None
         t_ns, row, timing = self._open
         self._open = None
-        self.rows.append(row)
-        self.timings.append(timing)
         self._log.cycle(t_ns, row, timing)
         return row

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from plant.segments import Array
+from rig.history import History
 from rig.job import Job
-from rig.recorder import Timing
 from rig.sequences.checks import CheckResult
 from rig.session import Happening
 
@@ -64,15 +65,16 @@ class Outcome:
                 "run": self.job.settings(), "fdi": {}}
 
 
-def timing(timings: Sequence[Timing], overruns: int, scheduler: str) -> dict[str, Any]:
+def timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:
     """Percentiles of lateness and response in us, as `rig run --json` gives them."""
-    return {"cycles": len(timings), "overruns": overruns, "scheduler": scheduler,
-            "lateness_us": _percentiles([t.lateness for t in timings]),
-            "response_us": _percentiles([t.response for t in timings])}
+    return {"cycles": len(history), "overruns": overruns, "scheduler": scheduler,
+            "lateness_us": _percentiles(history.column("lateness")),
+            "response_us": _percentiles(history.column("response"))}
 
 
-def _percentiles(seconds: Sequence[float]) -> dict[str, float | None]:
-    values = np.array([s for s in seconds if not math.isnan(s)]) * 1e6
+def _percentiles(seconds: Array) -> dict[str, float | None]:
+    """Of the values that are there, in us."""
+    values = seconds[~np.isnan(seconds)] * 1e6
     if not len(values):
         return dict.fromkeys(("p50", "p99", "p99_9", "max"))
     p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))

@@ -5,19 +5,22 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from plant import Actuator, InputError
+from plant.segments import Array
 from rig.clock import WallClock
+from rig.codec import Flags
 from rig.crew import crew
+from rig.history import History
 from rig.job import Job
 from rig.outcome import Outcome, timing
 from rig.priority import elevated, scheduler, uncollected
-from rig.recorder import Check, Recorder, Signals
+from rig.recorder import Check, Recorder
 from rig.recorder.provenance import provenance
 from rig.sequences.checks import CheckResult, evaluate
 from rig.session import MAIN, Progress, Session
@@ -26,13 +29,13 @@ from rig.session import MAIN, Progress, Session
 class Columns(NamedTuple):
     """Main as checks see it; each (n,) SI."""
 
-    t: np.ndarray
-    com: np.ndarray
-    xj: np.ndarray
-    cor: np.ndarray
-    p12: np.ndarray
-    xs: np.ndarray
-    load: np.ndarray
+    t: Array
+    com: Array
+    xj: Array
+    cor: Array
+    p12: Array
+    xs: Array
+    load: Array
 
 
 def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
@@ -57,26 +60,26 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
             session.play()
         spent = stopwatch.now() * 1e-9
         loop = session.loop
-        checks = judge(job, session, loop.rows)
+        history = session.history
+        checks = judge(job, session)
         for check in checks:
             recorder.put(session.now(), _record(check))
         outcome = Outcome(
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-            interrupted=session.interrupted, timing=timing(loop.timings, loop.overruns, scheduled),
-            counters=_counters(loop.rows), speed=len(loop.rows) * job.period_ns * 1e-9 / spent)
+            interrupted=session.interrupted, timing=timing(history, loop.overruns, scheduled),
+            counters=_counters(history), speed=len(history) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted,
                                       "overruns": str(loop.overruns)})
     (folder / "verdict.json").write_text(json.dumps(outcome.to_json(), indent=1) + "\n", encoding="utf-8")
     return outcome
 
 
-def judge(job: Job, session: Session, rows: Sequence[Signals]) -> list[CheckResult]:
+def judge(job: Job, session: Session) -> list[CheckResult]:
     """The job's checks on the main phase."""
-    main = [row for row in rows if row.phase == MAIN]
-    table = np.array([(row.com, row.xj, row.cor, row.p12, row.xs, row.load) for row in main]).reshape(len(main), 6)
-    columns = Columns(np.arange(len(main)) * (job.period_ns * 1e-9), *table.T)
+    main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
+    t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    return evaluate(sequence.checks, columns, sequence.sections(), session.events, sequence.fault_starts())
+    return evaluate(sequence.checks, Columns(t, *main), sequence.sections(), session.events, sequence.fault_starts())
 
 
 @contextlib.contextmanager
@@ -112,11 +115,13 @@ def log(job: Job, folder: Path) -> Iterator[Recorder]:
         recorder.close()
 
 
-def _counters(rows: Sequence[Signals]) -> dict[str, int]:
+def _counters(history: History) -> dict[str, int]:
     """Cycles whose answers did not come, from what the rig itself saw and what the plant flagged."""
-    return {"no_feedback": sum(row.xj != row.xj for row in rows), "no_drive": sum(row.cor != row.cor for row in rows),
-            "plant_drive_missing": sum(row.flags & 1 for row in rows),
-            "plant_drive_late": sum(row.flags >> 1 & 1 for row in rows)}
+    flags = history.column("flags").astype(int)
+    return {"no_feedback": int(np.isnan(history.column("xj")).sum()),
+            "no_drive": int(np.isnan(history.column("cor")).sum()),
+            "plant_drive_missing": int((flags & Flags.DRIVE_MISSING != 0).sum()),
+            "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
 
 
 def _record(check: CheckResult) -> Check:

@@ -16,10 +16,11 @@ from rig import firmware
 from rig.clock import WallClock
 from rig.codec import Control
 from rig.device.nmt import NmtState
+from rig.history import History
 from rig.job import Job
 from rig.loop import Loop, Step
 from rig.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
-from rig.recorder import Event, Recorder, Signals
+from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import Watch
@@ -51,6 +52,7 @@ class Session:
         self._watch = Watch(job.sequence.guards)
         self.loop: Loop | None = None
         self.events: list[Happening] = []
+        self.history = History()
         self.aborted = ""  # why main ended early
         self.interrupted = False
         self.safe = False  # no current from here on, until clean-up
@@ -79,6 +81,11 @@ class Session:
         self.events.append(Happening(self._main_time(), level, kind, text))
         self.recorder.put(t_ns, Event(level, kind, text))
 
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        """The loop has closed a cycle."""
+        self.history.add(signals, timing)
+        self.recorder.cycle(t_ns, signals, timing)
+
     def bring_up(self) -> None:
         """Reset, configure and start the nodes.
 
@@ -93,7 +100,7 @@ class Session:
         self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
-        self.loop = Loop(self._master, self._faults, self.recorder, job.period_ns, job.realtime)
+        self.loop = Loop(self._master, self._faults, self, job.period_ns, job.realtime)
 
     def play(self) -> None:
         """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""

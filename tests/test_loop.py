@@ -69,10 +69,14 @@ class Book:
     """A log that keeps what it is told."""
 
     def __init__(self) -> None:
-        self.rows: list[tuple[int, Signals, Timing]] = []
+        self.times: list[int] = []
+        self.rows: list[Signals] = []
+        self.timings: list[Timing] = []
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        self.rows.append((t_ns, signals, timing))
+        self.times.append(t_ns)
+        self.rows.append(signals)
+        self.timings.append(timing)
 
 
 def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[Loop, Book]:
@@ -92,10 +96,10 @@ def test_a_row_holds_what_belongs_together(realtime: bool) -> None:
     bench = Bench()
     one, book = loop(bench, realtime=realtime)
     run(one, 4)
-    assert [row.cycle for _, row, _ in book.rows] == [0, 1, 2, 3] and one.rows == [row for _, row, _ in book.rows]
-    assert [row.com for row in one.rows] == [0.0, 1e-4, 2e-4, 3e-4]
-    assert {(row.xj, row.p12, row.xs, row.cor, row.status) for row in one.rows} == {(1e-3, 1e5, 1e-6, 2e-3, 15)}
-    assert [t_ns for t_ns, _, _ in book.rows] == [MS, 2 * MS, 3 * MS, 4 * MS]
+    assert [row.cycle for row in book.rows] == [0, 1, 2, 3]
+    assert [row.com for row in book.rows] == [0.0, 1e-4, 2e-4, 3e-4]
+    assert {(row.xj, row.p12, row.xs, row.cor, row.status) for row in book.rows} == {(1e-3, 1e5, 1e-6, 2e-3, 15)}
+    assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
 
 
 def test_command_before_sync_every_cycle() -> None:
@@ -108,11 +112,11 @@ def test_due_times_are_a_fixed_grid() -> None:
     """Being late by less than a period does not shift what follows."""
     bench = Bench()
     bench.stalls = {2: 1_700_000, 5: 1_200_000}
-    one, _ = loop(bench)
+    one, book = loop(bench)
     run(one, 8)
     assert bench.syncs() == pytest.approx([1, 2, 3, 4.7, 5, 6, 7.2, 8])
-    assert [round(t.lateness * 1e6) for t in one.timings] == [0, 0, 0, 700, 0, 0, 200, 0]
-    assert one.overruns == 0 and not any(t.overrun for t in one.timings)
+    assert [round(t.lateness * 1e6) for t in book.timings] == [0, 0, 0, 700, 0, 0, 200, 0]
+    assert one.overruns == 0 and not any(t.overrun for t in book.timings)
 
 
 def test_overruns_are_dropped_and_counted_not_piled_up() -> None:
@@ -121,8 +125,8 @@ def test_overruns_are_dropped_and_counted_not_piled_up() -> None:
     one, book = loop(bench)
     run(one, 5)
     assert bench.syncs() == pytest.approx([1, 2, 7.3, 8, 9])  # back on the grid, no burst
-    assert one.overruns == 4 and [t.overrun for t in one.timings] == [False, False, True, False, False]
-    assert [row.cycle for _, row, _ in book.rows] == [0, 1, 2, 3, 4]
+    assert one.overruns == 4 and [t.overrun for t in book.timings] == [False, False, True, False, False]
+    assert [row.cycle for row in book.rows] == [0, 1, 2, 3, 4]
 
 
 def test_in_lockstep_nothing_is_late() -> None:
@@ -130,46 +134,46 @@ def test_in_lockstep_nothing_is_late() -> None:
     bench.stalls = {1: 5_300_000}
     one, book = loop(bench, realtime=False)
     run(one, 4)
-    assert one.overruns == 0 and {t.lateness for t in one.timings} == {0.0}
-    assert [t_ns for t_ns, _, _ in book.rows] == [MS, 2 * MS, 3 * MS, 4 * MS]
+    assert one.overruns == 0 and {t.lateness for t in book.timings} == {0.0}
+    assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
 
 
 def test_what_does_not_come_is_missing() -> None:
     bench = Bench()
-    one, _ = loop(bench)
+    one, book = loop(bench)
     bench.mute = True
     run(one, 2)
-    for row, timing in zip(one.rows, one.timings, strict=True):
+    for row, timing in zip(book.rows, book.timings, strict=True):
         assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
 
 
 def test_an_answer_after_the_next_sync_is_not_that_cycles() -> None:
     """Valve state and drive carry the cycle they belong to. (Feedback does not: the bus page says what follows.)"""
     bench = Bench(answer_ns=1_500_000)
-    one, _ = loop(bench)
+    one, book = loop(bench)
     run(one, 4)
-    assert all(isnan(row.cor) and isnan(row.xs) for row in one.rows)
+    assert all(isnan(row.cor) and isnan(row.xs) for row in book.rows)
 
 
 def test_of_two_drives_the_last_counts_as_in_the_plant() -> None:
     bench = Bench()
-    one, _ = loop(bench)
+    one, book = loop(bench)
     one.cycle(Step(1, 0.0, 0.0, 7))
     bench.answers.append(Frame(bench.clock.now(), codec.DRIVE, codec.pack_drive(4e-3, 15, 0)))
     one.finish()
-    assert one.rows[0].cor == 4e-3
+    assert book.rows[0].cor == 4e-3
 
 
 @pytest.mark.parametrize("cob_id", [codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE])
 def test_frames_of_another_length_are_nothing(cob_id: int) -> None:
     bench = Bench()
-    one, _ = loop(bench)
+    one, book = loop(bench)
     bench.mute = True
     one.cycle(Step(1, 0.0, 0.0, 7))
     for length in (0, 1, 4, 7):
         bench.receive(Frame(0, cob_id, bytes(length)))
     one.finish()
-    assert isnan(one.rows[0].xj) and isnan(one.rows[0].cor) and isnan(one.rows[0].xs)
+    assert isnan(book.rows[0].xj) and isnan(book.rows[0].cor) and isnan(book.rows[0].xs)
 
 
 @pytest.mark.parametrize("realtime", [False, True])
@@ -177,7 +181,7 @@ def test_commands_lost_and_late(realtime: bool) -> None:
     """One of a cycle's commands comes after its SYNC; the rest of the bench does not notice."""
     bench = Bench()
     one, _ = loop(bench, Lost(frame="command", start=0.001, end=0.002),
-                  Late(frame="command", start=0.003, end=0.004, delay=0.4e-3), realtime=realtime)
+               Late(frame="command", start=0.003, end=0.004, delay=0.4e-3), realtime=realtime)
     run(one, 6)
     commands = [(t, codec.unpack_command(data).cycle) for t, cob_id, data in bench.sent if cob_id == codec.COMMAND]
     assert [cycle for _, cycle in commands] == [0, 2, 3, 4, 5]

@@ -1,0 +1,33 @@
+"""What the verdict needs to remember of every cycle, as columns of numbers: 80 bytes a cycle, so that an hour fits."""
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+
+from plant.segments import Array
+from rig.recorder import Signals, Timing
+
+_FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response")
+
+
+class History:
+    """The closed cycles of a run. A field by name is a column, (cycles,) SI; missing samples are NaN."""
+
+    def __init__(self) -> None:
+        self._numbers = array("d")
+
+    def __len__(self) -> int:
+        return len(self._numbers) // len(_FIELDS)
+
+    def add(self, row: Signals, timing: Timing) -> None:
+        """One more cycle."""
+        self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
+                              timing.lateness, timing.response))
+
+    def column(self, name: str, phase: int | None = None) -> Array:
+        """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
+        table = np.array(self._numbers).reshape(-1, len(_FIELDS))
+        kept = table if phase is None else table[table[:, 0] == phase]
+        column: Array = kept[:, _FIELDS.index(name)]
+        return column
