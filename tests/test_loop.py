@@ -181,7 +181,7 @@ def test_commands_lost_and_late(realtime: bool) -> None:
     """One of a cycle's commands comes after its SYNC; the rest of the bench does not notice."""
     bench = Bench()
     one, _ = loop(bench, Lost(frame="command", start=0.001, end=0.002),
-               Late(frame="command", start=0.003, end=0.004, delay=0.4e-3), realtime=realtime)
+                  Late(frame="command", start=0.003, end=0.004, delay=0.4e-3), realtime=realtime)
     run(one, 6)
     commands = [(t, codec.unpack_command(data).cycle) for t, cob_id, data in bench.sent if cob_id == codec.COMMAND]
     assert [cycle for _, cycle in commands] == [0, 2, 3, 4, 5]
