@@ -38,5 +38,13 @@ def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     assert 0 < answer["cycle"] < 1e-3
 
 
+def test_a_path_that_cannot_be_written_is_told_in_one_line(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(bench, "report", lambda command: {"step": None})
+    assert cli.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
+
+
 def test_a_cycle_from_python_costs_far_less_than_a_cycle() -> None:
     assert bench.cycle_cost(2000, 3) < 200e-6

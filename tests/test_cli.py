@@ -91,6 +91,7 @@ BAD = {
     "no steps": (["simulate", "--steps", "0"], "at least 1"),
     "unknown effect": (["effects", "gremlins"], "gremlins"),
     "effects to nowhere": (["effects", "--out", "none/x.json"], "none/x.json"),
+    "doctor to nowhere": (["doctor", "--seconds", "0", "--out", "none/x.json"], "none/x.json"),
     "no such node": (["node", "pilot"], "'pilot'"),
     "node in itself": (["node", "plant", "--bus", "virtual"], "a bus between programs"),
     "nothing to recover": (["recover", "none.mcap"], "none.mcap"),

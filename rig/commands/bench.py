@@ -20,9 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure the plant: ns a step beside the same step in C, speed of a run, cost of a cycle from Python."""
-    from pathlib import Path
-
     from rig import bench
+    from rig.files import write_text
     from rig.sequences import load_sequence
 
     command = load_sequence("preflight").main_profile().command
@@ -31,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     if rows:
         answer["accuracy"] = [row._asdict() for row in rows]
     if args.out is not None:
-        Path(args.out).write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
+        write_text(args.out, json.dumps(answer, indent=1) + "\n")
     if args.json:
         print(json.dumps(answer))
     elif not args.quiet:

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,12 +25,13 @@ def run(args: argparse.Namespace) -> int:
     if not 0 <= args.seconds <= 3600:
         raise InputError("--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
     from rig import doctor
+    from rig.files import write_text
 
     findings = doctor.survey(args.seconds)
     blocked = [finding.name for finding in findings if finding.needed and finding.status == "missing"]
     answer = {"verdict": "FAIL" if blocked else "PASS", "findings": [finding._asdict() for finding in findings]}
     if args.out is not None:
-        Path(args.out).write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
+        write_text(args.out, json.dumps(answer, indent=1) + "\n")
     if args.json:
         print(json.dumps(answer))
     elif not args.quiet:

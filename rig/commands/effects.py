@@ -38,14 +38,9 @@ def run(args: argparse.Namespace) -> int:
     rows = [describe(e) for e in chosen]
     text = json.dumps({"effects": rows}, indent=None if args.json else 1)
     if args.out:
-        from pathlib import Path
+        from rig.files import write_text
 
-        from plant import InputError
-
-        try:
-            Path(args.out).write_text(text + "\n", encoding="utf-8")
-        except OSError as error:
-            raise InputError("--out", args.out, f"a file that can be written ({error.strerror})") from error
+        write_text(args.out, text + "\n")
     if args.json:
         print(text)
     elif not args.quiet:
