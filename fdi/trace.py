@@ -211,21 +211,16 @@ def _from_log(log: Log, everything: bool) -> Trace:
         raise InputError(log.path, "/signals.phase", "a main phase; this run ended in its set-up")
     first = main[0] if len(main) else 0
     kept = slice(None) if everything else slice(main[0], main[-1] + 1)
-    zero_ns = table[first, 0]
+    seconds = _seconds(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
     rows = cycle[kept] - cycle[kept][0]
     grid, gaps = _on_grid(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
                           | {"phase": phase[kept].astype(float)})
     grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
-
-    def seconds(time_ns: float) -> float:
-        return float(time_ns - zero_ns) / 1e9
-
     return _trace(grid, period, gaps, phase=filled.astype(int), provenance=_provenance(log, run),
                   units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
-                  timing=_timing(timing, {m.cycle for _, m in signals} if everything else set(cycle[kept].tolist()),
-                                 seconds),
+                  timing=_timing([m for _, m in timing], cycle[kept], int(cycle[first]), period),
                   events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
                   nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
                   checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
@@ -255,9 +250,28 @@ def _provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
     return {"source": log.path.name, **run, **more}
 
 
-def _timing(messages: Messages, cycles: set[int], seconds: Callable[[float], float]) -> Timing:
-    kept = [(seconds(t), m.lateness, m.response, m.work, m.overrun) for t, m in messages if m.cycle in cycles]
+def _seconds(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:
+    """Log time, ns, to s on the rows' own axis, where a cycle is one period long however long it took.
+
+    Rows were logged at `time_ns` and stand at `t`, shape (rows,) both; a real-time run that was late by whole periods
+    has jumps in the first and none in the second. Before the first row and after the last a second is a second.
+    """
+    logged = np.maximum.accumulate(time_ns - zero_ns) / 1e9
+
+    def seconds(at_ns: float) -> float:
+        at = (at_ns - zero_ns) / 1e9
+        beyond = min(at - logged[0], 0.0) + max(at - logged[-1], 0.0)
+        return round(float(np.interp(at, logged, t) + beyond), 9)
+
+    return seconds
+
+
+def _timing(records: list[Any], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
+    """Of the cycles that have a row; t = 0 at cycle `zero`."""
+    wanted = set(cycles.tolist())
+    kept = [((m.cycle - zero) * period, m.lateness, m.response, m.work, m.overrun) for m in records
+            if m.cycle in wanted]
     if not kept:
         return NO_TIMING
     t, lateness, response, work, overrun = (np.array(column) for column in zip(*kept, strict=True))
-    return Timing(t, lateness, response, work, overrun)
+    return Timing(np.round(t, 9), lateness, response, work, overrun)

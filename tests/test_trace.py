@@ -12,6 +12,7 @@ from synthetic import ATTACHMENTS, command, record
 from fdi.sections import sections
 from fdi.trace import Check, Gap, Trace
 from plant.errors import InputError
+from rig.recorder import Event, NmtState, Recorder, Signals, Timing
 
 PRACTICE = Path(__file__).parents[1].parent / "shared" / "practice"
 KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight
@@ -45,6 +46,29 @@ def test_whole_log_keeps_the_time_axis(run: Path) -> None:
     assert np.bincount(trace.phase).tolist() == [300, 13_500, 200]
     np.testing.assert_array_equal(trace.xj[trace.phase == 1], main.xj)
     np.testing.assert_allclose(trace.t[trace.phase == 1], main.t, atol=1e-12)
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_events_keep_to_the_rows_after_a_stall(tmp_path: Path, everything: bool) -> None:
+    """A real-time run that stood still for 2 s in its set-up and again in main: rows go on, log times jump."""
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
+    recorder.put(0, Event("INFO", "phase", "bring-up"))
+    for k in range(300):
+        t_ns = 500_000_000 + k * 1_000_000 + 2_000_000_000 * ((k >= 50) + (k >= 200))
+        if k == 100:
+            recorder.put(t_ns - 100_000, Event("INFO", "phase", "main"))
+        if k == 150:
+            recorder.put(t_ns, NmtState(3, 5, "operational"))
+        if k == 200:
+            recorder.put(t_ns - 1_000_000_000, Event("WARN", "stall", "half way"))
+            recorder.put(t_ns + 500_000, Event("WARN", "fault", "after it"))
+        recorder.cycle(t_ns, Signals(k, int(k >= 100), 0, 0, 0, 0, 0, 0, 0, 0, 0), Timing(k, False, 0, 0, 0))
+    recorder.put(t_ns + 3_000_000_000, Event("INFO", "phase", "end"))
+    recorder.close()
+    trace = Trace.read(tmp_path / "trace.mcap", all=everything)
+    assert [event.t for event in trace.events] == pytest.approx([-0.6, -1e-4, 0.0995, 0.1005, 3.199], abs=1e-6)
+    assert trace.nmt[0].t == 0.05
+    np.testing.assert_array_equal(trace.timing.t, trace.t)
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x.csv.gz"])
