@@ -14,6 +14,7 @@ from typing import Any
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
@@ -21,9 +22,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from plant.errors import InputError
 
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_OPCODE_MESSAGE = 0x05
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Log:
         with self.path.open("rb") as stream:
             for index in self._chunks:
                 if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
-                    for channel, time_ns, data in _scan(_chunk(self.path, stream, index)):
+                    for channel, time_ns, _, data in scan(_chunk(self.path, stream, index)):
                         if channel in decode:
                             out.append((time_ns, channel, data))
         out.sort(key=lambda item: item[0])
@@ -88,12 +88,15 @@ def _chunk(path: Path, stream: Any, index: ChunkIndex) -> bytes:
         raise InputError(path, f"chunk at byte {index.chunk_start_offset}", f"sound data ({error})") from error
 
 
-def _scan(raw: bytes) -> Iterator[tuple[int, int, bytes]]:
+def scan(raw: bytes) -> Iterator[tuple[int, int, int, bytes]]:
+    """(channel, log time in ns, offset of the record, data) of each message in an unpacked chunk, in its order.
+
+    Raises struct.error for a chunk that ends within a record.
+    """
     at, end = 0, len(raw)
     while at < end:
         opcode, length = _RECORD.unpack_from(raw, at)
-        at += 9
-        if opcode == _OPCODE_MESSAGE:
-            channel, _, time_ns, _ = _MESSAGE.unpack_from(raw, at)
-            yield channel, time_ns, raw[at + 22:at + length]
-        at += length
+        if opcode == Opcode.MESSAGE:
+            channel, _, time_ns, _ = _MESSAGE.unpack_from(raw, at + 9)
+            yield channel, time_ns, at, raw[at + 31:at + 9 + length]
+        at += 9 + length

@@ -112,3 +112,10 @@ def test_refusals(whole: Path, tmp_path: Path) -> None:
         recover(tmp_path / "none.mcap", tmp_path / "out.mcap")
     with pytest.raises(InputError, match="another file"):
         recover(whole, whole)
+
+
+def test_a_message_record_is_taken_apart_in_one_place() -> None:
+    root = Path(__file__).parents[1]
+    readers = [path for folder in ("fdi", "rig/recorder") for path in (root / folder).glob("*.py")
+               if "unpack_from" in path.read_text()]
+    assert [path.relative_to(root).as_posix() for path in readers] == ["fdi/log.py"]

@@ -14,12 +14,10 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 
+from fdi.log import scan
 from plant.errors import InputError
 from rig.recorder.container import McapFile
 
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQ")
-_OPCODE_MESSAGE = 0x05
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError)
 
 
@@ -132,11 +130,6 @@ def _declare(file: McapFile, record: McapRecord) -> None:
 def _index(raw: bytes) -> dict[int, array[int]]:
     """Channel -> flat pairs (log time ns, offset) of the messages in a chunk."""
     index: dict[int, array[int]] = {}
-    at = 0
-    while at < len(raw):
-        opcode, length = _RECORD.unpack_from(raw, at)
-        if opcode == _OPCODE_MESSAGE:
-            channel, _, time_ns = _MESSAGE.unpack_from(raw, at + 9)
-            index.setdefault(channel, array("Q")).extend((time_ns, at))
-        at += 9 + length
+    for channel, time_ns, at, _ in scan(raw):
+        index.setdefault(channel, array("Q")).extend((time_ns, at))
     return index
