@@ -1,6 +1,6 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
 #   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
-#   make bench    the project's benchmarks     make clean                everything that was made here
+#   make bench    the project's benchmarks     make clean                what was made here, but for runs/
 PYTHON ?= python3
 VENV   ?= .venv
 ARGS   ?=
@@ -30,7 +30,8 @@ bench: env-test
 	@$(BIN)/rig bench
 
 clean:
-	rm -rf $(VENV) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@test ! -e $(VENV) -o -e $(VENV)/pyvenv.cfg || { echo "make: $(VENV) is there and is no virtual environment"; exit 2; }
+	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:
@@ -44,6 +45,7 @@ $(MADE):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "make: Python 3.11 or newer is needed; make PYTHON=/path/to/python names another"; exit 2; }
 	@echo "== making the virtual environment $(VENV)"
+	@test ! -e $(VENV) -o -e $(VENV)/pyvenv.cfg || { echo "make: $(VENV) is there and is no virtual environment"; exit 2; }
 	@rm -rf $(VENV)
 	@$(PYTHON) -m venv $(VENV) >/dev/null || $(PYTHON) -m virtualenv --quiet $(VENV) 2>/dev/null || \
 	  { rm -rf $(VENV); echo "make: this Python cannot make a virtual environment; on Debian: apt-get install python3-venv"; exit 2; }

@@ -1,4 +1,4 @@
-"""The only place that knows what time it is: a clock that is set (lockstep) and one that runs (real time)."""
+"""Time for the bench: a clock that is set (lockstep) and one that runs (real time)."""
 from __future__ import annotations
 
 import time

@@ -28,9 +28,9 @@ _HEARTBEAT = 0x700 + NODE
 
 
 class Emulator:
-    """A plant node. `receive` and `tick` are its whole outside; without a scenario it is the nominal actuator."""
+    """A plant node. `receive` and `tick` are its whole outside; `scenario` holds until the rig loads another."""
 
-    def __init__(self, send: Send) -> None:
+    def __init__(self, send: Send, scenario: Scenario | None = None) -> None:
         self._send = send
         self.device = Device(NODE, EDS[NODE], self._transmit)
         self.device.on_sync = self._on_sync
@@ -39,7 +39,7 @@ class Emulator:
         self._od = self.device.od.values
         self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, COB-ID, data
         self._late: list[tuple[int, int, Frame]] = []
-        self.load_scenario(Scenario(Model(), Plan(stop=0)))
+        self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
 
     def load_scenario(self, scenario: Scenario) -> None:
         """Take a plant with its faults and loads; it is compiled now, not in the first cycle.
@@ -129,6 +129,9 @@ class Emulator:
         k, od = self._cycle, self._od
         flags = Flags(0) if self._first else self._judge(k)
         self._first = False
+        for name, value in self._faults.parameters_at(k, self._changed).items():
+            self._plant.set(name, value)
+        self._changed = k
         xj, p12, xs = self._plant.sample()
         if not isfinite(xj + p12 + xs):
             self._diverged()
@@ -173,11 +176,8 @@ class Emulator:
         self._od[COUNTERS, 1 if what == "missing" else 2] = self._counts[what]
 
     def _move(self) -> None:
-        """The plant goes on to the next cycle, with the faults and the load of this one."""
+        """The plant goes on to the next cycle, under the load of this one."""
         k = self._cycle
-        for name, value in self._faults.parameters_at(k, self._changed).items():
-            self._plant.set(name, value)
-        self._changed = k
         self._plant.advance(self._current, self._load[k] if k < len(self._load) else 0.0)
         self._moved = True
         self._cycle += 1

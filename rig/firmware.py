@@ -38,9 +38,9 @@ def gains_of(model: Model) -> Gains:
 
 
 class Firmware:
-    """A controller node. `receive` and `tick` are its whole outside."""
+    """A controller node. `receive` and `tick` are its whole outside; `gains` hold until the rig writes others."""
 
-    def __init__(self, send: Send) -> None:
+    def __init__(self, send: Send, gains: Gains | None = None) -> None:
         self.device = Device(NODE, EDS[NODE], send)
         self.device.on_sync = self._on_sync
         self.device.on_rpdo = self._on_rpdo
@@ -48,6 +48,7 @@ class Firmware:
         self.device.on_heartbeat_lost = self._trip
         self.device.on_write = self._on_write
         self._od = self.device.od.values
+        self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
         self._lost = False  # feedback, announced by EMCY; a restart does not take that back
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick

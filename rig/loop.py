@@ -65,11 +65,11 @@ class Loop:
         master, k = self._master, self.k
         row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
                       step.load, step.control, 0, 0)
-        timing = Timing(k, lateness > self._period, lateness * 1e-9, nan, nan)
+        timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
         self._open, self._seen = (self._t_ns, row, timing), 0
         master.silent = not self._faults.heartbeat_alive("rig", k)
         self._command(codec.pack_command(step.demand, step.control, k))
-        self._sync = self._wall.now()
+        self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
         master.send(codec.SYNC, b"")
         if not self._realtime:
             self._wire.settle(self._t_ns, lambda: self._seen == _ALL)
@@ -94,11 +94,14 @@ class Loop:
             self._send_held(due + 1)
         self._wire.run_until(self._t_ns)
         late = self._wire.clock.now() - self._t_ns
-        if late > self._period:
-            lost = late // self._period
-            self.overruns += lost
-            self._t_ns += lost * self._period
+        lost = late // self._period
+        self.overruns += max(lost, self._overrun(late))
+        self._t_ns += lost * self._period
         return late
+
+    def _overrun(self, late_ns: int) -> bool:
+        """Late by more than half a cycle: the controller is left too little of it to answer in."""
+        return 2 * late_ns > self._period
 
     def _command(self, data: bytes) -> None:
         action = self._faults.frame("command", self.k)
@@ -116,14 +119,14 @@ class Loop:
         if self._open is not None and not self._seen & _XJ and len(frame.data) == 8:
             row = self._open[1]
             row.xj, row.p12 = codec.unpack_feedback(frame.data)
-            self._answered(_XJ)
+            self._answered(_XJ, frame)
 
     def _valve(self, frame: Frame) -> None:
         if self._open is not None and len(frame.data) == 8:
             row, state = self._open[1], codec.unpack_valve_state(frame.data)
             if state.cycle == row.cycle & 0xFFFF:
                 row.xs, row.flags = state.spool, state.flags
-                self._answered(_XS)
+                self._answered(_XS, frame)
 
     def _drive(self, frame: Frame) -> None:
         if self._open is not None and len(frame.data) == 8:  # of several the last: the plant latches that one
@@ -132,13 +135,17 @@ class Loop:
             if drive.cycle == row.cycle & 0xFFFF:
                 row.cor, row.status = drive.current, drive.status
                 if not self._seen & _COR:
-                    timing.response = (self._wall.now() - self._sync) * 1e-9
-                self._answered(_COR)
+                    timing.response = self._since_sync(frame)
+                self._answered(_COR, frame)
 
-    def _answered(self, what: int) -> None:
+    def _answered(self, what: int, frame: Frame) -> None:
         complete, self._seen = self._seen == _ALL, self._seen | what
         if self._seen == _ALL and not complete and self._open is not None:
-            self._open[2].work = (self._wall.now() - self._sync) * 1e-9
+            self._open[2].work = self._since_sync(frame)
+
+    def _since_sync(self, frame: Frame) -> float:
+        """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
+        return ((frame.t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
 
     def _close(self) -> Signals | None:
         """The cycle under way is over: the next SYNC is due."""

@@ -69,10 +69,13 @@ class _Network(canopen.Network):
 
 
 class Master:
-    """The rig on the bus. `on_frame` sees every frame, sent or received; the other hooks what the master notices."""
+    """The rig on the bus. `on_frame` sees every frame, sent or received; the other hooks what the master notices.
 
-    def __init__(self, wire: Wire, now: Callable[[], int]) -> None:
-        self.wire, self._now = wire, now
+    `stamped`: frames come with the time of their reception, which is kept; else `now()` is what the log shall say.
+    """
+
+    def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
+        self.wire, self._now, self._stamped = wire, now, stamped
         self.on_frame: Callable[[Frame], None] = lambda frame: None
         self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
         self.on_state: Callable[[int, int], None] = lambda node, state: None
@@ -115,7 +118,8 @@ class Master:
 
     def receive(self, frame: Frame) -> None:
         """A frame came in."""
-        frame = Frame(self._now(), frame.cob_id, frame.data)
+        if not self._stamped:
+            frame = Frame(self._now(), frame.cob_id, frame.data)
         self.on_frame(frame)
         cyclic = self.on_cyclic.get(frame.cob_id)
         if cyclic is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import threading
 from collections.abc import Iterator
 
 PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
@@ -13,14 +14,18 @@ PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
 def elevated() -> Iterator[None]:
     """The calling thread under SCHED_FIFO where that is allowed; as before afterwards.
 
-    Threads that are there already (the recorder) keep their scheduling: the loop must not wait for the disk.
+    The process's other threads (the recorder) get the lowest real-time priority: while one of them holds the
+    interpreter lock, other programs must not keep it from going on, for the loop would wait with it.
     """
-    granted = _fifo()
+    others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
+    raised = [thread for thread in others if thread is not None and _fifo(thread, 1)]
+    raised += [0] if _fifo(0, PRIORITY) else []
     try:
         yield
     finally:
-        if granted:
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        for thread in raised:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextlib.contextmanager
@@ -35,9 +40,9 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
-def _fifo() -> bool:
+def _fifo(thread: int, priority: int) -> bool:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError):
         return False
     return True

@@ -84,7 +84,7 @@ def judge(job: Job, session: Session) -> list[CheckResult]:
 
 @contextlib.contextmanager
 def taken(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, without the results of an earlier run, and locked against a second one.
+    """The folder, made if need be, and locked against a second run.
 
     Raises:
         InputError: it cannot be made or written, or another run is writing there.
@@ -96,8 +96,6 @@ def taken(folder: Path) -> Iterator[None]:
         raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        for name in ("verdict.json", "report.html"):
-            (folder / name).unlink(missing_ok=True)
         yield
     except BlockingIOError as error:
         raise InputError("--out", str(folder), "a folder that no other run is writing to") from error
@@ -107,7 +105,9 @@ def taken(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def log(job: Job, folder: Path) -> Iterator[Recorder]:
-    """The run's log, closed whatever happens."""
+    """The run's log in place of an earlier run's results, closed whatever happens."""
+    for name in ("verdict.json", "report.html"):  # of the run before
+        (folder / name).unlink(missing_ok=True)
     recorder = Recorder(folder / "trace.mcap", job.attachments(), provenance(**job.settings()))
     try:
         yield recorder

@@ -6,11 +6,12 @@ ends.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 from canopen.emcy import EmcyError
 
+from plant.profile import Profile
 from plant.segments import RATE
 from rig import firmware
 from rig.clock import WallClock
@@ -22,6 +23,7 @@ from rig.loop import Loop, Step
 from rig.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
+from rig.scenario import FORCE
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import Watch
 from rig.wire import Wire
@@ -47,6 +49,7 @@ class Session:
     def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
         self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
         self._plan = job.sequence.plan(job.seed)
+        self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
         self.scenario = job.scenario()
         self._faults = Schedule(self._plan, self.scenario.model.values)
         self._watch = Watch(job.sequence.guards)
@@ -62,7 +65,7 @@ class Session:
         self._operational: set[int] = set()
         self._edges = sorted(self._faults.edges)
         self._clock = wire.clock
-        self._master = Master(wire, self.now)
+        self._master = Master(wire, self.now, job.realtime)
         self._master.on_frame = recorder.frame
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
@@ -106,11 +109,11 @@ class Session:
         """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""
         assert self.loop is not None
         try:
-            self._run(SETUP, self._steps(SETUP)) and self._run(MAIN, self._steps(MAIN))
+            self._run(SETUP, self._setup) and self._run(MAIN, self._main)
         finally:
             try:
                 self._powered = self._recovered()
-                self._run(CLEANUP, self._steps(CLEANUP))
+                self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
                 self.loop.finish()
             finally:
                 self._playing = False
@@ -123,19 +126,8 @@ class Session:
             self._master.start()
         return not self.safe or not self._master.errors()
 
-    def _steps(self, phase: int) -> Iterator[tuple[str, Step]]:
-        """Section name and step of every cycle of a phase."""
-        sequence = self.job.sequence
-        profile = (sequence.setup_profile, sequence.main_profile,
-                   lambda: sequence.cleanup_profile(self._demand))[phase]()
-        names = [""] * len(profile.command)
-        for section in profile.sections:
-            names[section.start:section.stop] = [section.name] * (section.stop - section.start)
-        loads = self.scenario.load()[self._plan.start:] if phase == MAIN else []
-        for i, demand in enumerate(profile.command.tolist()):
-            yield names[i], Step(phase, demand, loads[i] if loads else 0.0, self._control(phase, i))
-
     def _control(self, phase: int, i: int) -> int:
+        """Control word of the phase's cycle `i`."""
         if self.safe if phase != CLEANUP else not self._powered:
             return 0
         if phase == CLEANUP and self.safe and i == 0:
@@ -143,22 +135,22 @@ class Session:
         started = self.loop.k if self.loop else 0  # without set-up main is where it is enabled
         return int(_ENABLING[started]) if started < len(_ENABLING) else int(Control.ACTIVE)
 
-    def _run(self, phase: int, steps: Iterator[tuple[str, Step]]) -> bool:
+    def _run(self, phase: int, profile: Profile) -> bool:
         """The cycles of one phase; False when it was ended early."""
         assert self.loop is not None
         self.say("INFO", "phase", PHASES[phase])
-        section, total = "", self._plan.stop
-        for name, step in steps:
-            if name != section:
-                section = name
-                self.say("INFO", "section", f"{PHASES[phase]}: {name}")
-            self._announce_faults()
-            self._demand = step.demand
-            closed = self.loop.cycle(step)
-            if self.loop.k % 50 == 0:
-                self._progress(name if phase == MAIN else PHASES[phase], self.loop.k, max(total, self.loop.k))
-            if phase != CLEANUP and self._must_end(closed):
-                return False
+        for section in profile.sections:
+            self.say("INFO", "section", f"{PHASES[phase]}: {section.name}")
+            shown = section.name if phase == MAIN else PHASES[phase]
+            for i in range(section.start, section.stop):
+                self._announce_faults()
+                self._demand = float(profile.command[i])
+                load = self.scenario.force[self.loop.k] * FORCE if phase == MAIN else 0.0
+                closed = self.loop.cycle(Step(phase, self._demand, load, self._control(phase, i)))
+                if self.loop.k % 50 == 0:
+                    self._progress(shown, self.loop.k, max(self._plan.stop, self.loop.k))
+                if phase != CLEANUP and self._must_end(closed):
+                    return False
         return True
 
     def _must_end(self, row: Signals | None) -> bool:

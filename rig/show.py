@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -31,9 +32,10 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
         yield lambda what, done, total: None
         return
     errors = Console(stderr=True)
+    live = errors.is_terminal and not job.realtime  # its refreshing thread would make a real-time loop late
     bar = Progress(TextColumn("{task.description:<14}", markup=False), BarColumn(40),
                    TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
-                   console=errors, transient=True, disable=not errors.is_terminal)
+                   console=errors, transient=True, disable=not live)
     with bar:
         task = bar.add_task("bring-up", total=None)
         told = False
@@ -45,6 +47,9 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
                 console().print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
                                                 f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
             bar.update(task, description=what, completed=done, total=total or None)
+            if errors.is_terminal and job.realtime and done % 1000 == 0:
+                sys.stderr.write(f"\r\033[K{what:<14} {100 * done // max(total, 1):3d} %" if total else "\r\033[K")
+                sys.stderr.flush()
 
         yield update
 

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("plant", "fdi", "rig", "dbc")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-MAX_FILE, MAX_FUNCTION = 330, 45
+MAX_FILE, MAX_FUNCTION = 300, 40
 
 # The project's packages that each package may import. dbc is data only.
 MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"}}
@@ -46,7 +46,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "rig/clock.py", "rig/loop.py", "rig/link.py", "rig/bus.py", "rig/lateness.py", "rig/commands/",
     "rig/recorder/",  # its thread must close a chunk in time
-    "rig/viewer.py", "rig/screenshot.py",  # wait for the viewer to come up
+    "rig/viewer.py",  # waits for the viewer to come up
 )
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {

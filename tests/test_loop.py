@@ -116,7 +116,7 @@ def test_due_times_are_a_fixed_grid() -> None:
     run(one, 8)
     assert bench.syncs() == pytest.approx([1, 2, 3, 4.7, 5, 6, 7.2, 8])
     assert [round(t.lateness * 1e6) for t in book.timings] == [0, 0, 0, 700, 0, 0, 200, 0]
-    assert one.overruns == 0 and not any(t.overrun for t in book.timings)
+    assert one.overruns == 1 and [t.overrun for t in book.timings] == [k == 3 for k in range(8)]  # above half a cycle
 
 
 def test_overruns_are_dropped_and_counted_not_piled_up() -> None:
@@ -243,3 +243,11 @@ def test_the_embedded_wire_waits_in_its_own_time() -> None:
     wire = EmbeddedWire(VirtualClock(), [])
     assert not wire.wait(lambda: False, 0.25) and wire.clock.now() == 250 * MS
     assert wire.wait(lambda: wire.clock.now() >= 300 * MS, 1.0) and wire.clock.now() == 300 * MS
+
+
+def test_response_and_work_are_measured_from_sync_to_reception() -> None:
+    bench = Bench(answer_ns=300_000)
+    one, book = loop(bench)
+    run(one, 4)
+    assert [t.response for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
+    assert [t.work for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)

@@ -3,9 +3,13 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rig import options
+
+if TYPE_CHECKING:
+    from rig.frame import Node, Send
 
 HELP = "run one node (plant or controller) on a bus, to face real hardware"
 
@@ -16,20 +20,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                         help="such as socketcan:vcan0 or udp_multicast (default: what EHA_RIG_BUS names)")
     parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # ends when this process does
-    parser.add_argument("--effects", action="append", default=[], type=Path, metavar="FILE.py",
-                        help="your own effects, for the plant (repeatable)")
+    options.add_model(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Be the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it."""
+    """Be the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it.
+
+    --model, --set and --seed are what it is until a rig loads something else, for a bus with another master.
+    """
     import signal
 
     from plant import InputError
     from rig.bus import choose, open_can
     from rig.clock import WallClock
     from rig.crew import EMBEDDED
-    from rig.emulator import Emulator
-    from rig.firmware import Firmware
     from rig.link import Link
     from rig.priority import elevated
     from rig.wire import serve
@@ -37,13 +41,13 @@ def run(args: argparse.Namespace) -> int:
     bus, _ = choose(args.bus)
     if bus.partition(":")[0] in EMBEDDED:
         raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
-    options.load_user_effects(args.effects)
+    make = maker(args)
     clock = WallClock()
     link = Link(open_can(bus), clock.now)
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda got, frame: ended.append(got))
-    node = (Emulator if args.node == "plant" else Firmware)(link.send)
+    node = make(link.send)
     if not args.quiet:
         print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
     try:
@@ -55,3 +59,16 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.node}: frames lost on the way in {link.overflows}, not sent {link.unsent}, "
               f"error frames {link.error_frames}")
     return 0
+
+
+def maker(args: argparse.Namespace) -> Callable[[Send], Node]:
+    """What builds the node that the options describe."""
+    from rig.emulator import Emulator
+    from rig.firmware import Firmware, gains_of
+    from rig.scenario import Scenario
+    from rig.sequences.faults import Plan
+
+    model = options.model_of(args)
+    if args.node == "plant":
+        return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
+    return lambda send: Firmware(send, gains_of(model))

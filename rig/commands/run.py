@@ -71,6 +71,9 @@ def asked(args: argparse.Namespace) -> Job:
         raise InputError("--set", "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
+    foreign = [name for name in model.differences() if name.startswith("controller.")]
+    if args.controller == "external" and foreign:
+        raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
     job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=tuple(args.effects))
     return replaced(job, pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
 
@@ -83,6 +86,9 @@ def repeated(args: argparse.Namespace) -> Job:
     if args.sequence or args.set or args.model or args.effects or args.seed is not None:
         raise InputError("--from", str(args.source), "no SEQUENCE, --model, --set, --seed or --effects: the log has "
                          "them")
+    log = args.source / "trace.mcap" if args.source.is_dir() else args.source
+    if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
+        raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
     return replaced(repeat(args.source), pace=args.pace, controller=args.controller, plant=args.plant,
                     max_overruns=args.max_overruns)
 
