@@ -76,7 +76,11 @@ def _tangent(com: Floats, start: int, stop: int, slope: float, longest: int) -> 
     """True for a short line that only touches a slow curve: its slope bends on beyond one of its ends."""
     if stop - start > longest or abs(slope) * (stop - start) <= 2 * RESOLUTION:
         return False
-    beyond = [com[start] - com[start - 20]] * (start >= 20) + [com[stop + 19] - com[stop - 1]] * (stop + 20 <= len(com))
+    beyond = []
+    if start >= 20:
+        beyond.append(com[start] - com[start - 20])
+    if stop + 20 <= len(com):
+        beyond.append(com[stop + 19] - com[stop - 1])
     return any(0 < abs(rise / (20 * slope) - 1) < 0.2 and abs(rise - 20 * slope) > RESOLUTION / 10 for rise in beyond)
 
 

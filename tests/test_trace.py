@@ -174,6 +174,15 @@ def test_sections_of_any_command() -> None:
     assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == 13_500
 
 
+def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
+    """As an abort leaves it: main breaks off, clean-up goes back from there."""
+    for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
+        cut = command()[:last]
+        for com in (cut, np.concatenate([cut, np.linspace(cut[-1], 0, 300)]), cut[-15:]):
+            cover = sections(com)
+            assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == len(com)
+
+
 def test_practice_traces_load() -> None:
     paths = sorted(PRACTICE.glob("*/*.csv.gz"))
     if not paths:
