@@ -102,7 +102,7 @@ class Sine(Timed):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_frequency("frequency", self.frequency)
+        require_frequency("frequency", self.frequency)
 
     def demand(self, t: Array, last: float) -> Array:
         return last + self.amplitude * _sine(self.frequency * t)
@@ -120,8 +120,8 @@ class Chirp(Timed):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_frequency("f0", self.f0)
-        _require_frequency("f1", self.f1)
+        require_frequency("f0", self.f0)
+        require_frequency("f1", self.f1)
         require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
 
     def demand(self, t: Array, last: float) -> Array:
@@ -147,7 +147,7 @@ class Multisine(Timed):
         super().__post_init__()
         require(bool(self.frequencies), "frequencies", "at least one frequency in Hz")
         for frequency in self.frequencies:
-            _require_frequency("frequencies", frequency)
+            require_frequency("frequencies", frequency)
         require(len(self.phases) in (0, len(self.frequencies)), "phases",
                  f"{len(self.frequencies)} phases in rad, one a frequency, not {len(self.phases)}")
         require(self.fade >= 0, "fade", f"0 or more 1/s, not {self.fade:g}")
@@ -222,5 +222,6 @@ def require(holds: bool, key: str, expected: str) -> None:
         raise InputError("segment", key, expected)
 
 
-def _require_frequency(key: str, frequency: float) -> None:
+def require_frequency(key: str, frequency: float) -> None:
+    """Refuse a frequency that a signal of one sample a cycle cannot have."""
     require(0 < frequency < RATE / 2, key, f"a frequency above 0 and below {RATE / 2:g} Hz, not {frequency:g}")

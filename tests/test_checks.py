@@ -250,6 +250,16 @@ def test_reasons(kind: str, keys: dict[str, Any], reason: str) -> None:
     ("never_exceeds", {"signal": "p12", "unit": "mm"}, "unit", "'MPa'"),
     ("max_error", {"window": (2.0, 1.0)}, "window", "t0 < t1"),
     ("max_error", {"skip": -1.0}, "skip", "0 s or more"),
+    ("max_error", {"skip": 1e300}, "skip", "at most 3600"),
+    ("max_error", {"window": (0.0, 1e306)}, "window", "t1 <= 1e+06"),
+    ("settling_time", {"band": 0.0}, "band", "above 0 and at most 100 %"),
+    ("settling_time", {"band": -5.0}, "band", "above 0"),
+    ("amplitude_ratio", {"frequency": 0.0}, "frequency", "above 0 and below 500 Hz"),
+    ("phase_lag", {"frequency": -1.0}, "frequency", "above 0 and below 500 Hz"),
+    ("phase_lag", {"frequency": 500.0}, "frequency", "above 0 and below 500 Hz"),
+    ("event_never", {"event": " "}, "event", "at least one word"),
+    ("response_within", {"after": -1.0, "event": "EMCY"}, "after", "0 to 1e+06 s"),
+    ("response_within", {"after": 1e308, "event": "EMCY"}, "after", "0 to 1e+06 s"),
     ("response_within", {"after": 1.0}, "event", "either an event or a signal"),
     ("response_within", {"after": 1.0, "signal": "xj"}, "signal", "a level"),
 ])
@@ -257,6 +267,29 @@ def test_an_impossible_check_is_refused(kind: str, keys: dict[str, Any], key: st
     with pytest.raises(InputError) as refusal:
         check(kind, **keys)
     assert refusal.value.field == key and expected in refusal.value.expected
+
+
+@pytest.mark.parametrize(("raised", "said"), [
+    (ZeroDivisionError("float division by zero"), "the measure failed (ZeroDivisionError: float division by zero)"),
+    (np.linalg.LinAlgError("SVD did not converge"), "the measure failed (LinAlgError: SVD did not converge)"),
+    (OverflowError("too large"), "the measure failed (OverflowError: too large)"),
+])
+def test_a_measure_that_raises_has_failed(raised: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> float:
+        raise raised
+
+    run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
+    monkeypatch.setattr(measures, "overshoot", broken)
+    spoilt, sound = evaluate([check("overshoot", window="step"), check("rise_time", window="step")], run, sections)
+    assert (spoilt.passed, isnan(spoilt.value), spoilt.detail) == (False, True, said)
+    assert sound.passed
+
+
+def test_a_measure_without_end_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
+    monkeypatch.setattr(measures, "overshoot", lambda *_: float("inf"))
+    result = judged(run, sections, "overshoot", window="step", low=0.0, high=None)
+    assert not result.passed and isnan(result.value) and result.detail == "the measure came to inf"
 
 
 def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:

@@ -1,103 +1,30 @@
-"""Checks as data: what is measured in which window of a run, within which limits, and whether it passed.
+"""The kinds of check, and how a run is judged by them.
 
 Every kind measures one number (measures.py says how) that is held against `low` and `high`, all three in `unit`.
-A check never raises: what cannot be measured has failed, and `detail` says why.
+What no run could answer (0 Hz, an empty band) is refused when the check is read. On a run a check never raises: what
+cannot be measured has failed, and `detail` says why.
 """
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from cmath import phase
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import degrees, nan
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from math import degrees
+from typing import Annotated, Literal
 
 import numpy as np
 
-from plant.errors import InputError
-from plant.segments import RATE, Hertz, Second
+from plant.segments import RATE, Hertz, Second, require_frequency
 from rig.sequences import measures
+from rig.sequences.check import MOST, Check, CheckResult, InUnit, require
 from rig.sequences.measures import NotMeasurable
-from rig.sequences.scene import MAIN, EventLike, Scene, TraceLike
-from rig.sequences.units import OF_SIGNAL, scale
+from rig.sequences.scene import EventLike, Scene, TraceLike
+
+__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "evaluate"]
 
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
-InUnit = Annotated[float, "the check's unit"]
 InSI = Annotated[float, "SI units"]
 Percent = Annotated[float, "%"]
-
-
-class CheckResult(NamedTuple):
-    """One line of the table. `value`, `low` and `high` are in `unit`; NaN: not measurable, no such limit."""
-
-    name: str
-    kind: str
-    signal: str
-    value: float
-    unit: str
-    low: float
-    high: float
-    passed: bool
-    t0: float  # s, the window
-    t1: float
-    detail: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check(ABC):
-    """A measured number and its limits. `window`: a section's name, [t0, t1] in s of main, or "main" for all of it."""
-
-    kind: ClassVar[str]
-    si: ClassVar[str]  # what the kind measures in; "" is the signal's own unit
-    name: str
-    window: str | tuple[Second, Second] = MAIN
-    skip: Second = 0.0  # left out at the window's beginning
-    low: InUnit | None = None
-    high: InUnit | None = None
-    unit: str = ""
-
-    def __post_init__(self) -> None:
-        if self.low is None and self.high is None:
-            raise InputError("check", "", "a low, a high, or both")
-        if self.low is not None and self.high is not None and self.low > self.high:
-            raise InputError("check", "high", f"a number from low = {self.low:g} up, not {self.high:g}")
-        if isinstance(self.window, tuple) and not 0 <= self.window[0] < self.window[1]:
-            raise InputError("check", "window", f"[t0, t1] with 0 <= t0 < t1, not {list(self.window)}")
-        if self.skip < 0:
-            raise InputError("check", "skip", f"0 s or more, not {self.skip:g}")
-        scale(self.shown_unit, self.si_unit)
-
-    @property
-    def about(self) -> str:
-        """The signal, or the event, that is judged."""
-        return str(getattr(self, "signal", None) or getattr(self, "event", ""))
-
-    @property
-    def si_unit(self) -> str:
-        return self.si or OF_SIGNAL[self.about]
-
-    @property
-    def shown_unit(self) -> str:
-        return self.unit or self.si_unit
-
-    @abstractmethod
-    def measure(self, scene: Scene, span: slice) -> float:
-        """The number in rows `span`, SI; raises NotMeasurable with the reason."""
-
-    def judge(self, scene: Scene) -> CheckResult:
-        """Measure and hold against the limits."""
-        value, t0, t1, detail = nan, nan, nan, ""
-        try:
-            span = scene.span(self.window, self.skip)
-            t0, t1 = span.start / RATE, span.stop / RATE
-            value = self.measure(scene, span) / scale(self.shown_unit, self.si_unit)
-            missing = scene.missing(self.about, span)
-            detail = f"{missing} missing samples bridged" if missing else ""
-        except NotMeasurable as reason:
-            detail = str(reason)
-        low, high = (nan if limit is None else limit for limit in (self.low, self.high))
-        passed = not (value != value or value < low or value > high)  # NaN limits compare false
-        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +57,10 @@ class SettlingTime(_OfPosition):
 
     kind, si = "settling_time", "s"
     band: Percent
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(0 < self.band <= 100, "band", f"above 0 and at most 100 % of the step, not {self.band:g}")
 
     def measure(self, scene: Scene, span: slice) -> float:
         return measures.settling_time(*scene.step(span), self.band)
@@ -212,6 +143,10 @@ class AmplitudeRatio(_OfPosition):
     kind, si = "amplitude_ratio", "1"
     frequency: Hertz
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_frequency("frequency", self.frequency)
+
     def measure(self, scene: Scene, span: slice) -> float:
         return abs(measures.response(scene.signal("xj", span), scene.signal("com", span), self.frequency))
 
@@ -240,10 +175,11 @@ class ResponseWithin(Check):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if bool(self.event) == (self.signal is not None):
-            raise InputError("check", "event", "either an event or a signal")
-        if (self.above is None and self.below is None) == (self.signal is not None):
-            raise InputError("check", "signal", "a signal with a level above or below which it counts")
+        require(bool(self.event) != (self.signal is not None), "event", "either an event or a signal")
+        levelled = self.above is not None or self.below is not None
+        require(levelled == (self.signal is not None), "signal", "a signal with a level above or below which it counts")
+        if isinstance(self.after, float):
+            require(0 <= self.after <= MOST, "after", f"0 to {MOST:g} s of main, or a fault's name, not {self.after:g}")
 
     def measure(self, scene: Scene, span: slice) -> float:
         after = self.after if isinstance(self.after, float) else scene.starts.get(self.after)
@@ -265,6 +201,10 @@ class EventOccurs(Check):
     kind, si = "event_occurs", "1"
     event: str
     low: InUnit | None = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(bool(self.event.split()), "event", "at least one word")
 
     def measure(self, scene: Scene, span: slice) -> float:
         return float(len(scene.matching(self.event, span.start / RATE, span.stop / RATE)))

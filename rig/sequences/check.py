@@ -1,0 +1,98 @@
+"""What a check is: a window of a run, a number measured there, limits, and a verdict. checks.py has the kinds."""
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from math import isfinite, nan
+from typing import Annotated, ClassVar, NamedTuple
+
+from plant.errors import InputError
+from plant.segments import LONGEST, RATE, Second
+from rig.sequences.measures import NotMeasurable
+from rig.sequences.scene import MAIN, Scene
+from rig.sequences.units import OF_SIGNAL, scale
+
+InUnit = Annotated[float, "the check's unit"]
+MOST = 1e6  # s, later than any run ends
+
+
+def require(holds: bool, key: str, expected: str) -> None:
+    """Refuse a check; whoever read it knows the file and the line and adds them."""
+    if not holds:
+        raise InputError("check", key, expected)
+
+
+class CheckResult(NamedTuple):
+    """One line of the table. `value`, `low` and `high` are in `unit`; NaN: not measurable, no such limit."""
+
+    name: str
+    kind: str
+    signal: str
+    value: float
+    unit: str
+    low: float
+    high: float
+    passed: bool
+    t0: float  # s, the window
+    t1: float
+    detail: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(ABC):
+    """A measured number and its limits. `window`: a section's name, [t0, t1] in s of main, or "main" for all of it."""
+
+    kind: ClassVar[str]
+    si: ClassVar[str]  # what the kind measures in; "" is the signal's own unit
+    name: str
+    window: str | tuple[Second, Second] = MAIN
+    skip: Second = 0.0  # left out at the window's beginning
+    low: InUnit | None = None
+    high: InUnit | None = None
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        require(self.low is not None or self.high is not None, "", "a low, a high, or both")
+        if self.low is not None and self.high is not None:
+            require(self.low <= self.high, "high", f"a number from low = {self.low:g} up, not {self.high:g}")
+        if isinstance(self.window, tuple):
+            t0, t1 = self.window
+            require(0 <= t0 < t1 <= MOST, "window", f"[t0, t1] with 0 <= t0 < t1 <= {MOST:g}, not {[t0, t1]}")
+        require(0 <= self.skip <= LONGEST, "skip", f"0 s or more, at most {LONGEST:g}, not {self.skip:g}")
+        scale(self.shown_unit, self.si_unit)
+
+    @property
+    def about(self) -> str:
+        """The signal, or the event, that is judged."""
+        return str(getattr(self, "signal", None) or getattr(self, "event", ""))
+
+    @property
+    def si_unit(self) -> str:
+        return self.si or OF_SIGNAL[self.about]
+
+    @property
+    def shown_unit(self) -> str:
+        return self.unit or self.si_unit
+
+    @abstractmethod
+    def measure(self, scene: Scene, span: slice) -> float:
+        """The number in rows `span`, SI; raises NotMeasurable with the reason."""
+
+    def judge(self, scene: Scene) -> CheckResult:
+        """Measure and hold against the limits."""
+        value, t0, t1, detail = nan, nan, nan, ""
+        try:
+            span = scene.span(self.window, self.skip)
+            t0, t1 = span.start / RATE, span.stop / RATE
+            missing = scene.missing(self.about, span)
+            measured = self.measure(scene, span) / scale(self.shown_unit, self.si_unit)
+            if not isfinite(measured):
+                raise NotMeasurable(f"the measure came to {measured:g}")
+            value, detail = measured, f"{missing} missing samples bridged" if missing else ""
+        except NotMeasurable as reason:
+            detail = str(reason)
+        except (ArithmeticError, ValueError) as error:  # one bad check must not cost a run its verdict
+            detail = f"the measure failed ({type(error).__name__}: {error})"
+        low, high = (nan if limit is None else limit for limit in (self.low, self.high))
+        passed = not (value != value or value < low or value > high)  # NaN limits compare false
+        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail)
