@@ -4,9 +4,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import sys
 import threading
 from collections.abc import Iterator
 
+SWITCH = 50e-6  # s
 PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
 
 
@@ -29,13 +31,18 @@ def elevated() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def uncollected() -> Iterator[None]:
-    """No garbage collection: going through a long run's rows takes ms, and the loop makes no cycles to collect."""
-    collecting = gc.isenabled()
+def undisturbed() -> Iterator[None]:
+    """No garbage collection, which takes ms; and a thread that holds the interpreter lock gives it up when asked.
+
+    By default it may keep the lock for 5 ms, five cycles, while the loop waits for it.
+    """
+    collecting, interval = gc.isenabled(), sys.getswitchinterval()
     gc.disable()
+    sys.setswitchinterval(SWITCH)
     try:
         yield
     finally:
+        sys.setswitchinterval(interval)
         if collecting:
             gc.enable()
 

@@ -19,7 +19,7 @@ from rig.crew import crew
 from rig.history import History
 from rig.job import Job
 from rig.outcome import Outcome, timing
-from rig.priority import elevated, scheduler, uncollected
+from rig.priority import elevated, scheduler, undisturbed
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import provenance
 from rig.sequences.checks import CheckResult, evaluate
@@ -55,7 +55,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         with contextlib.ExitStack() as rights:
             if job.realtime:
                 rights.enter_context(elevated())
-                rights.enter_context(uncollected())
+                rights.enter_context(undisturbed())
             scheduled = scheduler()
             session.play()
         spent = stopwatch.now() * 1e-9

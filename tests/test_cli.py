@@ -69,6 +69,8 @@ BAD = {
     "bad group": (["run", "--bus", "udp_multicast:10.0.0.1"], "IPv4 multicast group"),
     "CAN that is not there": (["run", "--bus", "socketcan:nocan7"], "nocan7"),
     "nobody outside": (["run", "--controller", "external"], "external node"),
+    "gains of foreign firmware": (["run", "--controller", "external", "--bus", "udp_multicast:239.0.0.9", "--set",
+                                   "controller.proportional_gain=1"], "controller.proportional_gain"),
     "bad pace": (["run", "--pace", "warp"], "'warp'"),
     "bad seed": (["run", "--seed", "-1"], "whole number from 0"),
     "seed no number": (["run", "--seed", "x"], "'x'"),
@@ -93,6 +95,7 @@ BAD = {
     "effects to nowhere": (["effects", "--out", "none/x.json"], "none/x.json"),
     "doctor to nowhere": (["doctor", "--seconds", "0", "--out", "none/x.json"], "none/x.json"),
     "no such node": (["node", "pilot"], "'pilot'"),
+    "node with a slip": (["node", "plant", "--bus", "udp_multicast", "--set", "spool.mass=-1"], "spool.mass"),
     "node in itself": (["node", "plant", "--bus", "virtual"], "a bus between programs"),
     "nothing to recover": (["recover", "none.mcap"], "none.mcap"),
     "nothing to report": (["report", "none.mcap"], "none.mcap"),
@@ -100,6 +103,17 @@ BAD = {
     "nothing to export": (["export", "none.mcap", "--out", "x.csv"], "none.mcap"),
     "nothing to import": (["import", "none.blf", "--out", "x.mcap"], "none.blf"),
 }
+
+
+def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> None:
+    """Neither a bus without its nodes nor a repeat into its own folder costs the results that lie there."""
+    folder = tmp_path / "done"
+    assert rig("run", short, "--out", folder, "--quiet").status == 0
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    nobody = rig("run", short, "--out", folder, "--bus", "udp_multicast:239.74.9.9", "--plant", "external")
+    itself = rig("run", "--from", folder / "trace.mcap", "--out", folder)
+    assert (nobody.status, itself.status) == (2, 2) and "overwritten" in itself.err
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("what", BAD)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from desk import MS, PlantDesk
+from desk import MS, Desk, PlantDesk
 
 from plant import Actuator, Model
 from rig import codec
 from rig.codec import Flags
 from rig.device import Abort, NmtState
-from rig.emulator import COUNTERS, MISSED_LIMIT
+from rig.emulator import COUNTERS, MISSED_LIMIT, Emulator
 from rig.scenario import Scenario
 from rig.sequences.faults import Fault, Late, Lost, Noise, Offset, Parameter, Plan, Silent, Stuck
 
@@ -153,6 +153,18 @@ def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
         seen.append(float(desk.node._plant._live[index]))
     assert seen[15:20] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert seen[:15] == [0.0] * 15 and seen[20:25] == [0.4] * 5 and seen[25:] == [0.0] * 5
+
+
+def test_a_sensors_parameter_changes_in_the_sample_of_its_cycle() -> None:
+    fault = Parameter(parameter="sensors.pressure_noise", value=1e6, start=0.005, end=0.010)
+    desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(fault,), stop=25)))
+    noisy = [abs(desk.cycle()[0].pressure) > 10.0 for _ in range(15)]
+    assert noisy == [5 <= k < 10 for k in range(15)]
+
+
+def test_a_node_starts_as_the_plant_it_was_told_to_be() -> None:
+    heavy = Desk(lambda send: Emulator(send, Scenario(QUIET_MODEL.replace({"jack.mass": 500.0}), Plan(stop=0))))
+    assert heavy.node._plant.model["jack.mass"] == 500.0  # type: ignore[union-attr]
 
 
 def test_the_load_is_that_of_the_cycle() -> None:

@@ -3,11 +3,12 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import threading
 
 import pytest
 
-from rig.priority import PRIORITY, elevated, scheduler, uncollected
+from rig.priority import PRIORITY, SWITCH, elevated, scheduler, undisturbed
 
 
 def allowed() -> bool:
@@ -49,8 +50,9 @@ def test_collection_comes_back_as_it_was(collecting: bool) -> None:
     if not collecting:
         gc.disable()
     try:
-        with uncollected():
-            assert not gc.isenabled()
-        assert gc.isenabled() == collecting
+        before = sys.getswitchinterval()
+        with undisturbed():
+            assert not gc.isenabled() and sys.getswitchinterval() == pytest.approx(SWITCH)
+        assert gc.isenabled() == collecting and sys.getswitchinterval() == before
     finally:
         gc.enable()
