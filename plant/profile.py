@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from plant.errors import InputError
-from plant.segments import LONGEST, RATE, Array, Segment, require
+from plant.segments import FARTHEST, LONGEST, RATE, STRONGEST, Array, Segment, require
+
+_SANE = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
 
 
 class Section(NamedTuple):
@@ -126,6 +128,9 @@ def _numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int], wher
             raise InputError(where, f"line {line}, t", f"a time after {t[-2]:g} s, not {t[-1]:g}")
         if t[-1] - t[0] > LONGEST:
             raise InputError(where, f"line {line}, t", f"seconds, and at most {LONGEST:g} of them, not {t[-1]:g}")
+        for name, most in _SANE.items():
+            if name in table and abs(table[name][-1]) > most:
+                raise InputError(where, f"line {line}, {name}", f"at most {most:g} either way, not {table[name][-1]:g}")
     if not t:
         raise InputError(where, "line 2", "at least one row below the header")
     return table

@@ -13,7 +13,6 @@ from plant.profile import build
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, evaluate
-from rig.sequences.guards import Guard, Watch
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower
@@ -290,19 +289,3 @@ def test_a_measure_without_end_has_failed(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(measures, "overshoot", lambda *_: float("inf"))
     result = judged(run, sections, "overshoot", window="step", low=0.0, high=None)
     assert not result.passed and isnan(result.value) and result.detail == "the measure came to inf"
-
-
-def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:
-    guard = Guard(name="far", signal="xj", high=10.0, unit="mm", cycles=3)
-    watch = Watch([Guard(name="other", signal="p12", low=-1.0, high=1.0), guard])
-    values = [0.011, 0.011, 0.0, 0.011, float("nan"), 0.011, 0.011]
-    assert [watch.see({"xj": x}) for x in values] == [None] * 6 + [guard]
-    assert Watch([]).see({"xj": 1e9}) is None
-
-
-@pytest.mark.parametrize("keys", [
-    {}, {"low": 1.0, "high": 1.0}, {"high": 1.0, "cycles": 0}, {"high": 1.0, "unit": "bar"},
-])
-def test_an_impossible_guard_is_refused(keys: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        Guard(name="g", signal="xj", **keys)

@@ -18,7 +18,7 @@ from plant import segments
 from plant.errors import InputError
 from plant.model import meaning
 from plant.profile import Profile, build, names, parse_columns
-from plant.segments import RATE, Array, Csv, Segment
+from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
 from rig.sequences.checks import Check, ResponseWithin
 from rig.sequences.faults import Fault, Parameter, Plan
@@ -203,11 +203,27 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
                 raise place.at(phase, i, "name").refuse(f"a name used once, not a second {name!r}")
             if name == MAIN:
                 raise place.at(phase, i, "name").refuse(f"another name than {MAIN!r}, which is all of main")
+    _check_sizes(sequence, place)
     if not sequence.main:
         raise place.at("main").refuse("at least one segment")
     length = sum(segment.duration for segment in sequence.load)
     if round(length * RATE) > round(sequence.duration * RATE):
         raise place.at("load").refuse(f"at most the {sequence.duration:g} s that main lasts, not {length:g} s")
+
+
+def _check_sizes(sequence: Sequence, place: Place) -> None:
+    """No demand and no load of a size that can only be a slip of units."""
+    start = 0.0
+    for phase, most, unit in (("setup", FARTHEST, "m"), ("main", FARTHEST, "m"), ("cleanup", FARTHEST, "m"),
+                              ("load", STRONGEST, "N")):
+        with np.errstate(all="ignore"):  # what overflows is refused below
+            values, sections, end = build(getattr(sequence, phase), 0.0 if phase == "load" else start)
+        for i, section in enumerate(sections):
+            last = end if i == len(sections) - 1 else 0.0
+            largest = np.abs((*values[section.start:section.stop], last)).max()
+            if not largest <= most:  # nor NaN
+                raise place.at(phase, i).refuse(f"at most {most:g} {unit} either way, not {largest:g}")
+        start = end
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
