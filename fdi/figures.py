@@ -19,6 +19,8 @@ STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
     "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+BRIDGED = 5  # cycles
+SHORTEST = 0.1  # us, the left end of a histogram; no clock here tells less
 COLUMNS = 1400  # a line is drawn by its extremes in this many columns; more cannot be seen
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
           ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
@@ -42,32 +44,35 @@ def signals(trace: Trace) -> str:
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
             if name == "xj":
                 ax.plot(*_thin(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
-            ax.plot(*_thin(trace.t, values[name] * scale), color=colour, lw=1.0, label="XJ, ram")
+            ax.plot(*_thin(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
+            _missing(ax, trace, values[name])
             ax.set_ylabel(label)
             if name == "close":
                 ax.set_ylim(-calm * scale, calm * scale)
             _sections(ax, trace)
-        axes[0].legend(loc="upper right", ncols=2, frameon=False)
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
         if trace.checks:
             _windows(axes[-1], trace)
         axes[-1].set_xlabel("time from the start of the main phase [s]")
-        axes[-1].set_xlim(trace.t[0], trace.t[-1])
+        axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
         figure.align_ylabels()
         return _svg(figure, "signals")
 
 
 def timing(trace: Trace) -> str:
     """Histograms of lateness, response and work; "" for a trace without timing."""
-    columns = {"SYNC lateness": trace.timing.lateness, "controller's response": trace.timing.response,
-               "bench's own work": trace.timing.work}
-    drawn = {name: values[values > 0] * 1e6 for name, values in columns.items() if (values > 0).any()}
+    columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
+               ("controller's response", trace.timing.response, "#d9730d"),
+               ("bench's own work", trace.timing.work, "#57606a"))
+    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, SHORTEST), colour)
+             for name, values, colour in columns if (values > 0).any()]
     if not drawn:
         return ""
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 2.5), layout="constrained")
         axes = figure.subplots(1, len(drawn), squeeze=False)[0]
-        for ax, (name, values), colour in zip(axes, drawn.items(), ("#1f6feb", "#d9730d", "#57606a"), strict=False):
-            low, high = math.log10(max(float(values.min()), 0.1)), math.log10(max(float(values.max()), 1.0))
+        for ax, (name, values, colour) in zip(axes, drawn, strict=True):
+            low, high = math.log10(values.min()), math.log10(max(float(values.max()), 1.0))
             ax.hist(values, bins=np.logspace(low, high + 0.02, 60).tolist(), color=colour, log=True)
             ax.set_xscale("log")
             ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
@@ -92,6 +97,29 @@ def _thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     return t[chosen], values[chosen]
 
 
+def _bridged(values: Floats) -> Floats:
+    """Straight lines over up to BRIDGED missing samples: a line of single samples would not be seen at all."""
+    known = np.flatnonzero(~np.isnan(values))
+    if not len(known):
+        return values
+    rows = np.arange(len(values))
+    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
+    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
+    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
+    return np.where(near, np.interp(rows, known, values[known]), values)
+
+
+def _missing(ax: Axes, trace: Trace, values: Floats) -> None:
+    """A red mark at the foot of the panel wherever samples are missing."""
+    pieces = np.array_split(np.isnan(values), min(COLUMNS, len(values)))
+    lost = np.array([piece.any() for piece in pieces])
+    starts = np.cumsum([0, *map(len, pieces)])
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
+    spans = [(float(trace.t[starts[a]]), float(starts[b] - starts[a]) * trace.period) for a, b in edges]
+    if spans:
+        ax.broken_barh(spans, (0.0, 0.04), transform=ax.get_xaxis_transform(), color=RED, lw=0.5, zorder=3)
+
+
 def _calm(trace: Trace) -> float:
     """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
     ramps = [np.arange(s.start, s.stop) for s in trace.sections() if s.kind == "ramp"]
@@ -108,19 +136,23 @@ def _sections(ax: Axes, trace: Trace) -> None:
 
 
 def _windows(ax: Axes, trace: Trace) -> None:
-    """A bar for each check over its window, green or red, with its name beside it."""
+    """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
     first, last = float(trace.t[0]), float(trace.t[-1])
+    room, span = 0.005 * (last - first), last - first
     for row, check in enumerate(trace.checks):
         t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
-        ax.barh(row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED)
-        room, span = 0.005 * (last - first), last - first
-        if last - t1 > 0.25 * span:
-            x, side, colour = t1 + room, "left", INK
-        elif t0 - first > 0.25 * span:
-            x, side, colour = t0 - room, "right", INK
+        if math.isnan(check.t0) and math.isnan(check.value):
+            x, side, colour, name = first + room, "left", RED, f"{check.name}: not measured"
         else:
-            x, side, colour = t0 + room, "left", "white"
-        ax.text(x, row, check.name, va="center", ha=side, color=colour, fontsize=7, clip_on=True).set_in_layout(False)
+            ax.barh(row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED)
+            name = check.name
+            if last - t1 > 0.25 * span:
+                x, side, colour = t1 + room, "left", INK
+            elif t0 - first > 0.25 * span:
+                x, side, colour = t0 - room, "right", INK
+            else:
+                x, side, colour = t0 + room, "left", "white"
+        ax.text(x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True).set_in_layout(False)
     ax.set_ylim(len(trace.checks) - 0.4, -0.6)
     ax.set_yticks([])
     ax.set_ylabel("checks")

@@ -9,8 +9,10 @@ import numpy as np
 
 from fdi import figures
 from fdi.trace import Check, Trace
+from fdi.verdict import verdict
 from plant.errors import InputError
 
+GAPS_LISTED = 5
 WORDS = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad"}
 
 
@@ -31,20 +33,14 @@ def render(trace: Trace) -> str:
     from jinja2 import Environment, PackageLoader
 
     pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    verdict = trace.provenance.get("verdict.verdict") or _verdict(trace.checks)
+    word, why = verdict(trace)
     return pages.get_template("report.html").render(
         title=trace.provenance.get("sequence", trace.provenance.get("source", "trace")),
-        verdict=verdict, mood=WORDS.get(verdict, "neutral"), why=trace.provenance.get("verdict.why", ""),
+        verdict=word, mood=WORDS.get(word, "neutral"), why=why,
         facts=_facts(trace), checks=[_row(check) for check in trace.checks], notes=_notes(trace),
         signals=figures.signals(trace), histogram=figures.timing(trace), timing=_timing(trace),
         events=trace.events, nmt=trace.nmt, provenance=sorted(trace.provenance.items()),
         attachments=sorted(trace.attachments.items()))
-
-
-def _verdict(checks: tuple[Check, ...]) -> str:
-    if not checks:
-        return "NOT JUDGED"
-    return "PASS" if all(check.passed for check in checks) else "FAIL"
 
 
 def _facts(trace: Trace) -> list[tuple[str, str]]:
@@ -62,7 +58,13 @@ def _row(check: Check) -> dict[str, Any]:
     return {"name": check.name, "kind": check.kind.replace("_", " "), "signal": check.signal, "passed": check.passed,
             "value": _number(check.value, "not measurable"), "unit": unit, "low": _number(check.low),
             "high": _number(check.high), "detail": check.detail,
-            "window": "whole run" if math.isnan(check.t0) else f"{check.t0:.3f} – {check.t1:.3f} s"}
+            "window": _window(check)}
+
+
+def _window(check: Check) -> str:
+    if math.isnan(check.t0):
+        return "not reached" if math.isnan(check.value) else "whole run"
+    return f"{check.t0:.3f} – {check.t1:.3f} s"
 
 
 def _number(value: float, missing: str = "") -> str:
@@ -71,12 +73,25 @@ def _number(value: float, missing: str = "") -> str:
 
 def _notes(trace: Trace) -> list[str]:
     """What a reader must know before trusting the plots."""
-    lost = {name: int(np.isnan(trace.column(name)).sum()) for name in trace.signals if name != "load"}
-    return [*trace.notes,
-            *(f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps),
-            *(f"{count} samples of {name} missing" for name, count in lost.items() if count),
+    return [*trace.notes, *_lost_cycles(trace), *_lost_samples(trace),
             *([f"this log was salvaged after its writer died: {trace.provenance['recovered.reason']}"]
               if "recovered.reason" in trace.provenance else [])]
+
+
+def _lost_cycles(trace: Trace) -> list[str]:
+    shown = [f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps[:GAPS_LISTED]]
+    rest = trace.gaps[GAPS_LISTED:]
+    return [*shown, *([f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps"] if rest else [])]
+
+
+def _lost_samples(trace: Trace) -> list[str]:
+    """One line: how many samples of which signals; a load is known or not, it is not sampled."""
+    lost: dict[int, list[str]] = {}
+    for name in trace.signals:
+        if name != "load":
+            lost.setdefault(int(np.isnan(trace.column(name)).sum()), []).append(name)
+    parts = [f"{count} of {', '.join(names)}" for count, names in lost.items() if count]
+    return [f"missing samples, marked red below the lines: {'; '.join(parts)} (of {len(trace)})"] if parts else []
 
 
 def _timing(trace: Trace) -> list[tuple[str, ...]]:

@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
+from command import rig
 
 from rig.bus import socketcan_problem
 
@@ -20,3 +22,47 @@ def bus_kind(request: pytest.FixtureRequest) -> str:
     if problem:
         pytest.skip(problem)
     return kind
+
+
+@pytest.fixture(scope="session")
+def preflight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a real preflight run, not to be written to."""
+    folder = tmp_path_factory.mktemp("preflight")
+    assert rig("run", "--quiet", "--out", folder).status == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def aborted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a real run with lost frames that a guard ended within a ramp; not to be written to."""
+    folder = tmp_path_factory.mktemp("aborted")
+    (folder / "guarded.toml").write_text(GUARDED)
+    assert rig("run", folder / "guarded.toml", "--quiet", "--out", folder).status == 1
+    return folder
+
+
+GUARDED = """
+title = "Guarded"
+setup = [{ kind = "hold", time = 0.3 }]
+main = [
+  { name = "rest", kind = "hold", time = 0.5 },
+  { name = "step 5 mm", kind = "step", to = 5e-3, time = 1.0 },
+  { name = "ramp out", kind = "ramp", to = 9e-3, time = 2.0 },
+  { name = "sine", kind = "sine", amplitude = 1e-3, frequency = 1.0, time = 2.0 },
+]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.3 }]
+faults = [
+  { kind = "lost", frame = "feedback", start = 0.2, end = 0.5, every = 7 },
+  { kind = "lost", frame = "feedback", start = 1.0, end = 1.002, every = 1 },
+  { kind = "lost", frame = "valve_state", start = 0.6, end = 0.9, every = 1 },
+]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "step 5 mm", high = 11 },
+  { name = "ramp error", kind = "ramp_error", window = "ramp out", low = 0, high = 14, unit = "um" },
+  { name = "gain, 1 Hz", kind = "amplitude_ratio", window = "sine", frequency = 1, low = 0.98 },
+  { name = "lag, 1 Hz", kind = "phase_lag", window = "sine", frequency = 1, high = 4.5 },
+  { name = "spool", kind = "never_exceeds", signal = "xs", high = 1, unit = "mm" },
+  { name = "no emergency", kind = "event_never", event = "EMCY" },
+]
+guards = [{ name = "ram far out", signal = "xj", high = 6.5, unit = "mm" }]
+"""
