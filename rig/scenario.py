@@ -10,6 +10,7 @@ import numpy as np
 from plant import InputError, Model
 from plant.segments import Array
 from rig.sequences.faults import Plan
+from rig.sequences.parameters import require_sensible
 
 FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 SENT = 1 << 20  # bytes in one SDO download, as the node's server has it
@@ -28,7 +29,12 @@ class Scenario(NamedTuple):
 
     @classmethod
     def of(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
-        """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load."""
+        """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load.
+
+        Raises:
+            InputError: a fault that contradicts this model's parameters.
+        """
+        require_sensible(plan, model)
         counts = [0] * plan.start + np.rint(load / FORCE).astype(int).tolist()
         return cls(model.having(_touched(plan)), plan, tuple(counts), seed)
 
@@ -66,6 +72,7 @@ class Scenario(NamedTuple):
             plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
             if seed < 0 or not 0 <= plan.start <= plan.stop <= LONGEST:
                 raise InputError(WHERE, "plan", f"a seed from 0, and at most {LONGEST} cycles")
+            require_sensible(plan, model)
             return cls(model, plan, tuple(force), seed)
         except InputError:
             raise

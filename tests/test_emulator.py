@@ -209,6 +209,14 @@ REFUSED = {
     "negative seed": table(seed=-1), "no stop": table(plan={"faults": []}),
     "plan without end": table(plan={"faults": [{"kind": "noise", "signal": "xj", "value": 1.0, "start": 0.0}],
                                     "stop": 10**13}),
+    "fault in the controller": table(plan={"faults": [
+        {"kind": "parameter", "parameter": "controller.period", "value": 0.01, "start": 0.0}], "stop": 10}),
+    "fault out of range": table(plan={"faults": [
+        {"kind": "parameter", "parameter": "filter.clogging", "value": 2.0, "start": 0.0}], "stop": 10}),
+    "fault that contradicts": table(plan={"faults": [
+        {"kind": "parameter", "parameter": "spool.static_friction", "value": 1.0, "start": 0.0}], "stop": 10}),
+    "fault beyond time": table(plan={"faults": [
+        {"kind": "stuck", "signal": "xj", "start": 0.0, "end": 1e308}], "stop": 10}),
     "fault of nothing": table(plan={"faults": [{"kind": "parameter", "parameter": "a.b", "value": 1.0, "start": 0.0}],
                                     "stop": 10}),
 }

@@ -7,15 +7,23 @@ import time
 import numpy as np
 import pytest
 
+from plant import load_model
 from plant.errors import InputError
+from rig.scenario import Scenario
 from rig.sequences import faults
 from rig.sequences.faults import Delay, Drop, Fault, Late, Lost, Noise, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.sequence import Sequence, parse_sequence
 
+MAIN = 'title = "T"\nmain = [{ kind = "hold", time = 1.0 }]\n'
 BASE = {"filter.clogging": 0.0, "spool.static_friction": 5.0}
 
 
 def schedule(*faults: Fault, start: int = 0, stop: int = 10_000, seed: int = 0) -> Schedule:
     return Schedule(Plan(faults=faults, start=start, stop=stop, seed=seed), BASE)
+
+
+def parse(text: str) -> Sequence:
+    return parse_sequence(text, "mine.toml", lambda name: b"")
 
 
 def test_without_faults_everything_is_as_it_was() -> None:
@@ -120,6 +128,33 @@ def test_a_bad_scenario_is_refused(data: object, message: str) -> None:
 def test_a_parameter_the_model_lacks_is_refused() -> None:
     with pytest.raises(InputError, match=r"did you mean 'filter.clogging'"):
         schedule(Parameter(parameter="filter.cloging", value=0.3, start=1.0))
+
+
+def test_words_stand_for_their_numbers_and_what_fits_together_is_taken() -> None:
+    s = parse(MAIN + """faults = [
+      { kind = "parameter", parameter = "filter.law", value = "linear", start = 0.1 },
+      { kind = "parameter", parameter = "spool.static_friction", value = 70, start = 0.2, ramp = 0.3 },
+      { kind = "parameter", parameter = "spool.dynamic_friction", value = 30, start = 0.2, ramp = 0.3 },
+      { kind = "parameter", parameter = "null_bias.current", value = 1e-4, start = 0.2 },
+    ]
+    [model]
+    overrides = { filter.law = "pressure" }
+    """)
+    assert s.model.overrides == {"filter.law": "pressure"}
+    model = load_model("eha").replace(s.model.overrides)
+    asked = Schedule(s.plan(0), {**model.values, "null_bias.current": 0.0})
+    at = [asked.parameters(k) for k in (0, 100, 999, 1000)]
+    assert [values["filter.law"] for values in at] == [0.0, 1.0, 1.0, 0.0]
+    assert [values["spool.static_friction"] for values in at] == [5.0, 5.0, 70.0, 5.0]
+
+
+def test_a_fault_that_contradicts_the_model_of_the_run_is_refused_before_it() -> None:
+    """The sequence is sound on the actuator it names; --set has made another of it."""
+    s = parse(MAIN + 'faults = [{ kind = "parameter", parameter = "jack.static_friction", value = 600, start = 0 }]')
+    other = load_model("eha").replace({"jack.dynamic_friction": 700.0})
+    Scenario.of(load_model("eha"), s.plan(0), s.load_profile(), 0)
+    with pytest.raises(InputError, match=r"parameter jack.static_friction: expected jack.dynamic_friction at most "):
+        Scenario.of(other, s.plan(0), s.load_profile(), 0)
 
 
 def test_it_is_cheap_enough_to_ask_in_every_cycle() -> None:

@@ -14,13 +14,20 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from plant.errors import InputError
-from plant.segments import RATE, Array, Second
+from plant.model import meaning
+from plant.parameters import accept
+from plant.quantity import Quantity
+from plant.segments import RATE, Second
 from rig.sequences import tables
+from rig.sequences.injection import Added, Held, hits
 
 Sensor = Literal["xj", "p12", "xs"]
 FrameName = Literal["feedback", "valve_state", "drive", "command"]
 Heart = Literal["rig", "plant"]
 InSI = Annotated[float, "SI units"]
+LATEST = 1e6  # s, later than any run ends
+LARGEST = 1e12  # SI; a sensor cannot be further off, and sums of two stay numbers
+MOST = 1_000_000_000  # cycles or frames to count to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +40,9 @@ class Fault(ABC):
     name: str = ""
 
     def __post_init__(self) -> None:
-        _require(self.start >= 0, "start", f"0 s or later, not {self.start:g}")
-        _require(self.end is None or self.end > self.start, "end", f"after the start at {self.start:g} s")
+        _require(0 <= self.start <= LATEST, "start", f"0 s or later, at most {LATEST:g}, not {self.start:g}")
+        _require(self.end is None or self.start < self.end <= LATEST, "end",
+                 f"after the start at {self.start:g} s, and at most {LATEST:g} s")
 
     @property
     def label(self) -> str:
@@ -45,9 +53,8 @@ class Fault(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _Ramped(Fault):
-    """A fault of a size that is reached linearly within `ramp` seconds of the start."""
+    """A fault of a size, its `value`, that is reached linearly within `ramp` seconds of the start."""
 
-    value: InSI
     ramp: Second = 0.0
 
     def __post_init__(self) -> None:
@@ -65,6 +72,20 @@ class Parameter(_Ramped):
 
     kind = "parameter"
     parameter: str
+    value: InSI | str  # a word for a parameter that is a choice
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.parameter.partition(".")[0] != "controller", "parameter",
+                 f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under test, "
+                 "no fault reaches into it")
+
+    def target(self, quantity: Quantity) -> float:
+        """The number that `value` stands for; raises InputError at the key that cannot be for such a parameter."""
+        value = accept("fault", "value", quantity, self.value)
+        _require(not (quantity.words and self.ramp), "ramp",
+                 f"none: {self.parameter} is {quantity.expected}, with nothing between them")
+        return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,14 +94,18 @@ class Offset(_Ramped):
 
     kind = "offset"
     signal: Sensor
+    value: InSI
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_size(self.value)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Noise(_Ramped):
+class Noise(Offset):
     """A sensor has more white noise: `value` is its standard deviation."""
 
     kind = "noise"
-    signal: Sensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +115,10 @@ class Stuck(Fault):
     kind = "stuck"
     signal: Sensor
     value: InSI | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_size(self.value or 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +132,8 @@ class _Frames(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self.every >= 1, "every", f"1 or more cycles, not {self.every}")
-        _require(self.count is None or self.count >= 1, "count", f"1 or more frames, not {self.count}")
+        _require(1 <= self.every <= MOST, "every", f"1 or more cycles, not {self.every}")
+        _require(self.count is None or 1 <= self.count <= MOST, "count", f"1 or more frames, not {self.count}")
         _require(0 < self.probability <= 1, "probability", f"above 0 and at most 1, not {self.probability:g}")
 
 
@@ -191,7 +220,7 @@ class Schedule:
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
         self._base = base or {}
-        self._parameters: dict[str, list[tuple[int, int, Parameter]]] = {}
+        self._parameters: dict[str, list[tuple[int, int, float, Parameter]]] = {}
         self._signals: dict[str, list[Callable[[int, float], float]]] = {}
         self._frames: dict[str, list[tuple[int, bytes, Drop | Delay]]] = {}
         self._silent: dict[str, list[range]] = {}
@@ -207,17 +236,19 @@ class Schedule:
             case Parameter():
                 if fault.parameter not in self._base:
                     raise InputError("faults", fault.parameter, tables.one_of(fault.parameter, self._base))
-                self._parameters.setdefault(fault.parameter, []).append((first, last, fault))
-            case Offset() | Noise():
-                noise = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
-                self._signals.setdefault(fault.signal, []).append(_Added(fault, first, noise))
+                self._parameters.setdefault(fault.parameter, []).append(
+                    (first, last, fault.target(meaning(fault.parameter, "faults")), fault))
+            case Offset():  # or noise
+                shape = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
+                values = [fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
+                self._signals.setdefault(fault.signal, []).append(Added(first, values))
             case Stuck():
-                self._signals.setdefault(fault.signal, []).append(_Held(fault, first, last))
+                self._signals.setdefault(fault.signal, []).append(Held(range(first, last), fault.value))
             case _Frames():
                 action = Delay(round(fault.delay * 1e9)) if isinstance(fault, Late) else Drop()
-                hits = _hits(fault, last - first, rng)
-                self._frames.setdefault(fault.frame, []).append((first, hits, action))
-                return first + len(hits)
+                hit = hits(last - first, fault.every, fault.count, fault.probability, rng)
+                self._frames.setdefault(fault.frame, []).append((first, hit, action))
+                return first + len(hit)
             case Silent():
                 self._silent.setdefault(fault.node, []).append(range(first, last))
         return last
@@ -230,10 +261,14 @@ class Schedule:
 
     def _parameter(self, name: str, cycle: int) -> float:
         base = self._base[name]
-        for first, last, fault in self._parameters[name]:
+        for first, last, value, fault in self._parameters[name]:
             if first <= cycle < last:
-                return base + (fault.value - base) * fault.growth((cycle - first) / RATE)
+                return base + (value - base) * fault.growth((cycle - first) / RATE)
         return base
+
+    def parameters(self, cycle: int) -> dict[str, float]:
+        """All parameters of the model, with what faults have made of them in this cycle."""
+        return {**self._base, **{name: self._parameter(name, cycle) for name in self._parameters}}
 
     def signal(self, name: str, value: float, cycle: int) -> float:
         """What the sensor `name` (xj, p12, xs; SI) says in place of `value`; faults act in the order of the plan."""
@@ -243,8 +278,8 @@ class Schedule:
 
     def frame(self, name: str, cycle: int) -> Drop | Delay | None:
         """What happens to the frame `name` of this cycle; None: it goes its way."""
-        for first, hits, action in self._frames.get(name, ()):
-            if 0 <= cycle - first < len(hits) and hits[cycle - first]:
+        for first, hit, action in self._frames.get(name, ()):
+            if 0 <= cycle - first < len(hit) and hit[cycle - first]:
                 return action
         return None
 
@@ -253,37 +288,8 @@ class Schedule:
         return not any(cycle in cycles for cycles in self._silent.get(node, ()))
 
 
-class _Added:
-    """A sensor that reads more than there is: an offset, or noise drawn beforehand."""
-
-    def __init__(self, fault: Offset | Noise, first: int, shape: Array) -> None:
-        self._first, self._added = first, [
-            fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
-
-    def __call__(self, cycle: int, value: float) -> float:
-        k = cycle - self._first
-        return value + self._added[k] if 0 <= k < len(self._added) else value
-
-
-class _Held:
-    """A stuck sensor."""
-
-    def __init__(self, fault: Stuck, first: int, last: int) -> None:
-        self._cycles, self._last_read, self._value = range(first, last), 0.0, fault.value
-
-    def __call__(self, cycle: int, value: float) -> float:
-        if cycle in self._cycles:
-            return self._last_read if self._value is None else self._value
-        self._last_read = value
-        return value
-
-
-def _hits(fault: _Frames, cycles: int, rng: np.random.Generator) -> bytes:
-    """One byte a cycle, 1 where the fault hits the frame; up to the last hit if they are counted."""
-    hits = (np.arange(cycles) % fault.every == 0) & (rng.random(cycles) < fault.probability)
-    if fault.count is not None and hits.sum() >= fault.count:
-        hits = hits[:np.flatnonzero(hits)[fault.count - 1] + 1]
-    return bytes(hits.tobytes())
+def _require_size(value: float) -> None:
+    _require(abs(value) <= LARGEST, "value", f"at most {LARGEST:g} either way, not {value:g}")
 
 
 def _require(holds: bool, key: str, expected: str) -> None:

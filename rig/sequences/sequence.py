@@ -16,17 +16,17 @@ import numpy as np
 
 from plant import segments
 from plant.errors import InputError
-from plant.model import meaning
+from plant.model import Model, meaning
 from plant.profile import Profile, build, names, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
 from rig.sequences.checks import Check, ResponseWithin
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
+from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
 from rig.sequences.scene import MAIN
 from rig.sequences.tables import Place
 
-Known = Callable[[str], object]  # raises InputError for a name that no parameter has
 ReadFile = Callable[[str], bytes]
 
 _KINDS: tables.Kinds = {Segment: segments.KINDS, Fault: faults.KINDS, Check: checks.KINDS}
@@ -38,7 +38,7 @@ class ModelChoice:
     """Which plant to run on: a model's name or file, and parameters that differ from it (SI)."""
 
     name: str = "eha"
-    overrides: Mapping[str, float] = field(default_factory=dict)
+    overrides: Mapping[str, float | str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,22 +243,15 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
 
 def _check_parameters(sequence: Sequence, place: Place, known: Known) -> None:
     """Names must exist. If `known` says what a name means (plant.model.meaning does), values are tried as well."""
-    named: list[tuple[Place, Place, str, float]] = []
-    for name, value in sequence.model.overrides.items():
-        here = place.at("model", "overrides", *name.split("."))  # where `overrides.spool.travel` stands in the file
-        here = here if here.keys in place.lines else place.at("model", "overrides", name)
-        named.append((here, here, name, value))
-    for i, fault in enumerate(sequence.faults):
-        if isinstance(fault, Parameter):
-            here = place.at("faults", i)
-            named.append((here.at("parameter"), here.at("value"), fault.parameter, fault.value))
-    for name_place, value_place, name, value in named:
+    chosen, plan = sequence.model, sequence.plan(0)
+    whole = check_overrides(chosen.overrides, place.at("model", "overrides"), known)
+    whole &= check_faults(plan, place.at("faults"), known)
+    if whole and chosen.name == "eha":  # another model's values are known when it runs
         try:
-            quantity: Any = known(name)
+            model = Model().replace(chosen.overrides)
         except InputError as error:
-            raise name_place.refuse(f"{error.expected}, not {name!r}") from error
-        if hasattr(quantity, "refuses") and quantity.refuses(value):
-            raise value_place.refuse(f"{quantity.expected}, not {value:g}")
+            raise place.at("model", "overrides").refuse(f"{error.field} {error.expected}") from error
+        check_together(plan, model, place.at("faults"))
 
 
 def _check_checks(sequence: Sequence, place: Place) -> None:

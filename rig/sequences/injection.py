@@ -1,0 +1,36 @@
+"""What a fault does to the samples of a sensor or to frames, laid out before the run."""
+from __future__ import annotations
+
+import numpy as np
+
+
+class Added:
+    """A sensor that reads more than there is: from cycle `first` on by `values`, one a cycle."""
+
+    def __init__(self, first: int, values: list[float]) -> None:
+        self._first, self._values = first, values
+
+    def __call__(self, cycle: int, value: float) -> float:
+        k = cycle - self._first
+        return value + self._values[k] if 0 <= k < len(self._values) else value
+
+
+class Held:
+    """A sensor stuck within `cycles`, at `value` or without one at what it last read."""
+
+    def __init__(self, cycles: range, value: float | None) -> None:
+        self._cycles, self._last_read, self._value = cycles, 0.0, value
+
+    def __call__(self, cycle: int, value: float) -> float:
+        if cycle in self._cycles:
+            return self._last_read if self._value is None else self._value
+        self._last_read = value
+        return value
+
+
+def hits(cycles: int, every: int, count: int | None, probability: float, rng: np.random.Generator) -> bytes:
+    """One byte a cycle, 1 where a frame is hit: every `every`-th with a probability; up to the last if counted."""
+    hit = (np.arange(cycles) % every == 0) & (rng.random(cycles) < probability)
+    if count is not None and hit.sum() >= count:
+        hit = hit[:np.flatnonzero(hit)[count - 1] + 1]
+    return bytes(hit.tobytes())
