@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fdi import figures
+from fdi.output import writable
 from fdi.trace import Check, Trace
 from fdi.verdict import verdict
 from plant.errors import InputError
@@ -21,9 +22,11 @@ def write_report(source: str | Path, out: str | Path) -> None:
 
     Raises InputError for a trace that cannot be read and a file that cannot be written.
     """
-    page = render(Trace.read(source, all=True))
+    trace = Trace.read(source, all=True)
+    place = writable(out, "--out", source=source)
+    page = render(trace)
     try:
-        Path(out).write_text(page, encoding="utf-8")
+        place.write_text(page, encoding="utf-8")
     except OSError as error:
         raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.output import writable
 from fdi.sections import Section
 from fdi.trace import Check, Trace
 from plant.errors import RigError
@@ -73,9 +74,12 @@ def rerun() -> Any:
 
 
 def write_rrd(trace: Trace, path: Path) -> None:
-    """Write a trace with its blueprint as a rerun recording; set-up has negative times, main starts at 0."""
+    """Write a trace with its blueprint as a rerun recording; set-up has negative times, main starts at 0.
+
+    Raises ViewerError without rerun; InputError for a place that cannot be written.
+    """
     rr = rerun()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    writable(path, "the recording")
     with rr.RecordingStream("eha-rig", recording_id=str(path.stem)) as stream:
         stream.save(path, default_blueprint=_blueprint(rr, trace))
         stream.send_recording_name(trace.provenance.get("sequence", trace.provenance.get("source", "trace")))

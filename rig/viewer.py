@@ -71,7 +71,6 @@ def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
     from rerun.experimental import ViewerClient
 
     port = _free_port()
-    image.parent.mkdir(parents=True, exist_ok=True)
     image.unlink(missing_ok=True)
     with tempfile.TemporaryFile("w+") as output:
         viewer = subprocess.Popen([*_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],

@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.headless and not args.screenshot:
         raise InputError("--headless", "", "--screenshot FILE.png with it")
+    from fdi.output import writable
     from fdi.trace import Trace
     from rig import recording, viewer
 
@@ -30,11 +31,13 @@ def run(args: argparse.Namespace) -> int:
     trace = Trace.read(source, all=True)
     save = args.save or args.out
     if save is not None:
-        rrd = Path(save)
+        rrd = writable(save, "--save" if args.save else "--out", source=source)
     elif args.screenshot:
-        rrd = Path(args.screenshot).with_suffix(".rrd")
+        rrd = writable(Path(args.screenshot).with_suffix(".rrd"), "--screenshot", source=source)
     else:
         rrd = (source if source.is_dir() else source.parent) / (source.name.split(".")[0] + ".rrd")
+    if args.screenshot:
+        writable(args.screenshot, "--screenshot", source=source)
     recording.write_rrd(trace, rrd)
     answer: dict[str, object] = {"rrd": str(rrd)}
     if args.screenshot:

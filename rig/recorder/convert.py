@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.log import open_log
+from fdi.output import writable
 from fdi.trace import Trace
 from plant.errors import InputError
 from rig import codec
@@ -30,7 +31,7 @@ def export(source: Path, out: Path, everything: bool = False) -> int:
     """
     if out.name.endswith((".csv", ".csv.gz")):
         trace = Trace.read(source, all=everything)
-        trace.write_csv(out)
+        trace.write_csv(writable(out, "--out", source=source))
         return len(trace)
     if out.suffix not in RAW:
         raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW)}")
@@ -39,19 +40,17 @@ def export(source: Path, out: Path, everything: bool = False) -> int:
     path = source / "trace.mcap" if source.is_dir() else source
     if path.suffix != ".mcap":
         raise InputError(path, "", "a log with raw frames (.mcap)")
-    count = 0
+    raw = list(frames(path))
+    if not raw:
+        raise InputError(path, "/can", "at least one raw frame")
     try:
-        with can.Logger(out) as writer:
-            for frame in frames(path):
+        with can.Logger(writable(out, "--out")) as writer:
+            for frame in raw:
                 writer(can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.cob_id, data=frame.data,
                                    is_extended_id=False, channel="can0" if out.suffix == ".log" else 0))
-                count += 1
     except OSError as error:
         raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
-    if not count:
-        out.unlink()
-        raise InputError(path, "/can", "at least one raw frame")
-    return count
+    return len(raw)
 
 
 def frames(path: Path) -> Iterator[Frame]:
@@ -68,7 +67,10 @@ def import_csv(source: Path, out: Path) -> int:
 
 
 def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = None) -> None:
-    """Write a trace's signals as a log; `metadata` is its own provenance by default."""
+    """Write a trace's signals as a log; `metadata` is its own provenance by default.
+
+    Raises InputError for a place that cannot be written; unlike a run it makes no folder.
+    """
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
     recorder = Recorder(_mcap(out), {n: ("application/octet-stream", d) for n, d in trace.attachments.items()}, given)
     columns = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
@@ -207,7 +209,7 @@ def _decoder(dbc: Path) -> dict[int, Any]:
 def _mcap(out: Path) -> Path:
     if out.suffix != ".mcap":
         raise InputError(out, "--out", "a name that ends in .mcap")
-    return out
+    return writable(out, "--out")
 
 
 def _wait(recorder: Recorder, item: int) -> None:

@@ -15,6 +15,7 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schem
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 
 from fdi.log import scan
+from fdi.output import writable
 from plant.errors import InputError
 from rig.recorder.container import McapFile
 
@@ -51,8 +52,6 @@ def recover(path: Path, out: Path) -> Salvage:
         source = path.open("rb")
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
-    if out.exists() and out.samefile(path):
-        raise InputError(out, "--out", "another file than the one to recover")
     with source:
         reading = _Reading(source, path.stat().st_size)
         records = iter(reading)
@@ -60,8 +59,7 @@ def recover(path: Path, out: Path) -> Salvage:
         if first is None:
             raise InputError(path, "", f"an MCAP log with something in it ({reading.reason or 'it is empty'})")
         try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            return _write(chain([first], records), reading, out)
+            return _write(chain([first], records), reading, writable(out, "--out", source=path))
         except OSError as error:
             raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 
