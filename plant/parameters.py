@@ -1,6 +1,8 @@
 """What the actuator is made of: one NamedTuple a component, every field with unit, symbol and range.
 
-The numbers themselves are data (nominal.toml); this file says what they mean and refuses what cannot be.
+The numbers themselves are data (nominal.toml); this file says what they mean and refuses what cannot be. The ranges are
+generous, some three orders of magnitude either way: what is outside can only be a slip (of units, of an exponent), and
+inside the plant has a number for everything.
 """
 from __future__ import annotations
 
@@ -30,32 +32,32 @@ def _q(unit: str, symbol: str = "", **more: Any) -> Quantity:
 class Controller(NamedTuple):
     """The position loop of the reference firmware: a PID law on the sensed error, limited."""
 
-    proportional_gain: Annotated[float, _q("A/m", "GAP", low=0)]
-    integral_gain: Annotated[float, _q("A/(m s)", low=0)]
-    derivative_gain: Annotated[float, _q("A s/m", low=0)]
-    current_limit: Annotated[float, _q("A", "Imax", above=0)]
+    proportional_gain: Annotated[float, _q("A/m", "GAP", low=0, high=1e6)]
+    integral_gain: Annotated[float, _q("A/(m s)", low=0, high=1e9)]
+    derivative_gain: Annotated[float, _q("A s/m", low=0, high=1e6)]
+    current_limit: Annotated[float, _q("A", "Imax", low=1e-6, high=20)]
     period: Annotated[float, _q("s", low=1e-4, high=0.1)]
 
 
 class TorqueMotor(NamedTuple):
     """Current to torque on the flapper."""
 
-    gain: Annotated[float, _q("N m/A", "GM", above=0, tolerance=0.015)]
+    gain: Annotated[float, _q("N m/A", "GM", low=1e-3, high=1e3, tolerance=0.015)]
 
 
 class Flapper(NamedTuple):
     """The armature and flapper, between two inelastic stops."""
 
-    inertia: Annotated[float, _q("N m s2/m", "JF", above=0, tolerance=0.015)]
-    damping: Annotated[float, _q("N m s/m", "BF", low=0, tolerance=0.015)]
-    stiffness: Annotated[float, _q("N m/m", "KF", above=0, tolerance=0.015)]
-    travel: Annotated[float, _q("m", "XFM", above=0)]
+    inertia: Annotated[float, _q("N m s2/m", "JF", low=1e-9, high=1, tolerance=0.015)]
+    damping: Annotated[float, _q("N m s/m", "BF", low=0, high=1e3, tolerance=0.015)]
+    stiffness: Annotated[float, _q("N m/m", "KF", low=1e-2, high=1e6, tolerance=0.015)]
+    travel: Annotated[float, _q("m", "XFM", low=1e-7, high=1e-2)]
 
 
 class FeedbackSpring(NamedTuple):
     """The wire from spool to flapper."""
 
-    stiffness: Annotated[float, _q("N m/m", "KSF", above=0, tolerance=0.015)]
+    stiffness: Annotated[float, _q("N m/m", "KSF", low=1e-6, high=1e5, tolerance=0.015)]
 
 
 class Filter(NamedTuple):
@@ -68,52 +70,52 @@ class Filter(NamedTuple):
 class Pilot(NamedTuple):
     """The double nozzle with a clean filter."""
 
-    flow_gain: Annotated[float, _q("m2/s", "GQF", above=0, tolerance=0.015)]
-    pressure_gain: Annotated[float, _q("Pa/m", "GPF", above=0, tolerance=0.015)]
+    flow_gain: Annotated[float, _q("m2/s", "GQF", low=1e-5, high=1e2, tolerance=0.015)]
+    pressure_gain: Annotated[float, _q("Pa/m", "GPF", low=1e8, high=1e15, tolerance=0.015)]
 
 
 class Spool(NamedTuple):
     """The second stage."""
 
-    end_area: Annotated[float, _q("m2", "ASV", above=0)]
-    mass: Annotated[float, _q("kg", "MS", above=0)]
-    damping: Annotated[float, _q("N s/m", "CS", low=0)]
-    static_friction: Annotated[float, _q("N", "FSS", low=0)]
-    dynamic_friction: Annotated[float, _q("N", "FDS", low=0)]
-    travel: Annotated[float, _q("m", "XSM", above=0)]
+    end_area: Annotated[float, _q("m2", "ASV", low=1e-8, high=0.1)]
+    mass: Annotated[float, _q("kg", "MS", low=1e-6, high=100)]
+    damping: Annotated[float, _q("N s/m", "CS", low=0, high=1e6)]
+    static_friction: Annotated[float, _q("N", "FSS", low=0, high=1e6)]
+    dynamic_friction: Annotated[float, _q("N", "FDS", low=0, high=1e6)]
+    travel: Annotated[float, _q("m", "XSM", low=1e-6, high=1)]
 
 
 class Valve(NamedTuple):
     """The metering edges, linearised."""
 
-    flow_gain: Annotated[float, _q("m2/s", "GQ", above=0, tolerance=0.015)]
-    pressure_gain: Annotated[float, _q("Pa/m", "GP", above=0, tolerance=0.015)]
+    flow_gain: Annotated[float, _q("m2/s", "GQ", low=1e-5, high=1e3, tolerance=0.015)]
+    pressure_gain: Annotated[float, _q("Pa/m", "GP", low=1e8, high=1e15, tolerance=0.015)]
 
 
 class Supply(NamedTuple):
     """The hydraulic supply."""
 
-    pressure: Annotated[float, _q("Pa", "PSR", above=0, tolerance=0.015)]
+    pressure: Annotated[float, _q("Pa", "PSR", low=1e5, high=1e8, tolerance=0.015)]
 
 
 class Jack(NamedTuple):
     """The cylinder with the surface it moves."""
 
-    area: Annotated[float, _q("m2", "AJ", above=0)]
-    mass: Annotated[float, _q("kg", "MJ", above=0, tolerance=0.015)]
-    damping: Annotated[float, _q("N s/m", "CJ", low=0, tolerance=0.015)]
-    static_friction: Annotated[float, _q("N", "FSJ", low=0, tolerance=0.015)]
-    dynamic_friction: Annotated[float, _q("N", "FDJ", low=0, tolerance=0.015)]
-    leakage: Annotated[float, _q("m3/s/Pa", "CLK", low=0, tolerance=0.015)]
-    travel: Annotated[float, _q("m", "XJM", above=0)]
+    area: Annotated[float, _q("m2", "AJ", low=1e-7, high=1)]
+    mass: Annotated[float, _q("kg", "MJ", low=1e-2, high=1e6, tolerance=0.015)]
+    damping: Annotated[float, _q("N s/m", "CJ", low=0, high=1e9, tolerance=0.015)]
+    static_friction: Annotated[float, _q("N", "FSJ", low=0, high=1e7, tolerance=0.015)]
+    dynamic_friction: Annotated[float, _q("N", "FDJ", low=0, high=1e7, tolerance=0.015)]
+    leakage: Annotated[float, _q("m3/s/Pa", "CLK", low=0, high=1e-6, tolerance=0.015)]
+    travel: Annotated[float, _q("m", "XJM", low=1e-4, high=10)]
 
 
 class Sensors(NamedTuple):
     """White noise of the bench's transducers, one sample a cycle."""
 
-    position_noise: Annotated[float, _q("m rms", low=0)]
-    pressure_noise: Annotated[float, _q("Pa rms", low=0)]
-    spool_noise: Annotated[float, _q("m rms", low=0)]
+    position_noise: Annotated[float, _q("m rms", low=0, high=1)]
+    pressure_noise: Annotated[float, _q("Pa rms", low=0, high=1e8)]
+    spool_noise: Annotated[float, _q("m rms", low=0, high=1)]
 
 
 GROUPS: dict[str, type[Any]] = {

@@ -27,8 +27,12 @@ def refusal(changes: dict[str, object]) -> str:
 
 
 @pytest.mark.parametrize(("name", "value", "said"), [
-    ("spool.static_friction", -1, "at least 0 N, not -1"),
-    ("jack.mass", 0, "above 0 kg, not 0"),
+    ("spool.static_friction", -1, "at least 0 N and at most 1e+06 N, not -1"),
+    ("jack.mass", 0, "at least 0.01 kg"),
+    ("supply.pressure", 1e-300, "at least 100000 Pa and at most 1e+08 Pa, not 1e-300"),
+    ("supply.pressure", 201, "at least 100000 Pa"),  # bar
+    ("controller.current_limit", 1e300, "at most 20 A"),
+    ("constant_load.force", -1e7, "at least -1e+06 N"),
     ("filter.clogging", 1.0, "below 1, not 1"),
     ("filter.clogging", -0.1, "at least 0"),
     ("filter.law", "cubic", "one of sqrt, linear, pressure, not 'cubic'"),
@@ -37,7 +41,7 @@ def refusal(changes: dict[str, object]) -> str:
     ("valve.flow_gain", "nan", "not nan"),
     ("valve.flow_gain", float("nan"), "not nan"),
     ("valve.flow_gain", float("inf"), "not inf"),
-    ("null_bias.current", float("-inf"), "a finite number in A, not -inf"),
+    ("null_bias.current", float("-inf"), "at least -20 A and at most 20 A, not -inf"),
     ("valve.flow_gain", True, "not True"),
     ("valve.flow_gain", None, "not None"),
     ("valve.flow_gain", [0.3], r"not [0.3]"),
@@ -74,6 +78,26 @@ def test_whatever_is_set_is_taken_or_refused_in_one_line(name: str, value: objec
     else:
         assert np.isfinite(model[name])
         assert not meaning(name).refuses(model[name])
+
+
+ENDS = {name: (meaning(name).low, meaning(name).high) for name in NAMES
+        if not name.startswith("filter") and name != "controller.period"}
+ALONE = [{name: end} for name, ends in ENDS.items() for end in ends]
+TOGETHER = [{name: ends[pick] for (name, ends), pick in zip(ENDS.items(), picks, strict=True)}
+            for picks in np.random.default_rng(0).integers(2, size=(40, len(ENDS)))]
+
+
+@pytest.mark.parametrize("corners", [ALONE, TOGETHER], ids=["one parameter", "all parameters"])
+def test_every_corner_of_the_ranges_has_a_number(corners: list[dict[str, float]]) -> None:
+    """The plant may behave oddly there, but not lose its numbers."""
+    command, load = np.r_[np.zeros(5), np.full(60, 5e-3)], np.full(65, 1e6)
+    for values in corners:
+        for body in ("spool", "jack"):  # no contradiction
+            static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
+            both = {name: values.get(name, nominal()[name]) for name in (static, dynamic)}
+            values |= {static: max(both.values()), dynamic: min(both.values())}
+        run = simulate(Model().replace(values), command, load)
+        assert all(np.isfinite(column).all() for column in run), values
 
 
 def test_words_numbers_and_texts_are_accepted() -> None:

@@ -10,7 +10,7 @@ from plant.quantity import Quantity
 class ConstantLoad(NamedTuple):
     """A steady external force."""
 
-    force: Annotated[float, Quantity("N", typical="0.2-5 kN")] = 0.0
+    force: Annotated[float, Quantity("N", low=-1e6, high=1e6, typical="0.2-5 kN")] = 0.0
 
 
 @effect("load", ConstantLoad, law="FR = FR + F", symptoms="mean P12")
@@ -22,7 +22,7 @@ def constant_load(x: float, s: Any, u: Any, p: Any) -> float:
 class AeroStiffness(NamedTuple):
     """Hinge moment of the surface per unit of ram position."""
 
-    stiffness: Annotated[float, Quantity("N/m", low=0, typical="1e5-1e6 N/m")] = 0.0
+    stiffness: Annotated[float, Quantity("N/m", low=0, high=1e9, typical="1e5-1e6 N/m")] = 0.0
 
 
 @effect("load", AeroStiffness, law="FR = FR + K XJ", symptoms="P12 proportional to position, at rest too")

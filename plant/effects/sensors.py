@@ -10,7 +10,7 @@ from plant.quantity import Quantity
 class SensorOffset(NamedTuple):
     """Zero error of the transducer."""
 
-    offset: Annotated[float, Quantity("m", typical="10-200 um")] = 0.0
+    offset: Annotated[float, Quantity("m", low=-1, high=1, typical="10-200 um")] = 0.0
 
 
 @effect("position", SensorOffset, law="XJ = XJ + offset", symptoms="unobservable in closed loop except at end stops")

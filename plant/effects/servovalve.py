@@ -12,7 +12,7 @@ from plant.quantity import Quantity
 class NullBias(NamedTuple):
     """Current offset."""
 
-    current: Annotated[float, Quantity("A", typical="0.2-4 % of Imax")] = 0.0
+    current: Annotated[float, Quantity("A", low=-20, high=20, typical="0.2-4 % of Imax")] = 0.0
 
 
 @effect("current", NullBias, law="i = i + i0", symptoms="constant error i0/GAP with P12 unchanged")
@@ -24,9 +24,9 @@ def null_bias(x: float, s: Any, u: Any, p: Any) -> float:
 class CurrentNoise(NamedTuple):
     """Electrical noise on the current line."""
 
-    white: Annotated[float, Quantity("A rms", low=0)] = 0.0
-    hum: Annotated[float, Quantity("A", low=0, typical="amplitude")] = 0.0
-    frequency: Annotated[float, Quantity("Hz", low=0)] = 400.0
+    white: Annotated[float, Quantity("A rms", low=0, high=20)] = 0.0
+    hum: Annotated[float, Quantity("A", low=0, high=20, typical="amplitude")] = 0.0
+    frequency: Annotated[float, Quantity("Hz", low=0, high=1e6)] = 400.0
 
 
 @effect("current", CurrentNoise, law="i = i + white n_k + hum sin(2 pi f t), n_k new every cycle",
@@ -40,7 +40,7 @@ def current_noise(x: float, s: Any, u: Any, p: Any) -> float:
 class SpoolOverlap(NamedTuple):
     """Half width of the metering edges' dead zone."""
 
-    overlap: Annotated[float, Quantity("m", low=0, typical="5-60 um")] = 0.0
+    overlap: Annotated[float, Quantity("m", low=0, high=1, typical="5-60 um")] = 0.0
 
 
 @effect("metering", SpoolOverlap, law="XS = deadzone(XS, overlap) at the metering edges",
