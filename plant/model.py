@@ -18,7 +18,7 @@ from plant.effects import CATALOGUE, Effect, at
 from plant.errors import InputError
 from plant.parameters import GROUPS, accept, flatten, nominal, read_toml, resolve, sensible
 from plant.quantity import Quantity
-from plant.state import Ports, State
+from plant.state import Input, Ports, State
 
 STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
 
@@ -101,8 +101,12 @@ class Model:
         return np.array([row], np.dtype((np.record, list(inner.items()))))
 
     def state(self) -> State:
-        """The centred actuator at rest, with the memory of this model's effects."""
-        return initial(self.effects)
+        """The centred actuator at rest, with the memory of this model's effects, as its transducer shows it."""
+        s = initial(self.effects)
+        if not any(CATALOGUE[e].port == "position" for e in self.effects):
+            return s
+        law = at("position", self.effects)[0]  # once in plain Python: the first sample comes before the first step
+        return s._replace(sensed=float(law(s.jack_position, s.memory.position, s, Input(), self.record()[0])[0]))
 
 
 def load_model(source: str | Path = "eha") -> Model:

@@ -90,8 +90,10 @@ class Actuator:
     def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
         self.model, self.steps = model, steps
         self.cycle = 0
-        self._flat = np.array(values(model.state()))
-        self._unpack = packers(model.state())[1]
+        with _laws(model):
+            state = model.state()
+        self._flat = np.array(values(state))
+        self._unpack = packers(state)[1]
         self._record = model.record()
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
         self._index = {name: i for i, name in enumerate(model.names())}

@@ -156,6 +156,26 @@ def test_sensor_lag_in_the_loop() -> None:
     assert lag == pytest.approx(2e-3 * plant.state.jack_speed, rel=1e-3)
 
 
+@pytest.mark.parametrize("more", [{}, {"sensor_lag.time": 2e-3}])
+def test_the_first_sample_has_the_sensors_offset(more: dict[str, float]) -> None:
+    """The transducer shows it before the plant has made a step."""
+    model = SILENT.replace({"sensor_offset.offset": 50e-6} | more)
+    for fast in (True, False):
+        plant = Actuator(model, steps=FEW, fast=fast)
+        run = simulate(model, np.zeros(3), steps=FEW, fast=fast)
+        assert plant.sample()[0] == run.xj[0] == 50e-6
+        assert run.cor[0] == -50e-6 * model["controller.proportional_gain"]
+        plant.advance(0.0)
+        assert plant.sample()[0] == run.xj[1] == 50e-6  # nor is there a jump in the second
+
+
+def test_a_position_law_that_cannot_run_is_refused(file: Path) -> None:
+    file.write_text(COGGING.replace('"load"', '"position"').replace("p.cogging.force", "p.cogging.farce"))
+    load_effects(file)
+    with pytest.raises(InputError, match="cogging"):
+        Actuator(Model().having(["cogging"]))
+
+
 def test_the_users_effect_is_found_and_acts(file: Path) -> None:
     file.write_text(STIFF.format(scale=1.0))
     assert load_effects(file) == ["spring"]
