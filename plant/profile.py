@@ -5,7 +5,7 @@ import csv
 import gzip
 import zlib
 from collections.abc import Iterator, Sequence
-from math import isfinite
+from math import ceil, isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 from plant.errors import InputError
 from plant.segments import FARTHEST, LONGEST, RATE, STRONGEST, Array, Segment, require
 
+SLACK = 0.01  # of a cycle: a time within it of a row is that row's
 _SANE = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
 
 
@@ -65,25 +66,26 @@ def build(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     return Profile(np.concatenate(pieces), tuple(sections), last)
 
 
-def read_command(path: str | Path) -> Command:
+def read_command(path: str | Path, period: float = 1 / RATE) -> Command:
     """A command file for `rig simulate`: CSV (or .csv.gz) with columns t, com and optionally load, SI units.
 
-    Raises InputError naming the file, the line and what was expected there.
+    One value per cycle of `period` s, as `on_cycles` has it. Raises InputError naming the file, the line and what was
+    expected there.
     """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(path, "", f"a CSV file that can be read ({error.strerror})") from error
-    columns = parse_columns(data, path)
+    columns = parse_columns(data, path, period)
     if "com" not in columns:
         raise InputError(path, "line 1", "a header with the columns t and com")
     return Command(columns["com"], columns.get("load"))
 
 
-def parse_columns(data: bytes, where: object) -> dict[str, Array]:
+def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[str, Array]:
     """The columns com, value and load of a CSV text, as far as it has them, at one value per cycle from its first row.
 
-    Rows that are not 1 ms apart are joined by straight lines. Other columns are ignored, so a trace is a command too.
+    Rows and cycles need not agree: see `on_cycles`. Other columns are ignored, so a trace is a command too.
     Raises InputError for what is not a number, not finite, or not in order of time.
     """
     rows = _rows(data, where)
@@ -94,10 +96,25 @@ def parse_columns(data: bytes, where: object) -> dict[str, Array]:
     picked: dict[str, int] = {name: titles.index(name) for name in ("t", "com", "value", "load") if name in titles}
     table = {name: np.array(values) for name, values in _numbers(rows, picked, where).items()}
     t = table.pop("t")
-    grid = t[0] + np.arange(round((t[-1] - t[0]) * RATE) + 1) / RATE
-    if len(grid) == len(t) and np.abs(grid - t).max() < 0.01 / RATE:
-        return table
-    return {name: np.interp(grid, t, values) for name, values in table.items()}
+    return {name: on_cycles(t, values, period) for name, values in table.items()}
+
+
+def on_cycles(t: Array, values: Array, period: float) -> Array:
+    """What is asked for at the start of each cycle, when `values` are asked for at the times `t` (s, increasing).
+
+    Rows at that period are taken as they are. Else rows up to 1 ms apart, the bench's own cycle, are samples that hold
+    until the next: a step stays a step. Rows further apart are breakpoints, joined by straight lines. The last row
+    lasts as long as the one before it, if these are samples, or one cycle.
+    """
+    gaps = np.diff(t)
+    held = gaps <= (1 + SLACK) / RATE
+    tail = gaps[-1] if len(gaps) and held[-1] else period
+    cycles = max(1, ceil((t[-1] - t[0] + tail) / period - SLACK))
+    grid = t[0] + np.arange(cycles) * period
+    row = np.searchsorted(t, grid + SLACK * min(period, 1 / RATE), side="right") - 1
+    lines = np.interp(grid, t, values)
+    samples: Array = np.where(np.append(held, True)[row] | (np.abs(grid - t[row]) < SLACK * period), values[row], lines)
+    return samples
 
 
 def _rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:

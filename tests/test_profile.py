@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError
-from plant.profile import build, parse_columns, read_command
+from plant.profile import build, on_cycles, parse_columns, read_command
 from plant.segments import KINDS, Chirp, Csv, Hold, Multisine, Points, Ramp, Segment, Sine, Step
 
 PRACTICE = Path(__file__).parents[2] / "shared/practice/00/est.csv.gz"
@@ -83,6 +83,31 @@ def test_csv_files_are_read_resampled_and_shifted_to_their_first_row() -> None:
     assert exact.keys() == {"com"} and exact["com"].tolist() == [0.0, 1e-3, 2e-3]
     coarse = parse_columns(gzip.compress(b"t,value\n0,0\n0.004,4\n"), "c.csv.gz")
     np.testing.assert_allclose(coarse["value"], [0, 1, 2, 3, 4])
+
+
+RAMP = 0.5 * np.arange(40) / 1000  # 0.5 m/s in rows of 1 ms
+STEP = np.r_[np.zeros(21), np.ones(19)]
+
+
+@pytest.mark.parametrize(("period", "cycles"), [(0.0005, 80), (0.001, 40), (0.0015, 27), (0.002, 20), (0.004, 10)])
+def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycles: int) -> None:
+    t = 3.0 + np.arange(40) / 1000
+    ramp, step = on_cycles(t, RAMP, period), on_cycles(t, STEP, period)
+    at = np.arange(cycles) * period
+    np.testing.assert_allclose(ramp, 0.5 * np.floor(at * 1000 + 1e-6) / 1000, atol=1e-15)
+    assert step.tolist() == [float(x > 0.0209) for x in at]  # nothing between 0 and 1
+
+
+@pytest.mark.parametrize("period", [0.0005, 0.002, 0.01])
+def test_rows_at_the_models_period_are_taken_as_they_are(period: float) -> None:
+    values = np.random.default_rng(0).standard_normal(1001)
+    assert (on_cycles(np.round(7.0 + np.arange(1001) * period, 6), values, period) == values).all()
+
+
+def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle() -> None:
+    assert on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.002).tolist() == [0, 2, 4]
+    assert on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.001).tolist() == [0, 1, 2, 3, 4, 9]
+    assert on_cycles(np.array([5.0]), np.array([3.0]), 0.002).tolist() == [3.0]
 
 
 def test_read_command_gives_the_load_only_if_there_is_one(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     options.add_model(parser)
     parser.add_argument("--command", dest="command_file", metavar="FILE",
-                        help="CSV with t,com and optionally load; default: the main phase of preflight")
+                        help="CSV with t,com and optionally load; default: the main phase of preflight. Of rows up to "
+                             "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
     parser.add_argument("--steps", type=options.whole, default=None, metavar="N",
                         help="plant steps a cycle (default 100)")
 
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from plant.model import STEPS
 
     model = options.model_of(args)
-    com, load, name = _command(args.command_file)
+    com, load, name = _command(args.command_file, model["controller.period"])
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
@@ -54,14 +55,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _command(file: str | None) -> tuple[Any, Any, str]:
-    """Demand and load of every cycle, and what to call them."""
-    from plant.profile import read_command
+def _command(file: str | None, period: float) -> tuple[Any, Any, str]:
+    """Demand and load of every cycle of `period` s, and what to call them."""
+    import numpy as np
+
+    from plant.profile import on_cycles, read_command
+    from plant.segments import RATE
 
     if file is not None:
-        com, load = read_command(file)
+        com, load = read_command(file, period)
         return com, load, file
     from rig.sequences import load_sequence
 
     sequence = load_sequence("preflight")
-    return sequence.main_profile().command, sequence.load_profile(), "preflight"
+    command, force = sequence.main_profile().command, sequence.load_profile()
+    t = np.arange(len(command)) / RATE  # the bench's cycles
+    return on_cycles(t, command, period), on_cycles(t, force, period), "preflight"
