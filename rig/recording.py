@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from fdi.output import writable
 from fdi.sections import Section
-from fdi.trace import Check, Trace
+from fdi.trace import MAIN, Check, Trace
+from fdi.verdict import verdict
 from plant.errors import RigError
 from rig.sequences.units import IN_SI
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 TIMELINE = "run"
 COMMAND, MEASURED, LIMIT, PASS, FAIL, NEUTRAL = 0xC9CFD6FF, 0x3D8FE0FF, 0xE5534BFF, 0x3FA65AFF, 0xE5534BFF, 0x6B7785FF
+VERDICTS = {"PASS": PASS, "FAIL": FAIL, "ABORTED": FAIL, "INVALID_TIMING": 0xD9A441FF}
 STATES = {"operational": PASS, "pre-operational": 0xD9A441FF, "stopped": FAIL, "boot-up": NEUTRAL}
 
 
@@ -53,6 +55,8 @@ PLOTS = (
                                          Line("work", "bench's own work [us]", 0x8C7AE6FF, 1.0))),
 )
 SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
+LANES, TEXTS = "Verdict, phase, NMT states, checks", "Events and checks"  # titles of the views that are no plots
+LANE_HEIGHT, SCREEN = 0.039, (0.5, 0.78)  # a lane's and all lanes' least and most part of the window's height
 SHOWN_IN = {"xj": ("position", 1e3), "com": ("position", 1e3), "error": ("error", 1e6), "cor": ("current", 1e3),
             "p12": ("pressure", 1e-6), "xs": ("spool", 1e6)}  # signal -> plot, scale from SI
 LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
@@ -130,12 +134,15 @@ def _limits(rr: Any, stream: rr.RecordingStream, checks: tuple[Check, ...]) -> N
         level = check.high * IN_SI.get(check.unit, ("", 1.0))[1] * shown
         if origin and not math.isnan(level):  # both kinds judge the size of the signal
             for name, sign in (("high", 1.0), ("low", -1.0)):
-                _send(rr, stream, f"{origin}/limit_{number}_{name}", f"limit: {check.name}", LIMIT, 1.0,
+                _send(rr, stream, f"{origin}/limit_{number}_{name}", f"limit: {check.name}", LIMIT, 1.5,
                       np.array([check.t0, check.t1]), sign * np.array([level, level]))
 
 
 def _states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
-    """Lanes: phase, sections of the command, each node's NMT state, each check over its window."""
+    """Lanes: verdict, phase, sections of the command, each node's NMT state, each check over its window."""
+    result, first = verdict(trace), float(trace.t[0])
+    if result.word in VERDICTS:
+        _lane(rr, stream, "0 verdict", [(first, str(result))], {str(result): VERDICTS[result.word]})
     names = np.array(["set-up", "main", "clean-up"])
     turns = np.flatnonzero(np.diff(trace.phase, prepend=-1))
     _lane(rr, stream, "1 phase", [(float(trace.t[k]), str(names[trace.phase[k]])) for k in turns],
@@ -145,11 +152,21 @@ def _states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
           {text: SECTIONS[kind] for _, kind, text in sections})
     for node in sorted({state.node for state in trace.nmt}):
         _lane(rr, stream, f"3 node {node} NMT", [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
-    end = float(trace.t[-1])
-    for check in trace.checks:
-        start, stop = (float(trace.t[0]), end) if math.isnan(check.t0) else (check.t0, check.t1)
-        word = f"{'PASS' if check.passed else 'FAIL'} {_quantity(check.value, check.unit)}"
-        _lane(rr, stream, f"4 {check.name}", [(start, word), (stop, "")], {word: PASS if check.passed else FAIL})
+    for number, check in enumerate(trace.checks, 1):
+        _check_lane(rr, stream, number, check, trace)
+
+
+def _check_lane(rr: Any, stream: rr.RecordingStream, number: int, check: Check, trace: Trace) -> None:
+    """In the sequence's order, the failed ones first; grey is a window that the run did not reach."""
+    unreached = math.isnan(check.t0) and math.isnan(check.value)
+    main = trace.t[trace.phase == MAIN]
+    whole = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (float(trace.t[0]), float(trace.t[-1]))
+    start, stop = whole if math.isnan(check.t0) else (check.t0, check.t1)
+    word = f"{'PASS' if check.passed else 'FAIL'} {_value(check)}"
+    if math.isnan(check.value) and check.detail:
+        word += f": {check.detail}"
+    _lane(rr, stream, f"{5 if check.passed else 4}.{number:02} {check.name}", [(start, word), (stop, "")],
+          {word: PASS if check.passed else NEUTRAL if unreached else FAIL})
 
 
 def _asked(section: Section) -> str:
@@ -172,11 +189,13 @@ def _lane(rr: Any, stream: rr.RecordingStream, name: str, states: list[tuple[flo
 def _measured(check: Check) -> str:
     limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
                           if not math.isnan(limit))
-    return _quantity(check.value, check.unit) + (f" (limit {limits})" if limits else "")
+    return _value(check) + (f" (limit {limits})" if limits else "")
 
 
-def _quantity(value: float, unit: str) -> str:
-    return f"{value:.4g}" + ("" if unit in ("", "1") else f" {unit}")
+def _value(check: Check) -> str:
+    if math.isnan(check.value):
+        return "not measured"
+    return f"{check.value:.4g}" + ("" if check.unit in ("", "1") else f" {check.unit}")
 
 
 def _texts(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
@@ -213,12 +232,14 @@ def _blueprint(rr: Any, trace: Trace) -> Any:
     half = (len(plots) + 1) // 2
     columns = rrb.TextLogColumns(timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
                                  text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")])
-    texts = rrb.Tabs(rrb.TextLogView(contents=["/log/events", "/log/checks"], name="Events and checks",
+    texts = rrb.Tabs(rrb.TextLogView(contents=["/log/events", "/log/checks"], name=TEXTS,
                                      columns=columns),
                      rrb.TextDocumentView(origin="/log/provenance", name="Provenance"))
-    states = rrb.StateTimelineView(origin="/states", name="Phase, NMT states, checks", time_view=linked)
+    states = rrb.StateTimelineView(origin="/states", name=LANES, time_view=linked)
+    lanes = 5 + len({state.node for state in trace.nmt}) + len(trace.checks)  # 5: three more, a time axis and a title
+    share = min(max(LANE_HEIGHT * lanes, SCREEN[0]), SCREEN[1])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*plots[:half]), rrb.Vertical(*plots[half:]),
-                       rrb.Vertical(states, texts, row_shares=[3, 2])),
+                       rrb.Vertical(states, texts, row_shares=[share, 1 - share])),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused"),
         rrb.BlueprintPanel(state="hidden"), rrb.SelectionPanel(state="hidden"))

@@ -13,12 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi.trace import Trace
-from rig.recording import PLOTS, ViewerError, lines, rerun
+from rig.recording import LANES, LIMIT, PASS, PLOTS, SECTIONS, STATES, TEXTS, VERDICTS, ViewerError, lines, rerun
 
 SEEN = 500  # pixels; the marks in a legend have some 60 each
-FADING = 5.0  # s; the viewer's own greeting covers a corner for that long
+WORD = 40  # pixels; one level in the list of events has some 60
+FADING = 7.0  # s; the viewer's own greeting covers a corner for that long
+DIMMED = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
+LEVELS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
+LIMITS = "limits"
 
 
 def open_viewer(rrd: Path) -> None:
@@ -33,10 +38,11 @@ def open_viewer(rrd: Path) -> None:
 
 
 def screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
-    """Draw `rrd`, made of `trace`, without a display and save the picture; -> pixels of the lines of each view.
+    """Draw `rrd`, made of `trace`, without a display and save the picture; -> pixels of what each view is to show.
 
     Needs a Vulkan driver, lavapipe will do (Debian: mesa-vulkan-drivers libvulkan1). Raises ViewerError when the viewer
-    does not come up within `patience` s, when a view reports a warning or an error, and when one shows no line.
+    does not come up within `patience` s, when a view reports a warning or an error, and when one shows no line, no
+    lane or no text. The lines of limits are counted, but one may well lie behind its signal.
     """
     rerun()
     views = _draw(rrd, image, patience)
@@ -44,26 +50,35 @@ def screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> 
     if wrong:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
     pixels = _pixels(trace, image)
-    empty = [title for title, count in pixels.items() if count < SEEN]
+    empty = [title for title, count in pixels.items() if count < {TEXTS: WORD, LIMITS: 0}.get(title, SEEN)]
     if empty:
-        raise ViewerError(f"{image}: views in which no line is to be seen: {', '.join(empty)}")
+        raise ViewerError(f"{image}: views in which nothing is to be seen: {', '.join(empty)}")
     return pixels
 
 
 def _pixels(trace: Trace, image: Path) -> dict[str, int]:
-    """View -> how many pixels have the colour of one of its lines."""
+    """View -> how many pixels have the colour of one of its lines, lanes or words."""
     from matplotlib.image import imread
 
     shades = (imread(str(image))[..., :3] * 255).astype(int)
     there = lines(trace)
     out: dict[str, int] = {}
     for plot in PLOTS:
-        for line in plot.lines:
-            if f"{plot.origin}/{line.path}" in there:
-                colour = np.array([line.colour >> shift & 0xFF for shift in (24, 16, 8)])
-                seen = int((np.abs(shades - colour).max(axis=2) < 24).sum())
-                out[plot.title] = out.get(plot.title, 0) + seen
+        colours = [line.colour for line in plot.lines if f"{plot.origin}/{line.path}" in there]
+        if colours:
+            out[plot.title] = sum(_count(shades, colour) for colour in colours)
+    out[LANES] = sum(_count(shades, colour, DIMMED, 6) for colour in
+                     {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()})
+    if trace.events or trace.checks:
+        out[TEXTS] = sum(_count(shades, colour) for colour in LEVELS)
+    out[LIMITS] = _count(shades, LIMIT)
     return out
+
+
+def _count(shades: NDArray[np.int64], colour: int, weight: float = 1.0, off: int = 24) -> int:
+    """Pixels whose channels are all within `off` of a colour."""
+    wanted = weight * np.array([colour >> shift & 0xFF for shift in (24, 16, 8)])
+    return int((np.abs(shades - wanted).max(axis=2) < off).sum())
 
 
 def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
