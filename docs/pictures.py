@@ -6,6 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image  # comes with matplotlib
+
 from fdi import Trace, figures
 
 HERE = Path(__file__).parent
@@ -19,7 +21,9 @@ def main() -> None:
         (HERE / "preflight.svg").write_text(figures.signals(Trace.read(folder)), encoding="utf-8")
         picture = Path(folder, "viewer.png")
         subprocess.run([*RIG, "view", folder, "--headless", "--screenshot", str(picture)], check=True)
-        (HERE / "viewer.png").write_bytes(picture.read_bytes())
+        with Image.open(picture) as image:  # a palette does for a user interface, at a quarter of the size
+            small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+            small.save(HERE / "viewer.png", optimize=True)
 
 
 if __name__ == "__main__":
