@@ -15,6 +15,7 @@ from plant.segments import Chirp, Hold, Ramp, Sine
 from rig import cli
 from rig.bench import accuracy
 
+ROOT = Path(__file__).parent.parent
 GENTLE = build((Hold(time=0.05), Ramp(to=1e-3, time=1.0), Sine(amplitude=3e-3, frequency=1.0, time=1.0),
                 Chirp(amplitude=0.5e-3, f0=1.0, f1=20.0, fade=20.0, time=2.0))).command  # nothing saturates
 
@@ -107,6 +108,20 @@ def test_replay_with_friction_against_an_explicit_scheme(friction: float) -> Non
     assert rms(np.diff(run.xj) - np.diff(truth[0])) < 0.01e-6
 
 
+@pytest.mark.parametrize(("law", "exponent"), [("sqrt", 0.5), ("linear", 1.0), ("pressure", 0.0)])
+def test_filter_laws_against_an_explicit_scheme(law: str, exponent: float) -> None:
+    """The reference knows "sqrt" alone: the rest of the power is put into its flow gain. The page has the figures."""
+    clogged = {"filter.clogging": 0.35, "filter.law": law}
+    values = SILENT.replace({"filter.clogging": 0.35, "pilot.flow_gain": 0.069 * 0.65 ** (exponent - 0.5)}).values
+    truth = rms(explicit(values, PREFLIGHT)[0] - explicit(SILENT.values, PREFLIGHT)[0])
+    pairs = ((m.replace(clogged), m) for m in (SILENT, SMOOTH))
+    ours, smooth = (rms(simulate(a, PREFLIGHT).xj - simulate(b, PREFLIGHT).xj) for a, b in pairs)
+    assert ours == pytest.approx(truth, abs=0.3e-6)
+    line = next(line for line in (ROOT / "docs/accuracy.md").read_text().splitlines() if line.startswith(f"| {law} |"))
+    cells = line.split("|")
+    assert [float(cells[i]) for i in (2, 3, 5)] == pytest.approx([x * 1e6 for x in (ours, truth, smooth)], abs=0.3)
+
+
 def test_loads_against_an_explicit_scheme() -> None:
     n = np.arange(1500)
     load = 4000.0 * np.sin(2 * np.pi * 3e-3 * n) + 2000.0 * (n > 700)
@@ -137,7 +152,7 @@ def test_finer_steps_are_better(table: list) -> None:
 
 def test_the_page_says_what_is_measured(table: list) -> None:
     """docs/accuracy.md holds the numbers of `rig bench --accuracy`, not older ones."""
-    page = (Path(__file__).parent.parent / "docs/accuracy.md").read_text()
+    page = (ROOT / "docs/accuracy.md").read_text()
     for row in table:
         line = next(line for line in page.splitlines() if line.startswith(f"| {1000 / row.steps:g} |"))
         said = [float(cell) for cell in line.split("|")[3:7]]
