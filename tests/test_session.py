@@ -229,8 +229,8 @@ def test_a_law_that_cannot_be_compiled_is_bad_input(tmp_path: Path, monkeypatch:
 
 def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
     """White noise does not compress: said before a word is sent, and not as "out of memory"."""
-    rows = "\n".join(f"{k / 1000:.3f},{value:.3f}" for k, value in enumerate(np.random.default_rng(0).normal(
-        0.0, 1e6, 250_000)))
+    rows = "\n".join(f"{k / 1000:.3f},{value:.3f}" for k, value in enumerate(np.random.default_rng(0).uniform(
+        -1e6, 1e6, 250_000)))
     text = 'title = "x"\nmain = [{ kind = "hold", time = 250 }]\nload = [{ kind = "csv", file = "x.csv" }]'
     sequence = parse_sequence(text, "x.toml", lambda name: f"t,value\n{rows}\n".encode())
     with pytest.raises(InputError, match="KiB compressed"):
