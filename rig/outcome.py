@@ -52,13 +52,20 @@ class Outcome:
         return failed if self.safe or not meant else [*failed, "the run was to end in the safe state"]
 
     @property
+    def why(self) -> str:
+        """The reason of a verdict other than PASS, in words."""
+        return {"FAIL": ", ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING":
+                f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
+                f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller"}.get(self.verdict, "")
+
+    @property
     def status(self) -> int:
         """Exit status of `rig run`."""
         return INTERRUPTED if self.interrupted else STATUS[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
         """As interface and verdict.json have it; a number that is not there is null."""
-        return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.aborted,
+        return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 "events": [_plain(event._asdict()) for event in self.events],

@@ -21,8 +21,6 @@ from rig.outcome import Outcome
 
 EVENTS = 12  # shown in the terminal
 COLOURS = {"PASS": "green", "FAIL": "red", "ABORTED": "red", "INVALID_TIMING": "yellow"}
-MEANING = {"PASS": "every check passed",
-           "INVALID_TIMING": "the bench itself was too late too often: nothing can be said of the controller"}
 
 
 @contextlib.contextmanager
@@ -120,7 +118,7 @@ def outcome(o: Outcome) -> None:
     if len(notable) > EVENTS:
         out.print(f"            and {len(notable) - EVENTS} more in the report")
     out.print(f"results   {escape(str(o.folder))}/ trace.mcap, verdict.json, report.html")
-    words = {"FAIL": ", ".join(o.failures), "ABORTED": o.aborted}.get(o.verdict) or MEANING[o.verdict]
+    words = o.why or "every check passed"
     out.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {escape(words)}", soft_wrap=True)
 
 

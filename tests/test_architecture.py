@@ -7,6 +7,7 @@ import importlib
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
@@ -220,6 +221,17 @@ def test_each_dependency_is_explained() -> None:
     named = {re.split("[<>=]", line)[0] for line in requirements()}
     explained = set(re.findall(r"^\s*[-*] `([a-z0-9-]+)`: .+\(.+\)", text, re.MULTILINE))
     assert explained == named
+
+
+def test_each_import_is_declared() -> None:
+    """What another package happens to bring along today may be gone tomorrow."""
+    distributions = {"can": "python-can", "mcap_protobuf": "mcap-protobuf-support", "google": "protobuf",
+                     "rerun": "rerun-sdk", "llvmlite": "numba"}  # numba pins llvmlite itself
+    named = {re.split("[<>=]", line)[0] for line in requirements()}
+    for path in MODULES:
+        for module in {module.partition(".")[0] for module in imported(path)}:
+            known = module in sys.stdlib_module_names or module in PACKAGES
+            assert known or distributions.get(module, module) in named, f"{name(path)} imports {module}"
 
 
 def test_each_dependency_is_used() -> None:
