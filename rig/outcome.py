@@ -54,9 +54,10 @@ class Outcome:
     @property
     def why(self) -> str:
         """The reason of a verdict other than PASS, in words."""
-        return {"FAIL": ", ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING":
-                f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
-                f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller"}.get(self.verdict, "")
+        late = (f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
+                f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller")
+        words = {"FAIL": ", ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
+        return words.get(self.verdict, "")
 
     @property
     def status(self) -> int:
