@@ -151,7 +151,22 @@ def _error(e: Array) -> tuple[float, float]:
     return float(np.sqrt((e**2).mean())) * MICRO, float(np.abs(e).max()) * MICRO
 
 
+def lockstep() -> float:
+    """A whole preflight run on the embedded bus, log and all, as a multiple of real time; the best of three."""
+    from rig.job import Job
+    from rig.runner import run
+    from rig.sequences import load_sequence
+
+    job = Job(sequence=load_sequence("preflight"), model=Model())
+    speeds = []
+    for _ in range(3):
+        with tempfile.TemporaryDirectory() as folder:
+            speeds.append(run(job, Path(folder), lambda what, done, total: None, lambda: False).speed)
+    return max(speeds)
+
+
 def report(command: Array) -> dict[str, Any]:
     """Everything about cost as one JSON object; `step` is None without gcc."""
     cost = step_vs_c(command)
-    return {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost()}
+    return {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
+            "lockstep": lockstep()}

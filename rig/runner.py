@@ -7,12 +7,10 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from plant import Actuator, InputError
-from plant.segments import Array
+from plant import Actuator, Columns, InputError
 from rig.clock import WallClock
 from rig.codec import Flags
 from rig.crew import crew
@@ -24,18 +22,6 @@ from rig.recorder import Check, Recorder
 from rig.recorder.provenance import provenance
 from rig.sequences.checks import CheckResult, evaluate
 from rig.session import MAIN, Progress, Session
-
-
-class Columns(NamedTuple):
-    """Main as checks see it; each (n,) SI."""
-
-    t: Array
-    com: Array
-    xj: Array
-    cor: Array
-    p12: Array
-    xs: Array
-    load: Array
 
 
 def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:

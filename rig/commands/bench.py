@@ -65,7 +65,8 @@ def _costs(answer: dict[str, Any]) -> list[tuple[str, ...]]:
     """Rows of the table: what, cost, ratio, how far the results are apart."""
     step = answer["step"]
     rows: list[tuple[str, ...]] = [("preflight, simulated", f"{answer['times_real_time']:.0f} x real time"),
-                                   ("cycle of Actuator from Python", f"{answer['cycle'] * 1e6:.1f} us")]
+                                   ("cycle of Actuator from Python", f"{answer['cycle'] * 1e6:.1f} us"),
+                                   ("preflight on the embedded bus", f"{answer['lockstep']:.1f} x real time")]
     if step is None:
         return rows
     same = "equal bit for bit" if step["identical"] else "NOT equal"
