@@ -17,7 +17,7 @@ RIG = [sys.executable, "-m", "rig.cli"]
 def main() -> None:
     """One preflight run, drawn by the report's own figure and by the viewer."""
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([*RIG, "run", "preflight", "--seed", "1", "--quiet", "--out", folder], check=True)
+        subprocess.run([*RIG, "run", "preflight", "--quiet", "--out", folder], check=True)
         (HERE / "preflight.svg").write_text(figures.signals(Trace.read(folder)), encoding="utf-8")
         picture = Path(folder, "viewer.png")
         subprocess.run([*RIG, "view", folder, "--headless", "--screenshot", str(picture)], check=True)

@@ -1,6 +1,7 @@
 """The plant as programs use it: one cycle at a time (`Actuator`), or a whole command at once (`simulate`)."""
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, cast
@@ -8,6 +9,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import packers, values
 from plant.model import STEPS, Model, kernel
@@ -79,9 +81,23 @@ def _laws(model: Model) -> Iterator[None]:
     except Exception as error:
         if not model.effects:
             raise
-        said = next((line.strip() for line in reversed(str(error).splitlines()) if line.strip()), "")
-        raise InputError("effects", ", ".join(model.effects),
-                         f"laws that can be compiled and run ({type(error).__name__}: {said})") from error
+        where, cause = _in_plain_python(model) or ("effects", error)
+        said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
+        raise InputError(where, ", ".join(model.effects),
+                         f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
+
+
+def _in_plain_python(model: Model) -> tuple[str, Exception] | None:
+    """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
+    laws = [CATALOGUE[name].function for name in model.effects]
+    files = {law.__code__.co_filename for law in laws if law is not None}
+    try:
+        step = kernel("cycle", model.effects, fast=False)
+        step(model.state(), 0.0, 0.0, 0.0, 0.0, model.record(), 1)
+    except Exception as error:
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
+        return (f"{frames[-1].filename}:{frames[-1].lineno}", error) if frames else None
+    return None
 
 
 class Actuator:

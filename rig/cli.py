@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import importlib
 import os
 import pkgutil
@@ -63,12 +64,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _complain(args, "interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of a pipe has gone: nothing to say, and nobody to say it to
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _speak_no_more()
         return status
-    except Exception:  # a bug of ours: Python's own exit status 1 would read as a failed check
-        traceback.print_exc()
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _speak_no_more()
+            return _complain(args, f"no space left for the answer or the results ({error.strerror})", 2)
+        traceback.print_exc()  # a bug of ours: Python's own exit status 1 would read as a failed check
         return INTERNAL
+
+
+def _speak_no_more() -> None:
+    """Standard output leads nowhere any more; what is still in its buffer must not end the program in an error."""
+    with contextlib.suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _complain(args: argparse.Namespace, message: str, status: int) -> int:

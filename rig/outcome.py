@@ -56,7 +56,7 @@ class Outcome:
         """The reason of a verdict other than PASS, in words."""
         late = (f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
                 f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller")
-        words = {"FAIL": ", ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
+        words = {"FAIL": "; ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
         return words.get(self.verdict, "")
 
     @property

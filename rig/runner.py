@@ -54,7 +54,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
             interrupted=session.interrupted, timing=timing(history, loop.overruns, scheduled),
             counters=_counters(history), speed=len(history) * job.period_ns * 1e-9 / spent)
-        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or ", ".join(outcome.failures),
+        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
                                       "overruns": str(loop.overruns)})
     (folder / "verdict.json").write_text(json.dumps(outcome.to_json(), indent=1) + "\n", encoding="utf-8")
     return outcome

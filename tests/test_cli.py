@@ -13,6 +13,7 @@ from command import finished, grown, rig, started
 from plays import SHORT
 
 from fdi.trace import CLEANUP, Trace
+from plant.effects import CATALOGUE
 from rig.cli import command_modules
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
@@ -41,7 +42,17 @@ def test_version() -> None:
     assert rig("--version").out.startswith("eha-rig ")
 
 
+SLIP = """from typing import Annotated, NamedTuple
+from plant.effects import effect
+from plant.quantity import Quantity
+class Slip(NamedTuple):
+    size: Annotated[float, Quantity("N")] = 0.0
+@effect("load", Slip, law="")
+def slip(x, s, u, p):
+    return x + p.slip.size * s.jack_velocity
+"""
 FILES = {
+    "slip.py": SLIP,
     "notes.toml": "to be done", "empty.py": "", "raises.py": "1 / 0", "nocom.csv": "t,x\n0,1\n",
     "wrong.toml": 'title = "x"\nmain = [\n  { kind = "hold", tme = 1.0 },\n]\n',
     "type.toml": 'title = "x"\nmain = [{ kind = "hold", time = "long" }]\n',
@@ -91,6 +102,7 @@ BAD = {
     "simulate to somewhere": (["simulate", "--out", "x.xlsx"], ".mcap"),
     "simulate to nowhere": (["simulate", "--out", "none/x.csv"], "none/x.csv"),
     "no steps": (["simulate", "--steps", "0"], "at least 1"),
+    "a law with a slip": (["simulate", "--effects", "slip.py", "--set", "slip.size=1"], "slip.py:8: slip: "),
     "unknown effect": (["effects", "gremlins"], "gremlins"),
     "effects to nowhere": (["effects", "--out", "none/x.json"], "none/x.json"),
     "doctor to nowhere": (["doctor", "--seconds", "0", "--out", "none/x.json"], "none/x.json"),
@@ -126,6 +138,7 @@ def test_bad_input_is_told_in_one_line(what: str, tmp_path: Path, monkeypatch: p
         written(tmp_path / name, text)
     words, hint = BAD[what]
     said = rig(*words)
+    CATALOGUE.pop("slip", None)
     assert (said.status, said.out) == (2, ""), said
     assert len(said.err.splitlines()) == 1 and said.err.startswith("rig") and hint in said.err, said.err
     assert "Traceback" not in said.err

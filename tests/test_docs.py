@@ -11,6 +11,7 @@ import pytest
 
 from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, load_effects
+from plant.state import Input, Ports, State
 from rig import cli
 from rig.sequences import checks, faults
 from rig.sequences.guards import Guard
@@ -57,6 +58,25 @@ def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
         assert np.abs(plain - cogged).max() > 1e-6
     finally:
         CATALOGUE.pop("cogging", None)
+
+
+def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "effects.md").read_text()
+    found = re.findall(r"(?:^    .*\n|^\n(?=    ))+", text, re.MULTILINE)
+    code = re.sub(r"^    ", "", "\n".join(found), flags=re.MULTILINE)
+    (tmp_path / "manual.py").write_text(code)
+    try:
+        assert load_effects(tmp_path / "manual.py") == ["seal_drag", "rod_play"]
+        command = np.full(100, 1e-3)
+        plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
+        assert np.abs(plain - loose).max() > 1e-5
+        for port in Ports._fields:
+            assert f"| `{port}` |" in text
+        for field in (*State._fields[:-1], *Input._fields):
+            assert f"`{field}`" in text
+    finally:
+        for name in ("seal_drag", "rod_play"):
+            CATALOGUE.pop(name, None)
 
 
 def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:

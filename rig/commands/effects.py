@@ -67,7 +67,7 @@ def table(chosen: list[Effect]) -> None:
 
     t = Table(box=None, pad_edge=False, title_justify="left")
     for column in ("effect", "acts on", "parameters", "what tells it apart"):
-        t.add_column(column, overflow="fold")
+        t.add_column(column, overflow="fold", no_wrap=column == "parameters")  # names that one has to type
     for e in chosen:
         names = "\n".join(f"{name} [dim]{q.unit}[/]" for name, q in e.parameters.items())
         t.add_row(f"[bold]{e.name}[/]", e.port or "[dim]reference model[/]", names, e.symptoms)
