@@ -19,6 +19,7 @@ STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
     "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
 SHORTEST = 0.1  # us, the left end of a histogram; no clock here tells less
 COLUMNS = 1400  # a line is drawn by its extremes in this many columns; more cannot be seen
@@ -50,6 +51,11 @@ def signals(trace: Trace) -> str:
             if name == "close":
                 ax.set_ylim(-calm * scale, calm * scale)
             _sections(ax, trace)
+            for fault, t0, t1 in faults(trace):
+                ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
+                if ax is axes[0]:
+                    foot = ax.get_xaxis_transform()
+                    ax.text(t0, 0.03, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
         if trace.checks:
             _windows(axes[-1], trace)
@@ -57,6 +63,19 @@ def signals(trace: Trace) -> str:
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
         figure.align_ylabels()
         return _svg(figure, "signals")
+
+
+def faults(trace: Trace) -> list[tuple[str, float, float]]:
+    """The faults that the run injected: name, begin and end in s; one that is never over ends with the trace."""
+    begun: dict[str, float] = {}
+    spans = []
+    for event in trace.events:
+        name, _, word = event.text.rpartition(" ")
+        if event.kind == "fault" and word == "begins":
+            begun[name] = event.t
+        elif event.kind == "fault" and name in begun:
+            spans.append((name, begun.pop(name), event.t))
+    return spans + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
 
 
 def timing(trace: Trace) -> str:

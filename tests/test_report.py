@@ -18,7 +18,7 @@ from synthetic import record
 
 from fdi import figures
 from fdi.report import render, write_report
-from fdi.trace import Trace
+from fdi.trace import Event, Trace
 from fdi.verdict import verdict
 from plant.errors import InputError
 from rig.recorder import Check, Recorder, Signals, Timing
@@ -206,3 +206,12 @@ def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
     for name, _, _, colour in figures.PANELS[:4]:
         wanted = np.array([int(colour[i:i + 2], 16) for i in (1, 3, 5)])
         assert (np.abs(shades - wanted).max(axis=2) < 30).sum() > 500, name
+
+
+def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
+    trace = Trace.read(preflight)
+    events = (Event(1.0, "WARN", "fault", "lost drive begins"), Event(2.5, "INFO", "fault", "lost drive ends"),
+              Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
+    faulty = replace(trace, events=events)
+    assert figures.faults(faulty) == [("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
+    assert "lost drive" in render(faulty) and figures.signals(faulty) != figures.signals(trace)
