@@ -1,4 +1,4 @@
-"""Where a result is to go: asked before the work is done, and before anything that lies there is lost."""
+"""Where a result is to go: asked before long work is done, and before anything that lies there is lost; or written."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -23,3 +23,15 @@ def writable(out: str | Path, field: str, *, source: str | Path | None = None) -
     if not there:
         path.unlink()
     return path
+
+
+def write_text(path: str | Path, text: str, option: str = "--out") -> None:
+    """Write a text file in UTF-8 where `option` says.
+
+    Raises:
+        InputError: a path that cannot be written.
+    """
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error

@@ -27,7 +27,6 @@ class History:
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
-        table = np.array(self._numbers).reshape(-1, len(_FIELDS))
-        kept = table if phase is None else table[table[:, 0] == phase]
-        column: Array = kept[:, _FIELDS.index(name)]
-        return column
+        table = np.frombuffer(self._numbers).reshape(-1, len(_FIELDS))
+        column: Array = table[:, _FIELDS.index(name)]
+        return column.copy() if phase is None else column[table[:, 0] == phase]  # no view: it would pin the buffer

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import dbc
@@ -45,8 +46,9 @@ class Job:
         """Length of a cycle, ns."""
         return round(self.model["controller.period"] * 1e9)
 
+    @cached_property
     def scenario(self) -> Scenario:
-        """What the plant is to be told."""
+        """What the plant is to be told; laid out once, for a long test has many cycles."""
         sequence = self.sequence
         return Scenario.of(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
 

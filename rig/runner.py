@@ -31,7 +31,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         RigError: bad input, a bus or node that is not there, or a log that cannot be written. The log is closed first.
     """
     if job.plant != "external":  # here, where a law that cannot be compiled can be told in words
-        Actuator(job.scenario().model).warm()
+        Actuator(job.scenario.model).warm()
     with taken(folder), crew(job) as wire, log(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
         progress("bring-up", 0, 0)

@@ -48,9 +48,9 @@ class Session:
 
     def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
         self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
-        self._plan = job.sequence.plan(job.seed)
         self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
-        self.scenario = job.scenario()
+        self.scenario = job.scenario
+        self._plan = self.scenario.plan
         self._faults = Schedule(self._plan, self.scenario.model.values)
         self._watch = Watch(job.sequence.guards)
         self.loop: Loop | None = None

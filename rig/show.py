@@ -43,7 +43,7 @@ def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, i
             if not told:  # not before there is a bus and a place for the results: an error is one line
                 told = True
                 console().print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
-                                                f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
+                                f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
             bar.update(task, description=what, completed=done, total=total or None)
             if errors.is_terminal and job.realtime and done % 1000 == 0:
                 sys.stderr.write(f"\r\033[K{what:<14} {100 * done // max(total, 1):3d} %" if total else "\r\033[K")

@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure the plant: ns a step beside the same step in C, speed of a run, cost of a cycle from Python."""
+    from fdi.output import write_text
     from rig import bench
-    from rig.files import write_text
     from rig.sequences import load_sequence
 
     command = load_sequence("preflight").main_profile().command

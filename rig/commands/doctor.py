@@ -24,8 +24,8 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 <= args.seconds <= 3600:
         raise InputError("--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
+    from fdi.output import write_text
     from rig import doctor
-    from rig.files import write_text
 
     findings = doctor.survey(args.seconds)
     blocked = [finding.name for finding in findings if finding.needed and finding.status == "missing"]

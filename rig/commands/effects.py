@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     rows = [describe(e) for e in chosen]
     text = json.dumps({"effects": rows}, indent=None if args.json else 1)
     if args.out:
-        from rig.files import write_text
+        from fdi.output import write_text
 
         write_text(args.out, text + "\n")
     if args.json:
