@@ -161,8 +161,13 @@ def kernel(name: str, effects: tuple[str, ...], fast: bool = True) -> Function:
 
 @cache
 def _kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool) -> Function:
+    return (compiled if fast else interpreted)(getattr(solve, name), bindings(effects))
+
+
+def bindings(effects: tuple[str, ...]) -> dict[str, Function]:
+    """What stands for the port functions, and for the packing of the state, in a model with `effects`."""
     ports = {f"at_{port}": at(port, effects)[0] for port in Ports._fields}
     ports["pack"], ports["unpack"] = flat.packers(initial(effects))
     if any(CATALOGUE[e].port == "supply" for e in effects):
         ports["supplied"] = step_module.changing_supply
-    return (compiled if fast else interpreted)(getattr(solve, name), ports)
+    return ports

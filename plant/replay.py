@@ -1,0 +1,67 @@
+"""One run of the plant from a measured current, without its controller: what a fit repeats with other parameters."""
+from __future__ import annotations
+
+from typing import Any
+
+from plant.compile import Function
+from plant.ports import at_position
+from plant.solve import cycle
+from plant.state import Input, Ports, State
+
+SETTLING = 50  # cycles, twice, that the transducer rests where the ram starts
+
+
+def _with(*paths: str) -> Function:
+    """`(s, ...)`: `s` with the numbers at `paths` replaced. Written out, as compiled code knows no _replace."""
+    ports = ", ".join(f"memory_{f}" if f"memory.{f}" in paths else f"s.memory.{f}" for f in Ports._fields)
+    fields = [f"Ports({ports})" if f == "memory" else f if f in paths else f"s.{f}" for f in State._fields]
+    made: dict[str, Any] = {"State": State, "Ports": Ports}
+    names = ", ".join(path.replace(".", "_") for path in paths)
+    exec(f"def replaced(s, {names}):\n    return State({', '.join(fields)})", made)
+    return made["replaced"]
+
+
+moved = _with("jack_position")
+showing = _with("sensed", "memory.position")
+
+
+def shown(s: State, p: Any) -> Any:
+    """`s` with what its transducer shows before the first step."""
+    u = Input(0.0, 0.0, 0.0, 0.0, 0.0, 1e-5)
+    return showing(s, at_position(s.jack_position, s.memory.position, s, u, p)[0], s.memory.position)
+
+
+def rested(s: State, x: float, p: Any, steps: int) -> Any:
+    """`s` at rest where its transducer shows `x` m: a lag has caught up, an offset or a gain is made up for."""
+    u = Input(0.0, 0.0, 0.0, 0.0, 0.0, p.controller.period / steps)
+    sensed = 0.0
+    for _ in range(2):
+        s = moved(s, s.jack_position + (x - sensed))
+        for _ in range(SETTLING * steps):
+            sensed, m = at_position(s.jack_position, s.memory.position, s, u, p)
+            s = showing(s, sensed, m)
+    return s
+
+
+def replay(s: State, current: Any, load: Any, position: Any, anchor: float, record: Any, steps: int, out: Any) -> None:
+    """The plant driven by a measured current; fills out[k] = XJ as sensed, P12, XS at sample k, all without noise.
+
+    Args:
+        s: state at the start.
+        current: (n,) A; current[k - 1] acts from k to k + 1, none before.
+        load: (n,) N, external force against extension.
+        position: (n,) m, measured; NaN where missing; or (0,): the run starts as `s` is.
+        anchor: 1/s, how fast the ram is pulled to the measured position.
+        record: (1,) parameters of the model.
+        steps: steps a cycle.
+        out: (n, 3), written.
+    """
+    p = record[0]
+    pull = anchor * p.controller.period
+    s = rested(s, position[0], p, steps) if len(position) else shown(s, p)
+    for k in range(len(current)):
+        out[k, 0], out[k, 1], out[k, 2] = s.sensed, s.pressure, s.spool_position
+        if len(position) and pull != 0.0 and position[k] == position[k]:
+            s = moved(s, s.jack_position + pull * (position[k] - s.sensed))
+        acting = current[k - 1] if k else 0.0
+        s = cycle(s, acting, load[k], 0.0, k * p.controller.period, record, steps)
