@@ -168,6 +168,6 @@ def bindings(effects: tuple[str, ...]) -> dict[str, Function]:
     """What stands for the port functions, and for the packing of the state, in a model with `effects`."""
     ports = {f"at_{port}": at(port, effects)[0] for port in Ports._fields}
     ports["pack"], ports["unpack"] = flat.packers(initial(effects))
-    if any(CATALOGUE[e].port == "supply" for e in effects):
-        ports["supplied"] = step_module.changing_supply
+    if any(CATALOGUE[e].port in ("supply", "viscosity") for e in effects):
+        ports["oiled"] = step_module.changing_oil
     return ports

@@ -18,8 +18,8 @@ def through(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]
     return x, m
 
 
-at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
-at_valve = at_load = at_jack_drag = at_position = at_supply = through
+at_command = at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
+at_valve = at_load = at_jack_drag = at_position = at_reading = at_supply = at_viscosity = through
 
 
 def chain(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:

@@ -117,6 +117,9 @@ class Actuator:
         self._draws = draws(seed)
         self._noise = [0.0] * NOISES
         self._advance = kernel("advance", model.effects, fast)
+        # a reading that nothing changes is faster without a call of compiled code
+        changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
+        self._read = kernel("read", model.effects, fast) if changed else None
         self._period = model["controller.period"]
 
     @property
@@ -132,10 +135,15 @@ class Actuator:
         """
         with _laws(self.model):
             self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
+            if self._read:
+                self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)
 
     def sample(self) -> tuple[float, float, float]:
         """What the transducers read now: XJ m, P12 Pa, XS m. Once a cycle: it draws the cycle's noise."""
         n = self._noise = next(self._draws)
+        if self._read:
+            return cast("tuple[float, float, float]", self._read(
+                self._flat, np.array(n), self.cycle * self._period, self._record))
         level, state = self._live.item, self._flat.item
         position, pressure, spool = self._levels
         return (state(SENSED) + level(position) * n[0], state(PRESSURE) + level(pressure) * n[1],

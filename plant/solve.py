@@ -9,24 +9,61 @@ from typing import Any
 
 from plant.controller import Loop, answer
 from plant.flat import pack, unpack
-from plant.state import Input, State
+from plant.ports import at_command, at_reading
+from plant.state import Input, Memory, Ports, State
 from plant.step import coefficients, step
 
 NOISES = 4  # standard normal numbers a cycle: position, pressure, spool, and one for effects that are noise
 
 
-def sense(s: State, noise: Any, p: Any) -> tuple[float, float, float]:
-    """What the transducers read at one instant: XJ m, P12 Pa, XS m."""
+def sense(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, float, float, Memory]:
+    """What the transducers read at time `t`: XJ m, P12 Pa, XS m; and the memory of the reading."""
     g = p.sensors
-    return (s.sensed + g.position_noise * noise[0], s.pressure + g.pressure_noise * noise[1],
-            s.spool_position + g.spool_noise * noise[2])
+    u = Input(0.0, 0.0, noise[3], t, 0.0, p.controller.period)
+    xj, m = at_reading(s.sensed + g.position_noise * noise[0], m, s, u, p)
+    return xj, s.pressure + g.pressure_noise * noise[1], s.spool_position + g.spool_noise * noise[2], m
+
+
+def read(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, float]:
+    """`sense` on a flat state, which keeps the memory."""
+    s = unpack(flat)
+    xj, p12, xs, m_reading = sense(s, s.memory.reading, noise, t, record[0])
+    m = s.memory
+    pack(State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, s.jack_speed,
+               s.pressure, s.sensed, Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback,
+                                           m.spool_force, m.metering, m.valve, m.load, m.jack_drag, m.position,
+                                           m_reading)), flat)
+    return xj, p12, xs
+
+
+def demanded(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
+    """The demand as the firmware takes it, m, and its memory; of the plant it knows the sensed position alone."""
+    s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, 0.0)
+    return at_command(com, m, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
+
+
+def firmware(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
+    """The controller alone, on what it was told and what it sensed; fills out[k] = Cor, A.
+
+    Args:
+        m: memory of the port `command` at the start.
+        com: (n,) demand, m.
+        xj: (n,) sensed position, m.
+        record: (1,) parameters of the model.
+        out: (n,), written.
+    """
+    p = record[0]
+    c = Loop(0.0, 0.0, 0.0)
+    for k in range(len(com)):
+        demand, m = demanded(com[k], m, xj[k], k * p.controller.period, p)
+        out[k], c = answer(c, demand, xj[k], p.controller)
 
 
 def cycle(s: State, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> State:
     """The plant one cycle after `t`, current and load held, in `steps` equal steps; `record` is a model's record."""
     p = record[0]
     h = p.controller.period / steps
-    k = coefficients(p, 1.0, h)
+    k = coefficients(p, h)
     for i in range(steps):
         s = step(s, Input(current, load, noise, t + i * h, i * h, h), p, k)
     return s
@@ -51,11 +88,13 @@ def closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: i
     """
     p = record[0]
     c = Loop(0.0, 0.0, 0.0)  # numba does not know the defaults of a named tuple
-    current = 0.0
+    current, m_reading, m_command = 0.0, s.memory.reading, s.memory.command
     for k in range(len(com)):
-        xj, p12, xs = sense(s, noise[k], p)
-        cor, c = answer(c, com[k], xj, p.controller)
+        t = k * p.controller.period
+        xj, p12, xs, m_reading = sense(s, m_reading, noise[k], t, p)
+        demand, m_command = demanded(com[k], m_command, xj, t, p)
+        cor, c = answer(c, demand, xj, p.controller)
         out[k, 0], out[k, 1], out[k, 2], out[k, 3] = xj, cor, p12, xs
-        s = cycle(s, current, load[k], noise[k, 3], k * p.controller.period, record, steps)
+        s = cycle(s, current, load[k], noise[k, 3], t, record, steps)
         current = cor
     return s

@@ -14,8 +14,10 @@ class Ports(NamedTuple):
     An effect gets the signal of its port, in the unit below, and returns what is left of it or made of it.
     """
 
+    command: Memory = 0.0  # m, demand as the firmware takes it; once a cycle, in the controller
     current: Memory = 0.0  # A, in the torque motor's coil
-    supply: Memory = 0.0  # 1, supply pressure over nominal r; GPF and GP follow with r, GQF and GQ with sqrt r
+    supply: Memory = 0.0  # 1, supply pressure over nominal r; PSR and GPF follow with r, GQF and GQ with sqrt r
+    viscosity: Memory = 0.0  # 1, viscosity of the oil over nominal; CJ, BF and 1/CLK follow
     nozzle: Memory = 0.0  # m, flapper displacement as the nozzles feel it
     feedback: Memory = 0.0  # m, spool displacement as the feedback spring feels it
     spool_force: Memory = 0.0  # N, extra force on the spool, positive as XS
@@ -24,9 +26,10 @@ class Ports(NamedTuple):
     load: Memory = 0.0  # N, external force FR on the ram, positive against extension
     jack_drag: Memory = 0.0  # Drag, all that resists the ram in the jack
     position: Memory = 0.0  # m, ram position as its transducer feels it
+    reading: Memory = 0.0  # m, XJ with its noise as it is sent; once a cycle
 
 
-UNITS = Ports("A", "1", "m", "m", "N", "m", "Pa, Pa s/m", "N", "N, N s/m", "m")
+UNITS = Ports("m", "A", "1", "1", "m", "m", "N", "m", "Pa, Pa s/m", "N", "N, N s/m", "m", "m")
 
 
 class State(NamedTuple):
@@ -55,10 +58,12 @@ class Input(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A pressure that falls with the speed of the body it drives: p = offset - slope * v."""
+    """A pressure that falls with the speed of the body it drives: p = offset - slope * v, within +-limit."""
 
     offset: Pascal
     slope: float  # Pa s/m
+    limit: Pascal
+    drive: Pascal  # the part of the offset that the opening of the metering edges makes
 
 
 class Drag(NamedTuple):

@@ -8,6 +8,7 @@ Names in capitals in the comments are the paper's symbols; functions named `at_<
 """
 from __future__ import annotations
 
+from math import sqrt
 from typing import Any, NamedTuple
 
 from plant.friction import clip, slide
@@ -22,6 +23,7 @@ from plant.ports import (
     at_spool_force,
     at_supply,
     at_valve,
+    at_viscosity,
 )
 from plant.state import Drag, Input, Line, Memory, Ports, State
 
@@ -37,22 +39,25 @@ class Coefficients(NamedTuple):
     spool_free: float  # 1/kg
     spool_coupled: float  # 1/kg
     spool_push: float  # h ASV
+    valve_stiffness: float  # GP AJ / GQ, Pa s/m, the metering edges without leakage
+    valve_loss: float  # GP CLK / GQ, their loss of pressure gain by leakage
     valve_gain: float  # Pa/m, the metering edges with leakage
     valve_slope: float  # Pa s/m
     valve_limit: float  # PSR, Pa
+    jack_damping: float  # CJ, N s/m
     jack_free: float  # 1/kg
     jack_coupled: float  # 1/kg
 
 
-def coefficients(p: Any, ratio: float, h: float) -> Coefficients:
-    """Coefficients for parameters `p`, a supply of `ratio` times the nominal, and steps of `h` seconds."""
+def coefficients(p: Any, h: float) -> Coefficients:
+    """Coefficients for parameters `p` and steps of `h` seconds."""
     f, v, c = p.flapper, p.spool, p.jack
-    root = ratio**0.5
     left = 1.0 - p.filter.clogging  # 1 - Kintas
-    gpf1 = p.pilot.pressure_gain * left * ratio
-    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * left**p.filter.law * root)
-    gq, gp = p.valve.flow_gain * root, p.valve.pressure_gain * ratio
-    leak = 1.0 / (1.0 + gp * c.leakage / gq)  # QJ = AJ XJ' + CLK P12, solved for P12
+    gpf1 = p.pilot.pressure_gain * left
+    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * left**p.filter.law)
+    gq, gp = p.valve.flow_gain, p.valve.pressure_gain
+    loss = gp * c.leakage / gq
+    leak = 1.0 / (1.0 + loss)  # QJ = AJ XJ' + CLK P12, solved for P12
     slope2 = gp * c.area / gq * leak
     stiff = 1.0 / (f.inertia + 0.5 * h * f.damping + 0.25 * h * h * f.stiffness)
     spool, jack = v.mass + h * v.damping, c.mass + h * c.damping
@@ -61,30 +66,66 @@ def coefficients(p: Any, ratio: float, h: float) -> Coefficients:
         flapper_push=h * stiff,
         pilot_gain=gpf1,
         pilot_slope=slope1,
-        pilot_limit=p.supply.pressure * ratio * left,
+        pilot_limit=p.supply.pressure * left,
         spool_free=1.0 / spool,
         spool_coupled=1.0 / (spool + h * v.end_area * slope1),
         spool_push=h * v.end_area,
+        valve_stiffness=gp * c.area / gq,
+        valve_loss=loss,
         valve_gain=gp * leak,
         valve_slope=slope2,
-        valve_limit=p.supply.pressure * ratio,
+        valve_limit=p.supply.pressure,
+        jack_damping=c.damping,
         jack_free=1.0 / jack,
         jack_coupled=1.0 / (jack + h * c.area * slope2),
     )
 
 
-def steady_supply(k: Coefficients, m: Memory, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory]:
-    """A supply at its nominal pressure: the cycle's coefficients hold."""
-    return k, m
+def steady_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
+    """Oil as it should be: the cycle's coefficients hold. And the memory of supply and viscosity."""
+    return k, s.memory.supply, s.memory.viscosity
 
 
-def changing_supply(k: Coefficients, m: Memory, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory]:
-    """A supply with effects: coefficients for the pressure it has now."""
-    ratio, m = at_supply(1.0, m, s, u, p)
-    return coefficients(p, ratio, u.h), m
+def changing_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
+    """Oil with effects: coefficients for the pressure and viscosity it has now, at both nominal bit for bit `k`."""
+    ratio, m_supply = at_supply(1.0, s.memory.supply, s, u, p)
+    thick, m_viscosity = at_viscosity(1.0, s.memory.viscosity, s, u, p)
+    ratio, thick = max(ratio, LEAST), max(thick, LEAST)
+    return altered(k, ratio, thick, u.h, p), m_supply, m_viscosity
 
 
-supplied = steady_supply
+LEAST = 1e-3  # of supply pressure and viscosity: neither quite vanishes
+oiled = steady_oil
+
+
+def altered(k: Coefficients, ratio: float, thick: float, h: float, p: Any) -> Coefficients:
+    """`k` for a supply of `ratio` and a viscosity of `thick` times the nominal."""
+    f, root = p.flapper, sqrt(ratio)
+    damping, drag = f.damping * thick, k.jack_damping * thick
+    stiff = 1.0 / (f.inertia + 0.5 * h * damping + 0.25 * h * h * f.stiffness)
+    slope1 = k.pilot_slope * root  # GPF/GQF
+    back = 1.0 / (root * thick)
+    leak = 1.0 / (1.0 + k.valve_loss * back)
+    slope2 = k.valve_stiffness * (back * thick) * leak
+    jack = p.jack.mass + h * drag
+    return Coefficients(
+        flapper_keep=(f.inertia - 0.5 * h * damping - 0.25 * h * h * f.stiffness) * stiff,
+        flapper_push=h * stiff,
+        pilot_gain=k.pilot_gain * ratio,
+        pilot_slope=slope1,
+        pilot_limit=k.pilot_limit * ratio,
+        spool_free=k.spool_free,
+        spool_coupled=1.0 / (p.spool.mass + h * p.spool.damping + h * p.spool.end_area * slope1),
+        spool_push=k.spool_push,
+        valve_stiffness=k.valve_stiffness,
+        valve_loss=k.valve_loss,
+        valve_gain=p.valve.pressure_gain * leak,
+        valve_slope=slope2,
+        valve_limit=k.valve_limit * ratio,
+        jack_damping=drag,
+        jack_free=1.0 / jack,
+        jack_coupled=1.0 / (jack + h * p.jack.area * slope2),
+    )
 
 
 def travel(x0: float, v0: float, v: float, h: float, limit: float) -> tuple[float, float]:
@@ -120,7 +161,8 @@ def spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float
 def metering(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
     """Metering edges with leakage: P12 against the ram's speed, memory of the metering and of the valve."""
     opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
-    line, m_valve = at_valve(Line(k.valve_gain * opening, k.valve_slope), s.memory.valve, s, u, p)
+    drive = k.valve_gain * opening
+    line, m_valve = at_valve(Line(drive, k.valve_slope, k.valve_limit, drive), s.memory.valve, s, u, p)
     return line, m_metering, m_valve
 
 
@@ -130,24 +172,27 @@ def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line) -> tuple[float
     load, m_load = at_load(u.load, s.memory.load, s, u, p)
     drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
     # an effect that changes slope or damping pays for its division; without one these two fold away
-    push, mass = h * g.area, g.mass + h * (g.damping + drag.damping)
+    push, mass = h * g.area, g.mass + h * (k.jack_damping + drag.damping)
     free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
     same = drag.damping == 0.0 and line.slope == k.valve_slope
     coupled = k.jack_coupled if same else 1.0 / (mass + push * line.slope)
     dry = h * drag.static if v0 == 0.0 else h * drag.dynamic
     impulse = g.mass * v0 - h * (load + drag.force)
-    v = slide(v0, impulse, push, line.offset, line.slope, k.valve_limit, dry, free, coupled)
+    v = slide(v0, impulse, push, line.offset, line.slope, line.limit, dry, free, coupled)
     x, v = travel(s.jack_position, v0, v, h, g.travel)
-    return x, v, clip(line.offset - line.slope * v, k.valve_limit), m_load, m_drag
+    return x, v, clip(line.offset - line.slope * v, line.limit), m_load, m_drag
 
 
 def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
     """The plant `u.h` seconds later."""
-    k, m_supply = supplied(k, s.memory.supply, s, u, p)
+    k, m_supply, m_viscosity = oiled(k, s, u, p)
     xf, vf, m_current, m_feedback = flapper(s, u, p, k)
     xs, vs, m_nozzle, m_force = spool(s, u, p, k, xf)
     line, m_metering, m_valve = metering(s, u, p, k, xs)
     xj, vj, p12, m_load, m_drag = jack(s, u, p, k, line)
-    sensed, m_position = at_position(xj, s.memory.position, s, u, p)
+    m = s.memory
+    now = State(xf, vf, xs, vs, xj, vj, p12, s.sensed, m)  # the transducer feels the end of the step
+    sensed, m_position = at_position(xj, m.position, now, u, p)
     return State(xf, vf, xs, vs, xj, vj, p12, sensed, Ports(
-        m_current, m_supply, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load, m_drag, m_position))
+        m.command, m_current, m_supply, m_viscosity, m_nozzle, m_feedback, m_force, m_metering, m_valve, m_load,
+        m_drag, m_position, m.reading))

@@ -129,7 +129,7 @@ def test_filter_laws(law: str, change: float, tolerance: float) -> None:
 def overshoot(record, gain, target, steps, h):
     """Largest position on a step to `target` with a controller that answers at once."""
     p = record[0]
-    k = coefficients(p, 1.0, h)
+    k = coefficients(p, h)
     s, top = REST, 0.0
     for i in range(steps):
         current = clip(gain * (target - s.jack_position), p.controller.current_limit)

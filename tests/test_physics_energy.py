@@ -79,7 +79,7 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
     """Spool centred, air stiffness as spring: kinetic and elastic energy together never grow over a millisecond."""
     model = (SILENT if dry else SMOOTH).replace({"aero_stiffness.stiffness": stiffness})
     p = model.record()[0]
-    k = coefficients(p, 1.0, H)
+    k = coefficients(p, H)
     s, u = State(jack_position=x, jack_speed=v), Input(h=H)
 
     def energy(s: State) -> float:
@@ -96,7 +96,7 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
 @settings(max_examples=30, deadline=None)
 def test_a_flapper_left_alone_loses_energy(x: float, v: float) -> None:
     p = SILENT.record()[0]
-    k, s, f = coefficients(p, 1.0, H), State(flapper_position=x, flapper_speed=v), p.flapper
+    k, s, f = coefficients(p, H), State(flapper_position=x, flapper_speed=v), p.flapper
     last = np.inf
     for _ in range(50):
         s = step(s._replace(spool_position=0.0, spool_speed=0.0), Input(h=H), p, k)
