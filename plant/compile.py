@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import dis
 import hashlib
+import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
 import numpy as np
+
+from plant import functions
 
 Function = Any  # a plain function, or numba's dispatcher of one
 
@@ -49,7 +52,7 @@ def interpreted(function: Function, ports: Mapping[str, Function] | None = None)
 def compiled(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
     root = _link(function, ports or {}, lambda f: f)
-    linked = _link(function, ports or {}, lambda f: numba.njit(f, error_model="numpy", forceinline=True))
+    linked = _link(function, ports or {}, lambda f: numba.njit(f, **INLINED))
     plain = rebind(linked.py_func)
     settings: Any = numba.config
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
@@ -59,6 +62,11 @@ def compiled(function: Function, ports: Mapping[str, Function] | None = None) ->
         settings.CACHE_DIR = before
 
 
+# no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only
+# called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
+INLINED: Any = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
 def _link(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function]) -> Function:
     """Copy the call graph below `function`, names in `ports` replaced by theirs, each copy through `make`."""
     made: dict[Function, Function] = {}
@@ -66,7 +74,8 @@ def _link(function: Function, ports: Mapping[str, Function], make: Callable[[Fun
     def link(f: Function) -> Function:
         f = getattr(f, "py_func", f)  # an @njit function is welcome too
         if f not in made:
-            made[f] = make(rebind(f, **{name: link(ports.get(name, g)) for name, g in _calls(f).items()}))
+            calls = {name: link(ports.get(name, g)) for name, g in _calls(f).items()}
+            made[f] = make(rebind(f, **calls, **_libraries(f, link)))
         return made[f]
 
     return link(function)
@@ -81,8 +90,27 @@ def _globals(function: Function) -> dict[str, Any]:
 
 
 def _calls(function: Function) -> dict[str, Function]:
-    return {name: value for name, value in _globals(function).items()
-            if isinstance(value, FunctionType) or hasattr(value, "py_func")}
+    named = {name: _ours(value) for name, value in _globals(function).items()}
+    return {name: g for name, g in named.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
+
+
+def _ours(value: Any) -> Any:
+    """Our own version of a function of `math` or `numpy` if there is one, else the value itself."""
+    known = isinstance(value, BuiltinFunctionType | np.ufunc)
+    return functions.IN_PLACE_OF.get(value, value) if known else value
+
+
+def _libraries(function: Function, link: Callable[[Function], Function]) -> dict[str, ModuleType]:
+    """`math` and `np` as `function` calls them, with our own versions, through `link`, of what it uses of theirs."""
+    copies = {}
+    for name, library in _globals(function).items():
+        if library is math or library is np:
+            used = {f: vars(library).get(f) for f in function.__code__.co_names}
+            own = {f: link(_ours(g)) for f, g in used.items() if _ours(g) is not g}
+            if own:
+                copies[name] = ModuleType(library.__name__)
+                copies[name].__dict__.update(vars(library) | own)
+    return copies
 
 
 def fingerprint(function: Function) -> str:
@@ -105,7 +133,7 @@ def fingerprint(function: Function) -> str:
     return hashlib.sha256((_THIS_FILE + text(function)).encode()).hexdigest()[:20]
 
 
-_THIS_FILE = Path(__file__).read_text(encoding="utf-8")
+_THIS_FILE = "".join(Path(str(file)).read_text(encoding="utf-8") for file in (__file__, functions.__file__))
 
 
 def _code(f: Function) -> str:

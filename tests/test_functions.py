@@ -1,0 +1,84 @@
+"""The elementary functions of the laws: as good as the library's, the same bits in every way to run, wide registers."""
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from math import exp, hypot, sin
+
+import numba
+import numpy as np
+import pytest
+from llvmlite.binding import get_host_cpu_features
+
+from plant import functions
+from plant.compile import INLINED, _link, compiled, interpreted
+
+RNG = np.random.default_rng(1)
+NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5
+ANGLES = np.r_[RNG.uniform(-1e6, 1e6, 20000), RNG.uniform(-7.0, 7.0, 20000), TINY]
+# name: arguments, error in units of the last place
+CASES = {
+    "exp": (np.r_[RNG.uniform(-700.0, 700.0, 20000), NEAR, TINY], 1),
+    "log": (np.r_[np.exp(RNG.uniform(-700.0, 700.0, 20000)), 1.5 + NEAR, 1.0 + TINY, 1e-310], 1),
+    "sin": (ANGLES, 2),
+    "cos": (ANGLES, 2),
+    "tan": (ANGLES, 3),
+    "tanh": (np.r_[RNG.uniform(-25.0, 25.0, 20000), NEAR, TINY], 2),
+    "atan": (np.r_[RNG.uniform(-25.0, 25.0, 20000), NEAR, TINY * 1e10], 1),
+}
+
+
+def many(f: Callable[[float], float]) -> Callable[[np.ndarray, np.ndarray], None]:
+    """`f` over an array, compiled as laws are: inlined in a loop."""
+    inner = _link(f, {}, lambda g: numba.njit(g, **INLINED))
+
+    @numba.njit(error_model="numpy")
+    def run(x, y):
+        for i in range(len(x)):
+            y[i] = inner(x[i])
+
+    return run
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_accuracy_and_the_same_bits_in_plain_python(name: str) -> None:
+    x, ulps = CASES[name]
+    f, y = getattr(functions, name), np.empty_like(x)
+    run = many(f)
+    run(x, y)
+    truth = np.array([getattr(math, name)(v) for v in x])
+    assert (np.abs(y - truth) <= ulps * np.spacing(np.abs(truth))).all()
+    assert [f(v) for v in x[::40]] == y[::40].tolist()
+    if get_host_cpu_features().get("avx2"):
+        (code,) = run.inspect_asm().values()
+        assert "%ymm" in code or "%zmm" in code
+
+
+@pytest.mark.parametrize(("name", "x", "expected"), [
+    ("exp", math.inf, math.inf), ("exp", -math.inf, 0.0), ("exp", 710.0, math.inf), ("exp", -746.0, 0.0),
+    ("exp", 0.0, 1.0), ("exp", -745.0, 5e-324), ("log", 0.0, -math.inf), ("log", -1.0, math.nan),
+    ("log", math.inf, math.inf), ("log", 1.0, 0.0), ("sin", 0.0, 0.0), ("sin", math.inf, math.nan),
+    ("cos", -math.inf, math.nan), ("cos", 0.0, 1.0), ("tan", 1e300, math.nan), ("tanh", math.inf, 1.0),
+    ("tanh", -1e300, -1.0), ("atan", math.inf, math.pi / 2.0), ("atan", -math.inf, -math.pi / 2.0), ("atan", 0.0, 0.0),
+    *((name, math.nan, math.nan) for name in CASES)])
+def test_at_the_ends(name: str, x: float, expected: float) -> None:
+    with np.errstate(all="raise"):
+        y = getattr(functions, name)(x)
+    assert y == expected or (math.isnan(y) and math.isnan(expected))
+
+
+def by_name(x: float) -> float:
+    return sin(x) + exp(-x) + hypot(x, 3.0)
+
+
+def by_library(x: float) -> float:
+    return math.sin(x) + np.exp(-x) + math.hypot(x, 3.0) + 0.0 * math.pi
+
+
+def test_they_stand_in_however_a_law_calls_them() -> None:
+    """And the library's own stay where they are in code that is not linked."""
+    for f in (by_name, by_library):
+        assert compiled(f)(1.3) == interpreted(f)(1.3) == functions.sin(1.3) + functions.exp(-1.3) + functions.hypot(
+            1.3, 3.0)
+    assert interpreted(by_name).__globals__["sin"] is not sin is math.sin
+    assert interpreted(by_library).__globals__["math"].sqrt is math.sqrt
