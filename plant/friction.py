@@ -19,6 +19,12 @@ def soften(x: float, band: float) -> float:
     return x - clip(x, band)
 
 
+def play(x: float, held: float, half: float) -> float:
+    """What `x` drags along through a play of +-`half`, having been at `held`."""
+    held = held if held > x - half else x - half
+    return held if held < x + half else x + half
+
+
 def slide(v0: float, impulse: float, push: float, line: float, slope: float, limit: float, dry: float,
           free: float, coupled: float) -> float:
     """Velocity after the step of  m v' = F + A clip(p0 - s v, +-limit) - c v - dry(v), implicit in v.

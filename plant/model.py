@@ -56,6 +56,7 @@ class Model:
         model = self.having(name.partition(".")[0] for name in changes)
         merged = {**model.values, **values}
         sensible(where, merged)
+        compatible(where, model.effects, merged)
         return Model(model.name, merged, model.effects)
 
     def having(self, groups: Iterable[str]) -> Model:
@@ -135,6 +136,14 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     if unknown:
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}")
     return Model(name).having(effects).replace(flatten(where, tables, known_groups()), where)
+
+
+def compatible(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
+    """Refuse two effects at work that exclude each other; at its off value one may stand beside the other."""
+    working = {e for e in effects if CATALOGUE[e].acts(values)}
+    for e in sorted(working):
+        for other in working.intersection(CATALOGUE[e].excludes):
+            raise InputError(where, e, f"{e} or {other}, not both at work")
 
 
 def entry(name: str) -> Effect:

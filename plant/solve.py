@@ -38,7 +38,8 @@ def read(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, fl
 
 def demanded(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
     """The demand as the firmware takes it, m, and its memory; of the plant it knows the sensed position alone."""
-    s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, 0.0)
+    nothing: Memory = 0.0
+    s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, nothing)
     return at_command(com, m, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
 
 

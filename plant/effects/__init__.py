@@ -11,13 +11,13 @@ order of the catalogue. A law that remembers something also gets and returns its
     def null_bias(x, s, u, p):
         return x + p.null_bias.current
 
-The effects marked as fitted (`base`) are parameters of the reference model itself; they have no law of their own.
+The effects of `base` are parameters of the reference model itself; they have no law of their own.
 """
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -49,6 +49,20 @@ class Effect:
     function: Law | None = None
     memory: type[Any] | None = None
     disturbance: bool = False  # noise of the bench rather than physics of the actuator
+    fitted: tuple[str, ...] = ()  # "group.field" that a fit frees; the others keep their values
+    starts: tuple[Mapping[str, float], ...] = ()  # where fits and scans begin: all `fitted`, small to large, SI
+    excludes: tuple[str, ...] = ()  # effects that cannot be at work together with this one
+    confused_with: tuple[str, ...] = ()  # effects, or parameters, that position alone cannot tell from it
+    source: str = ""  # where the law is from
+
+    @property
+    def firmware(self) -> bool:
+        """True when it acts in the controller: seen in Cor against Com and XJ alone."""
+        return self.port == "command"
+
+    def acts(self, values: Mapping[str, float]) -> bool:
+        """Whether parameters "group.field" leave it anything to do. (Not for `base` effects: they always do.)"""
+        return any(values.get(name, self.off.get(name)) != self.off.get(name) for name in self.fitted)
 
     @property
     def base(self) -> bool:
@@ -59,15 +73,33 @@ class Effect:
 CATALOGUE: dict[str, Effect] = {}
 
 
+Start = float | tuple[float, ...]  # values of the fitted parameters, in their order
+
+
 def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory: type[Any] | None = None,
-           disturbance: bool = False) -> Callable[[Law], Law]:
+           disturbance: bool = False, fitted: Sequence[str] | None = None, starts: Sequence[Start] = (),
+           **more: Any) -> Callable[[Law], Law]:
     """Register a law at `port` with the parameters `group`; the function's name is the effect's.
 
+    Args:
+        port: where it acts.
+        group: its parameters, a NamedTuple; a default is the off value.
+        law: the formula, for people.
+        symptoms: what tells it apart, for people.
+        memory: what it remembers, a NamedTuple of floats with defaults.
+        disturbance: noise of the bench, which nobody fits.
+        fitted: fields that a fit frees; default all.
+        starts: values of these, one tuple a start; without any, `plant.starts` finds some.
+        more: `excludes`, `confused_with`, `source` of `Effect`.
+
     Raises:
-        ValueError: unknown port, a parameter without default, or a name already taken.
+        ValueError: unknown port or field, a parameter without default, or a name already taken.
     """
     if port not in Ports._fields:
         raise ValueError(f"no port {port!r}; there are {', '.join(Ports._fields)}")
+    free = () if disturbance else group._fields if fitted is None else tuple(fitted)
+    if not set(free) <= set(group._fields):
+        raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
@@ -78,16 +110,23 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
             raise ValueError(f"{name}: every parameter needs a default, its off value")
         meaning = {f"{name}.{field}": q for field, q in quantities(group).items()}
         off = {f"{name}.{field}": float(value) for field, value in group._field_defaults.items()}
-        CATALOGUE[name] = Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance)
+        names = tuple(f"{name}.{field}" for field in free)
+        CATALOGUE[name] = Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
+                                 names, _starts(names, starts), **more)
         return function
 
     return register
 
 
-def base(name: str, *fields: str, law: str, symptoms: str) -> None:
-    """Register an effect that the reference model has already, by the parameters that carry it."""
+def _starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mapping[str, float], ...]:
+    return tuple(dict(zip(names, start if isinstance(start, tuple) else (start,), strict=True)) for start in values)
+
+
+def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start], **more: Any) -> None:
+    """Register an effect that the reference model has already, by the parameters that carry it; a fit frees all."""
     meaning = {field: quantities(GROUPS[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
-    CATALOGUE[name] = Effect(name, "", law, symptoms, meaning, {})
+    CATALOGUE[name] = Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_starts(fields, starts),
+                             **more)
 
 
 def load_effects(path: Path) -> list[str]:
@@ -122,5 +161,5 @@ def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
     return chain((entry.function, entry.memory) for entry in acting)
 
 
-for _family in ("base", "servovalve", "jack", "sensors"):
+for _family in ("base", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "sensors"):
     importlib.import_module(f"plant.effects.{_family}")

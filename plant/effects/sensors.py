@@ -3,8 +3,45 @@ from __future__ import annotations
 
 from typing import Annotated, Any, NamedTuple
 
+from numpy import floor
+
 from plant.effects import effect
+from plant.friction import play
 from plant.quantity import Quantity
+
+
+class MountCompliance(NamedTuple):
+    """Compliance 1/K of the actuator's mount."""
+
+    compliance: Annotated[float, Quantity("m/N", low=0, high=1e-3, typical="1e-8-1e-7 m/N, 1/K")] = 0.0
+
+
+@effect("position", MountCompliance, law="XJ = XJ + AJ P12/K, K = 1/compliance",
+        symptoms="position residual proportional to P12", starts=(1e-8, 3e-8, 1e-7),
+        source="a light body on an elastic mount, static")
+def mount_compliance(x: float, s: Any, u: Any, p: Any) -> float:
+    """The body recoils under the ram's force, and the transducer sees the ram against the body."""
+    return x + p.mount_compliance.compliance * p.jack.area * s.pressure
+
+
+class RodBacklash(NamedTuple):
+    """Total play between ram and transducer."""
+
+    width: Annotated[float, Quantity("m", low=0, high=1, typical="20-200 um")] = 0.0
+
+
+class Dragged(NamedTuple):
+    """Where the ram has dragged the transducer's rod to."""
+
+    held: float = 0.0
+
+
+@effect("position", RodBacklash, law="XJ = play(XJ, width)", symptoms="lost motion at every reversal", memory=Dragged,
+        starts=(2e-5, 6e-5, 2e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
+def rod_backlash(x: float, m: Dragged, s: Any, u: Any, p: Any) -> tuple[float, Dragged]:
+    """A worn rod end: on reversal the transducer waits until the ram has crossed the play."""
+    held = play(x, m.held, 0.5 * p.rod_backlash.width)
+    return held, Dragged(held)
 
 
 class SensorLag(NamedTuple):
@@ -20,12 +57,27 @@ class Lag(NamedTuple):
     last: float = 0.0
 
 
-@effect("position", SensorLag, law="tau XS' + XS = XJ", symptoms="roll-off in the sensed position", memory=Lag)
+@effect("position", SensorLag, law="tau XS' + XS = XJ", symptoms="roll-off in the sensed position", memory=Lag,
+        starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "coil_lag"),
+        source="demodulator and filter of an LVDT")
 def sensor_lag(x: float, m: Lag, s: Any, u: Any, p: Any) -> tuple[float, Lag]:
     """Demodulator and anti-alias filter of the LVDT (trapezoidal rule on the part that lags, exact at tau = 0)."""
     two = 2.0 * p.sensor_lag.time
     behind = ((two - u.h) * m.behind - two * (x - m.last)) / (two + u.h)
     return x + behind, Lag(behind, x)
+
+
+class SensorGain(NamedTuple):
+    """Relative error of the transducer's gain."""
+
+    error: Annotated[float, Quantity("1", low=-1, high=1, typical="0.25-2 %")] = 0.0
+
+
+@effect("position", SensorGain, law="XJ = XJ (1 + error)", symptoms="residual proportional to position",
+        starts=(0.003, -0.003, 0.02, -0.02), confused_with=("jack.area",), source="calibration of the transducer")
+def sensor_gain(x: float, s: Any, u: Any, p: Any) -> float:
+    """The transducer's scale is not the ram's."""
+    return x + p.sensor_gain.error * x
 
 
 class SensorOffset(NamedTuple):
@@ -34,7 +86,23 @@ class SensorOffset(NamedTuple):
     offset: Annotated[float, Quantity("m", low=-1, high=1, typical="10-200 um")] = 0.0
 
 
-@effect("position", SensorOffset, law="XJ = XJ + offset", symptoms="unobservable in closed loop except at end stops")
+@effect("position", SensorOffset, law="XJ = XJ + offset", symptoms="unobservable in closed loop except at end stops",
+        starts=(3e-5, -3e-5, 2e-4, -2e-4), source="calibration of the transducer")
 def sensor_offset(x: float, s: Any, u: Any, p: Any) -> float:
     """The transducer's zero is not the ram's; behind the lag, which would else begin a run by catching up with it."""
     return x + p.sensor_offset.offset
+
+
+class Quantisation(NamedTuple):
+    """The least significant bit of the reading."""
+
+    lsb: Annotated[float, Quantity("m", low=0, high=1e-2, typical="1-20 um")] = 0.0
+
+
+@effect("reading", Quantisation, law="XJ = LSB round(XJ/LSB), noise included", symptoms="comb in the histogram",
+        starts=(2e-6, 6e-6, 2e-5), source="analogue-digital converter")
+def quantisation(x: float, s: Any, u: Any, p: Any) -> float:
+    """The converter has a finite number of bits."""
+    lsb = p.quantisation.lsb
+    on = lsb > 1e-12
+    return lsb * floor(x / (lsb if on else 1.0) + 0.5) if on else x

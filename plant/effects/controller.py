@@ -1,0 +1,33 @@
+"""Effects in the firmware: they show in its answer against what it was told and what it sensed, without any noise."""
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple
+
+from plant.effects import effect
+from plant.friction import clip
+from plant.quantity import Quantity
+
+
+class CommandRateLimit(NamedTuple):
+    """The fastest demand that the firmware follows."""
+
+    rate: Annotated[float, Quantity("m/s", low=0, high=1e6, typical="0.05-0.3 m/s; 0: no limit")] = 0.0
+
+
+class Followed(NamedTuple):
+    """The demand as the loop had it last."""
+
+    demand: float = 0.0
+    begun: float = 0.0  # 0 before the first demand, which is taken as it is
+
+
+@effect("command", CommandRateLimit, law="|Com'| <= rate, before the error is formed",
+        symptoms="only when the command is fast", memory=Followed, starts=(0.3, 0.12, 0.05),
+        source="ramp generators of position controllers")
+def command_rate_limit(x: float, m: Followed, s: Any, u: Any, p: Any) -> tuple[float, Followed]:
+    """The firmware follows a fast demand at its own rate."""
+    rate = p.command_rate_limit.rate
+    free = m.begun == 0.0 or rate == 0.0
+    limited = m.demand + clip(x - m.demand, rate * u.h)
+    x = x if free else limited
+    return x, Followed(x, 1.0)

@@ -1,0 +1,142 @@
+"""Effects on the way of the current, from the bus through driver, line and coil to the armature, in this order."""
+from __future__ import annotations
+
+from math import inf, pi, sin
+from typing import Annotated, Any, NamedTuple
+
+from plant.effects import effect
+from plant.friction import clip, play
+from plant.quantity import Quantity
+
+
+class TransportDelay(NamedTuple):
+    """How much later than it should the current acts, in cycles."""
+
+    cycles: Annotated[float, Quantity("1", low=0, high=5, typical="0.2-3 cycles, fractions too")] = 0.0
+
+
+class Past(NamedTuple):
+    """The current of this cycle and of the five before."""
+
+    now: float = 0.0
+    one: float = 0.0
+    two: float = 0.0
+    three: float = 0.0
+    four: float = 0.0
+    five: float = 0.0
+
+
+@effect("current", TransportDelay, law="i(t) = i(t - n T), n = cycles", symptoms="phase without attenuation",
+        memory=Past, starts=(0.3, 1.0, 3.0), confused_with=("sensor_lag", "coil_lag"),
+        source="synchronous buses: an answer that misses its SYNC acts a cycle later")
+def transport_delay(x: float, m: Past, s: Any, u: Any, p: Any) -> tuple[float, Past]:
+    """A bus, a gateway or a slow driver: the current comes later.
+
+    A step in which the current changes gets the mean of both, so that a fit sees a slope between whole steps.
+    """
+    new = u.phase == 0.0
+    one, two = m.now if new else m.one, m.one if new else m.two
+    three, four, five = m.two if new else m.three, m.three if new else m.four, m.four if new else m.five
+    rate = 1.0 / u.h
+    late = (p.transport_delay.cycles * p.controller.period - u.phase) * rate  # steps until this cycle's current acts
+    cycle = p.controller.period * rate
+    y = (x + (one - x) * _share(late) + (two - one) * _share(late - cycle) + (three - two) * _share(late - 2.0 * cycle)
+         + (four - three) * _share(late - 3.0 * cycle) + (five - four) * _share(late - 4.0 * cycle))
+    return y, Past(x, one, two, three, four, five)
+
+
+def _share(steps: float) -> float:
+    """The part of a step in which the older current still acts, when the newer is `steps` away."""
+    steps = steps if steps > 0.0 else 0.0
+    return steps if steps < 1.0 else 1.0
+
+
+class CurrentLimit(NamedTuple):
+    """What the driver's limit is short of Imax, as a fraction of it."""
+
+    loss: Annotated[float, Quantity("1", low=0, high=1, typical="0.05-0.4")] = 0.0
+
+
+@effect("current", CurrentLimit, law="|i| <= Imax (1 - loss)", symptoms="exactly zero residual while below the limit",
+        starts=(0.05, 0.2, 0.4), confused_with=("supply_droop",), source="a current source short of voltage")
+def current_limit(x: float, s: Any, u: Any, p: Any) -> float:
+    """The valve driver clips, though the firmware asks for more."""
+    loss = p.current_limit.loss
+    return clip(x, p.controller.current_limit * (1.0 - loss) if loss > 0.0 else inf)
+
+
+class CurrentNoise(NamedTuple):
+    """Electrical noise on the current line."""
+
+    white: Annotated[float, Quantity("A rms", low=0, high=20)] = 0.0
+    hum: Annotated[float, Quantity("A", low=0, high=20, typical="amplitude")] = 0.0
+    frequency: Annotated[float, Quantity("Hz", low=0, high=1e6)] = 400.0
+
+
+@effect("current", CurrentNoise, law="i = i + white n_k + hum sin(2 pi f t), n_k new every cycle",
+        symptoms="the current the coil feels differs from the one sent; a line at f in P12", disturbance=True,
+        source="the source paper: disturbances of the current line")
+def current_noise(x: float, s: Any, u: Any, p: Any) -> float:
+    """Aircraft supply hum and white noise couple into the current line."""
+    g = p.current_noise
+    return x + g.white * u.noise + g.hum * sin(2.0 * pi * g.frequency * u.t)
+
+
+class CoilLag(NamedTuple):
+    """First-order lag of the coil."""
+
+    time: Annotated[float, Quantity("s", low=0, high=0.1, typical="0.3-3 ms")] = 0.0
+
+
+class Behind(NamedTuple):
+    """How far the coil's current is from the driver's, and the driver's last."""
+
+    behind: float = 0.0
+    last: float = 0.0
+
+
+@effect("current", CoilLag, law="tau i' + i = i_driver", symptoms="attenuates above 1/(2 pi tau); a delay does not",
+        memory=Behind, starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "sensor_lag"),
+        source="inductance and resistance of the coil, Merritt 1967")
+def coil_lag(x: float, m: Behind, s: Any, u: Any, p: Any) -> tuple[float, Behind]:
+    """The coil's inductance: the mean current over a step in which the driver's is constant (no lag: exactly it)."""
+    two = 2.0 * p.coil_lag.time
+    whole = 1.0 / (two + u.h)
+    keep = (two - u.h) * whole
+    before = m.behind - (x - m.last)
+    return x + two * whole * before, Behind((keep if keep > 0.0 else 0.0) * before, x)
+
+
+class NullBias(NamedTuple):
+    """Current offset."""
+
+    current: Annotated[float, Quantity("A", low=-20, high=20, typical="0.2-4 % of Imax")] = 0.0
+
+
+@effect("current", NullBias, law="i = i + i0", symptoms="constant error i0/GAP with P12 unchanged",
+        starts=(3e-5, -3e-5, 3e-4, -3e-4), confused_with=("constant_load", "friction_asymmetry"),
+        source="null shift of servovalves, SAE ARP490")
+def null_bias(x: float, s: Any, u: Any, p: Any) -> float:
+    """The valve's null is not at zero current."""
+    return x + p.null_bias.current
+
+
+class TorqueMotorHysteresis(NamedTuple):
+    """Width of the loop, current up against current down."""
+
+    width: Annotated[float, Quantity("A", low=0, high=20, typical="1-5 % of Imax")] = 0.0
+
+
+class Dragged(NamedTuple):
+    """Where the play has been dragged to."""
+
+    held: float = 0.0
+
+
+@effect("current", TorqueMotorHysteresis, law="i = play(i, width)",
+        symptoms="loop in current against spool, rate free; the spool keeps moving", memory=Dragged,
+        starts=(8e-5, 2e-4, 4e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
+def torque_motor_hysteresis(x: float, m: Dragged, s: Any, u: Any, p: Any) -> tuple[float, Dragged]:
+    """Magnetic hysteresis and friction of the armature: after a reversal the torque waits for the play."""
+    held = play(x, m.held, 0.5 * p.torque_motor_hysteresis.width)
+    return held, Dragged(held)

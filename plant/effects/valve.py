@@ -1,0 +1,63 @@
+"""Effects between the metering edges and the piston: what pressure they leave across it at which speed."""
+from __future__ import annotations
+
+from math import sqrt
+from typing import Annotated, Any, NamedTuple
+
+from plant.effects import effect
+from plant.quantity import Quantity
+from plant.state import Line
+
+
+class Compressibility(NamedTuple):
+    """Compressibility 1/B of the oil in the jack, and the volume under pressure."""
+
+    coefficient: Annotated[float, Quantity("1/Pa", low=0, high=1e-6, typical="0.7e-9-2e-9 1/Pa, 1/B")] = 0.0
+    volume: Annotated[float, Quantity("m3", "V", low=0, high=10)] = 1.5e-4
+
+
+@effect("valve", Compressibility, law="V/(4 B) P12' = GQ XS - GQ/GP P12 - AJ XJ' - CLK P12",
+        symptoms="resonance in P12", fitted=("coefficient",), starts=(3e-10, 1e-9, 2e-9),
+        source="valve-controlled piston, Merritt 1967")
+def compressibility(x: Line, s: Any, u: Any, p: Any) -> Line:
+    """The oil in the chambers is a spring between valve and ram.
+
+    The pressure is implicit in itself and takes the ram's speed of the start of the step, which damps nothing; where
+    the step is too long for that (h w near 2, w the resonance) it takes the more of the speed at its end.
+    """
+    g = p.jack
+    stored = 0.25 * p.compressibility.volume * p.compressibility.coefficient  # m3/Pa
+    step = u.h * g.area
+    new = 1.0 / (1.0 + 8.0 * stored * g.mass / (step * step))  # (h w)^2 / ((h w)^2 + 8); 1 without compressibility
+    rest = stored * x.slope / step
+    share = 1.0 / (1.0 + rest)
+    offset = (rest * s.pressure + x.offset - x.slope * (1.0 - new) * s.jack_speed) * share
+    return Line(offset, x.slope * new * share, x.limit, x.drive * share)
+
+
+class OrificeRoot(NamedTuple):
+    """How much of the square-root law the metering edges follow; 1: all of it."""
+
+    share: Annotated[float, Quantity("1", low=0, high=2, typical="1")] = 0.0
+
+
+@effect("valve", OrificeRoot, law="P12 = GP (XS w - QJ/GQ), w = 1 - share (1 - sqrt(1 - sign(XS) P12/PSR))",
+        symptoms="cross term XS*P12, seen when fast and loaded", starts=(0.4, 1.0),
+        source="orifice equation, Merritt 1967")
+def orifice_root(x: Line, s: Any, u: Any, p: Any) -> Line:
+    """The flow through an edge goes with the root of the pressure left across it: at full load none is left.
+
+    In w = sqrt(1 - sign(XS) P12/PSR) the law is a quadratic equation, solved exactly for the ram's speed at the start
+    of the step; from there the pressure follows the tangent.
+    """
+    part = p.orifice_root.share * x.drive
+    size = abs(part)
+    on = size > 0.0
+    sign = 1.0 if part > 0.0 else -1.0
+    left = x.limit - sign * (x.offset - part - x.slope * s.jack_speed)
+    left = left if left > 0.0 else 0.0
+    root = size + sqrt(size * size + 4.0 * x.limit * left)
+    w = 2.0 * left / (root if on else 1.0)
+    slope = x.slope * (2.0 * x.limit * w) / ((2.0 * x.limit * w + size) if on else 1.0)
+    offset = sign * x.limit * (1.0 - w * w) + slope * s.jack_speed
+    return Line(offset if on else x.offset, slope if on else x.slope, x.limit, x.drive)
