@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import packers, values
-from plant.model import STEPS, Model, kernel
+from plant.model import STEPS, Model, initial, kernel
 from plant.solve import NOISES
 from plant.state import State
 
@@ -98,6 +98,27 @@ def _in_plain_python(model: Model) -> tuple[str, Exception] | None:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
         return (f"{frames[-1].filename}:{frames[-1].lineno}", error) if frames else None
     return None
+
+
+class Demand:
+    """What the firmware of a model makes of a demand, cycle by cycle: the effects at the port `command`."""
+
+    def __init__(self, model: Model) -> None:
+        self._law = kernel("demanded", model.effects, fast=False)
+        self._first = initial(model.effects).memory.command
+        self._record = model.record()[0]
+        self._period = model["controller.period"]
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all; the next cycle is the first."""
+        self._memory, self._cycle = self._first, 0
+
+    def __call__(self, demand: float, position: float) -> float:
+        """The demand that the loop closes on, m, from the demand and the sensed position, m."""
+        taken, self._memory = self._law(demand, self._memory, position, self._cycle * self._period, self._record)
+        self._cycle += 1
+        return float(taken)
 
 
 class Actuator:

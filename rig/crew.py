@@ -6,8 +6,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
-from plant import InputError
+from plant import InputError, Model
+from plant.effects import CATALOGUE
 from rig.bus import open_can
 from rig.clock import VirtualClock, WallClock
 from rig.emulator import Emulator
@@ -33,13 +35,17 @@ def crew(job: Job) -> Iterator[Wire]:
     """The bus with all nodes that are ours to run on it: inside this process, or as processes of their own.
 
     Raises:
-        InputError: an external node was asked for on a bus that no other program can reach.
+        InputError: an external node was asked for on a bus that no other program can reach, or a firmware of somebody
+            else's with an effect of ours.
         BusError: an external node does not answer.
     """
+    if job.controller == "external" and in_firmware(job.model):
+        raise InputError("--controller", "external", f"a model without effects in the firmware, which is not ours "
+                                                     f"then: not {', '.join(in_firmware(job.model))}")
     if job.bus.partition(":")[0] in EMBEDDED:
         if "external" in (job.controller, job.plant):
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
-        makers: list[Callable[[Send], Node]] = [Emulator, Firmware]
+        makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
         yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         return
     clock = WallClock()
@@ -80,12 +86,20 @@ def _dismiss(children: Sequence[Child]) -> None:
             child.wait()
 
 
+def in_firmware(model: Model) -> dict[str, float]:
+    """The parameters of the effects at work in a model's firmware."""
+    acting = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].firmware]
+    return {name: model[name] for effect in acting if effect.acts(model.values) for name in effect.parameters}
+
+
 def _start(job: Job, name: str) -> Child:
     """A node of our own in its own process, which ends when this one does.
 
     It has its own session, so that Ctrl-C reaches the rig alone: clean-up needs its plant.
     """
     effects = [word for path in job.effects for word in ("--effects", str(path))]
+    if name == NAMES[CONTROLLER]:  # all else about the model comes by SDO
+        effects += [word for name, value in in_firmware(job.model).items() for word in ("--set", f"{name}={value!r}")]
     command = [sys.executable, "-m", "rig.cli", "node", name, "--bus", job.bus, "--quiet", "--parent",
                str(os.getpid()), *effects]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)

@@ -12,6 +12,7 @@ from typing import NamedTuple, cast
 from dbc import EDS
 from plant.controller import Loop, answer
 from plant.model import Model
+from plant.run import Demand
 from rig import codec
 from rig.codec import Control, Status
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
@@ -38,9 +39,13 @@ def gains_of(model: Model) -> Gains:
 
 
 class Firmware:
-    """A controller node. `receive` and `tick` are its whole outside; `gains` hold until the rig writes others."""
+    """A controller node. `receive` and `tick` are its whole outside; `gains` hold until the rig writes others.
 
-    def __init__(self, send: Send, gains: Gains | None = None) -> None:
+    `model`: whose effects in the firmware this one has (port `command`); none by default.
+    """
+
+    def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
+        self._taken = Demand(model or Model())
         self.device = Device(NODE, EDS[NODE], send)
         self.device.on_sync = self._on_sync
         self.device.on_rpdo = self._on_rpdo
@@ -55,6 +60,7 @@ class Firmware:
 
     def _restart(self) -> None:
         self._loop = Loop()
+        self._taken.restart()
         self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
         self._silent = 0  # SYNCs since the last feedback
         self._fault = False
@@ -93,9 +99,10 @@ class Firmware:
         if status & Status.MODE:
             demand = codec.position(cast(int, self._od[0x2100, 0]))
             position = codec.position(cast(int, self._od[0x2102, 0]))
-            current, self._loop = answer(self._loop, demand, position, self._gains)
+            current, self._loop = answer(self._loop, self._taken(demand, position), position, self._gains)
         else:
             current, self._loop = 0.0, Loop()
+            self._taken.restart()
         self._drive(current, status)
 
     def _status(self) -> int:

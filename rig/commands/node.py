@@ -71,4 +71,4 @@ def maker(args: argparse.Namespace) -> Callable[[Send], Node]:
     model = options.model_of(args)
     if args.node == "plant":
         return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
-    return lambda send: Firmware(send, gains_of(model))
+    return lambda send: Firmware(send, gains_of(model), model)

@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import meaning
 from plant.parameters import accept
@@ -76,7 +77,9 @@ class Parameter(_Ramped):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self.parameter.partition(".")[0] != "controller", "parameter",
+        group = self.parameter.partition(".")[0]
+        inside = group == "controller" or (group in CATALOGUE and CATALOGUE[group].firmware)
+        _require(not inside, "parameter",
                  f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under test, "
                  "no fault reaches into it")
 
