@@ -1,10 +1,11 @@
-"""The plant's state as a flat array of floats and back: nested tuples for the physics, one buffer for whoever keeps it.
+"""Nested tuples as a flat array of floats and back: tuples for the physics, one buffer for whoever keeps them.
 
-The state of a model with effects nests their memories. `packers` writes the two conversions out as plain assignments,
-so that compiled code moves numbers between registers and the buffer and nothing else.
+The state of a model with effects nests their memories. The conversions are written out as plain assignments, so that
+compiled code moves numbers between registers and the buffer and nothing else.
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from plant.compile import Function
@@ -13,14 +14,28 @@ from plant.state import Memory, Ports, State
 
 def packers(state: State) -> tuple[Function, Function]:
     """`pack(state, array)` and `unpack(array) -> state` for states shaped as `state`."""
+    pack, unpack, _ = _converters(state, "", lambda i: f"a[{i}]")
+    return pack, unpack
+
+
+def lane_packers(shape: Any, width: int, first: int) -> tuple[Function, Function, int]:
+    """`keep(x, array, lane)` and `at(array, lane) -> x` for tuples like `shape`, and the first number after them.
+
+    In the buffer number f of a lane stands at f * width + lane; those of `shape` begin with f = `first`.
+    """
+    keep, at, numbers = _converters(shape, ", lane", lambda i: f"a[{(first + i) * width} + lane]")
+    return keep, at, first + numbers
+
+
+def _converters(shape: Any, lane: str, place: Callable[[int], str]) -> tuple[Function, Function, int]:
     kinds: dict[str, type[Any]] = {}
     paths: list[str] = []
-    built = _built(state, "s", kinds, paths)
-    stores = [f"    a[{i}] = {path}" for i, path in enumerate(paths)]
-    source = "\n".join(["def pack(s, a):", *stores, "def unpack(a):", f"    return {built}"])
+    built = _built(shape, "s", kinds, paths, place)
+    stores = [f"    {place(i)} = {path}" for i, path in enumerate(paths)]
+    source = "\n".join([f"def keep(s, a{lane}):", *stores, f"def at(a{lane}):", f"    return {built}"])
     made: dict[str, Any] = dict(kinds)
     exec(source, made)
-    return made["pack"], made["unpack"]
+    return made["keep"], made["at"], len(paths)
 
 
 def values(state: State) -> list[float]:
@@ -30,16 +45,17 @@ def values(state: State) -> list[float]:
     return [float(x) for x in array.values()]
 
 
-def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str]) -> str:
+def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str], place: Callable[[int], str]) -> str:
     """The expression that builds `x` from the array `a`; notes the tuple types it needs and the path to each number."""
     if not isinstance(x, tuple):
         paths.append(path)
-        return f"a[{len(paths) - 1}]"
+        return place(len(paths) - 1)
     named = getattr(x, "_fields", None)
     parts = [(part, f"{path}.{named[i]}" if named else f"{path}[{i}]") for i, part in enumerate(x)]
     # a bare number among ports or effects says that nothing is remembered there
     bare = isinstance(x, Ports) or not named
-    inner = ["0.0" if bare and not isinstance(part, tuple) else _built(part, p, kinds, paths) for part, p in parts]
+    inner = ["0.0" if bare and not isinstance(part, tuple) else _built(part, p, kinds, paths, place)
+             for part, p in parts]
     if not named:
         return f"({', '.join(inner)},)"
     kind = f"T{len(kinds)}"

@@ -2,15 +2,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import replay as replay_module
-from plant.compile import compiled
+from plant import block, flat
+from plant.compile import Function, compiled
+from plant.effects import CATALOGUE
 from plant.errors import InputError
-from plant.model import Model, bindings, kernel
+from plant.model import Model
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
@@ -45,13 +49,8 @@ class Lanes:
         Raises:
             InputError: shapes that do not fit.
         """
-        current, load = np.ascontiguousarray(current, float), np.ascontiguousarray(load, float)
-        where = np.empty(0) if position is None else np.ascontiguousarray(position, float)
-        records, out = self._records(values), np.empty((len(values), 3, len(current)))
-        run = compiled(replay_module.replay, bindings(self.model.effects))
-        for record, rows in zip(records, out, strict=True):
-            run(self.model.state(), current, load, where, anchor, record, self.steps, rows.T)
-        return out.transpose(0, 2, 1)
+        where = np.empty(0) if position is None else position
+        return self._run(values, current, load, where, anchor, False)
 
     def closed_loop(self, values: Array, com: Array, load: Array) -> Array:
         """The plant with its own controller over a command.
@@ -67,19 +66,56 @@ class Lanes:
         Raises:
             InputError: shapes that do not fit.
         """
-        com, load = np.ascontiguousarray(com, float), np.ascontiguousarray(load, float)
-        run, none = kernel("closed_loop", self.model.effects), np.zeros((len(com), 4))
-        out = np.empty((len(values), 4, len(com)))
-        for record, rows in zip(self._records(values), out, strict=True):
-            run(self.model.state(), com, load, none, record, self.steps, rows.T)
-        return out.transpose(0, 2, 1)
+        return self._run(values, com, load, np.empty(0), 0.0, True)
 
-    def _records(self, values: Array) -> Iterator[NDArray[np.void]]:
-        values = np.asarray(values, float)
+    def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool) -> Array:
+        values, driven, load, position = (np.ascontiguousarray(x, float) for x in (values, driven, load, position))
         if values.ndim != 2 or values.shape[1] != len(self.names):
             raise InputError("lanes", "values", f"one row a run of {len(self.names)} values, not shape {values.shape}")
-        record = self.model.record()
-        numbers = record.view(np.float64)
-        for row in values:
-            numbers[self._places] = row
-            yield record
+        if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
+            raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
+                             f"{driven.shape}, {load.shape} and {position.shape}")
+        buffers = self._buffers(values)
+        out = np.empty((len(buffers), block.WIDTH, 4 if closed else 3, len(driven)))
+        run, period = self._kernel(), float(self.model["controller.period"])
+
+        def work(i: int) -> None:
+            run(buffers[i], driven, load, position, float(anchor), closed, period, self.steps, out[i])
+
+        if min(self.workers, len(buffers)) < 2:
+            for i in range(len(buffers)):
+                work(i)
+        else:
+            with ThreadPoolExecutor(self.workers) as pool:
+                list(pool.map(work, range(len(buffers))))
+        return out.reshape(-1, *out.shape[2:])[:len(values)].transpose(0, 2, 1)
+
+    def _buffers(self, values: Array) -> Array:
+        """The blocks' buffers at the start, (blocks, numbers * WIDTH); idle lanes repeat the last run."""
+        _, first, numbers = _laid_out(self.model.effects, _laws(self.model.effects))
+        blocks = -(-len(values) // block.WIDTH)
+        a = np.zeros((blocks, numbers, block.WIDTH))
+        state, record = flat.values(self.model.state()), self.model.record().view(np.float64)
+        a[:, :len(state)] = np.array(state)[:, None]
+        a[:, first:first + len(record)] = record[:, None]
+        runs = np.minimum(np.arange(blocks * block.WIDTH), len(values) - 1).reshape(blocks, block.WIDTH)
+        for column, place in enumerate(self._places):
+            a[:, first + place] = values[runs, column]
+        return a.reshape(blocks, -1)
+
+    def _kernel(self) -> Function:
+        return _compiled(self.model.effects, _laws(self.model.effects))
+
+
+def _laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
+    return tuple(CATALOGUE[e].function for e in effects)  # a user's file may have been loaded anew
+
+
+@cache
+def _laid_out(effects: tuple[str, ...], laws: tuple[Any, ...]) -> tuple[dict[str, Function], int, int]:
+    return block.layout(effects)
+
+
+@cache
+def _compiled(effects: tuple[str, ...], laws: tuple[Any, ...]) -> Function:
+    return compiled(block.run, _laid_out(effects, laws)[0])

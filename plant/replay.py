@@ -5,9 +5,10 @@ from typing import Any
 
 from plant.compile import Function
 from plant.ports import at_position
-from plant.solve import cycle
+from plant.solve import cycle, sense
 from plant.state import Input, Ports, State
 
+SILENCE = (0.0, 0.0, 0.0, 0.0)  # no noise
 SETTLING = 50  # cycles, twice, that the transducer rests where the ram starts
 
 
@@ -23,6 +24,7 @@ def _with(*paths: str) -> Function:
 
 moved = _with("jack_position")
 showing = _with("sensed", "memory.position")
+sampled = _with("memory.command", "memory.reading")
 
 
 def shown(s: State, p: Any) -> Any:
@@ -57,11 +59,16 @@ def replay(s: State, current: Any, load: Any, position: Any, anchor: float, reco
         out: (n, 3), written.
     """
     p = record[0]
-    pull = anchor * p.controller.period
     s = rested(s, position[0], p, steps) if len(position) else shown(s, p)
     for k in range(len(current)):
-        out[k, 0], out[k, 1], out[k, 2] = s.sensed, s.pressure, s.spool_position
-        if len(position) and pull != 0.0 and position[k] == position[k]:
-            s = moved(s, s.jack_position + pull * (position[k] - s.sensed))
-        acting = current[k - 1] if k else 0.0
-        s = cycle(s, acting, load[k], 0.0, k * p.controller.period, record, steps)
+        t = k * p.controller.period
+        out[k, 0], out[k, 1], out[k, 2], m = sense(s, s.memory.reading, SILENCE, t, p)
+        s = sampled(s, s.memory.command, m)
+        if len(position):
+            s = moved(s, s.jack_position + pull(anchor * p.controller.period, position[k], s.sensed))
+        s = cycle(s, current[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
+
+
+def pull(share: float, measured: float, sensed: float) -> float:
+    """How far the ram is moved to the measured position, m: not at all where none was measured."""
+    return share * (measured - sensed) if measured == measured else 0.0
