@@ -16,14 +16,21 @@ class Compressibility(NamedTuple):
     volume: Annotated[float, Quantity("m3", "V", low=0, high=10)] = 1.5e-4
 
 
+class Metered(NamedTuple):
+    """The edges' part of the line in the step before."""
+
+    offset: float = 0.0
+    drive: float = 0.0
+
+
 @effect("valve", Compressibility, law="V/(4 B) P12' = GQ XS - GQ/GP P12 - AJ XJ' - CLK P12",
-        symptoms="resonance in P12", fitted=("coefficient",), starts=(3e-10, 1e-9, 2e-9),
+        symptoms="resonance in P12", memory=Metered, fitted=("coefficient",), starts=(3e-10, 1e-9, 2e-9),
         source="valve-controlled piston, Merritt 1967")
-def compressibility(x: Line, s: Any, u: Any, p: Any) -> Line:
+def compressibility(x: Line, m: Metered, s: Any, u: Any, p: Any) -> tuple[Line, Metered]:
     """The oil in the chambers is a spring between valve and ram.
 
-    The pressure is implicit in itself and takes the ram's speed of the start of the step, which damps nothing; where
-    the step is too long for that (h w near 2, w the resonance) it takes the more of the speed at its end.
+    The pressure is implicit in itself and takes speed and opening of the start of the step: a leapfrog, which damps
+    nothing. Where the step is too long for that (h w near 2, w the resonance) it takes the more of both at its end.
     """
     g = p.jack
     stored = 0.25 * p.compressibility.volume * p.compressibility.coefficient  # m3/Pa
@@ -31,8 +38,10 @@ def compressibility(x: Line, s: Any, u: Any, p: Any) -> Line:
     new = 1.0 / (1.0 + 8.0 * stored * g.mass / (step * step))  # (h w)^2 / ((h w)^2 + 8); 1 without compressibility
     rest = stored * x.slope / step
     share = 1.0 / (1.0 + rest)
-    offset = (rest * s.pressure + x.offset - x.slope * (1.0 - new) * s.jack_speed) * share
-    return Line(offset, x.slope * new * share, x.limit, x.drive * share)
+    old = 1.0 - new
+    offset = (rest * s.pressure + (new * x.offset + old * m.offset) - x.slope * old * s.jack_speed) * share
+    line = Line(offset, x.slope * new * share, x.limit, (new * x.drive + old * m.drive) * share)
+    return line, Metered(x.offset, x.drive)
 
 
 class OrificeRoot(NamedTuple):
