@@ -66,7 +66,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
     out = np.empty((len(com), 4))
     record = model.record()
-    with _laws(model):
+    with laws(model):
         kernel("closed_loop", model.effects, fast)(model.state(), com, force, noise(seed, len(com)), record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
@@ -74,7 +74,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
 
 
 @contextmanager
-def _laws(model: Model) -> Iterator[None]:
+def laws(model: Model) -> Iterator[None]:
     """What a user's own law does wrong is told as bad input: numba and Python raise what they like."""
     try:
         yield
@@ -127,7 +127,7 @@ class Actuator:
     def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
         self.model, self.steps = model, steps
         self.cycle = 0
-        with _laws(model):
+        with laws(model):
             state = model.state()
         self._flat = np.array(values(state))
         self._unpack = packers(state)[1]
@@ -154,7 +154,7 @@ class Actuator:
         Raises:
             InputError: an effect's law that cannot be compiled.
         """
-        with _laws(self.model):
+        with laws(self.model):
             self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
             if self._read:
                 self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)

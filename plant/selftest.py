@@ -1,0 +1,83 @@
+"""What every effect must keep to, whoever wrote it, tried on a command: `rig effects NAME --test` shows it."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.effects import CATALOGUE, Effect
+from plant.model import Model
+from plant.run import simulate
+from plant.starts import changes, levels, rms, starts_of
+
+Array = NDArray[np.float64]
+STEPS = 20  # steps a cycle where plain Python runs too
+SHORT = np.concatenate([np.zeros(5), np.full(25, 2e-3), np.linspace(2e-3, -1e-3, 20)])  # m, what it runs
+
+
+class Shown(NamedTuple):
+    """What an effect of one size changes: RMS over a command, and over the noise of the sensor."""
+
+    start: Mapping[str, float]
+    xj: float  # m
+    p12: float  # Pa
+    xs: float  # m
+    level: float  # largest of the three over its sensor's noise; 1 is as large as the noise
+
+
+class Report(NamedTuple):
+    """What was tried on an effect, and how it went; `faults` in words, none if all is well."""
+
+    effect: str
+    faults: tuple[str, ...]
+    shown: tuple[Shown, ...]
+
+    @property
+    def visible(self) -> bool:
+        """Whether its largest size shows above the noise on the command it was tried on."""
+        return any(shown.level >= 1.0 for shown in self.shown)
+
+
+def examine(name: str, command: Array, load: Array | None = None) -> Report:
+    """Try an effect of the catalogue on `command` (n,) m and `load` (n,) N.
+
+    Raises:
+        InputError: a law that cannot be compiled and run.
+    """
+    effect = CATALOGUE[name]
+    if effect.base or effect.disturbance:
+        return Report(name, (), ())
+    starts = starts_of(effect, command, load)
+    change = changes(effect, starts, command, load) if starts else np.zeros((0, len(command), 3))
+    shown = tuple(Shown(dict(start), xj, p12, xs, most) for start, (xj, p12, xs), most in zip(
+        starts, rms(change).tolist(), levels(change).max(axis=1, initial=0.0).tolist(), strict=True))
+    return Report(name, tuple(_faults(effect, starts, command, load)), shown)
+
+
+def _faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array, load: Array | None) -> list[str]:
+    bare, off = Model(), Model().having([effect.name])
+    faults = []
+    if not _equal(simulate(bare, command, load), simulate(off, command, load)):
+        faults.append("at its off value it changes the plant")
+    if not starts:
+        faults.append("no size of it changes anything on this command")
+    for start in starts:
+        if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all():
+            faults.append(f"with {_said(start)} the plant has no number any more")
+    if starts and not faults:
+        model, said = off.replace(starts[-1]), _said(starts[-1])
+        if not _equal(*(simulate(model, command, load) for _ in range(2))):
+            faults.append(f"with {said} two runs of one seed differ")
+        if not _equal(*(simulate(model, SHORT, steps=STEPS, fast=fast) for fast in (True, False))):
+            faults.append(f"with {said} compiled code and plain Python differ")
+    return faults
+
+
+def _said(start: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:g}" for name, value in start.items())
+
+
+def _equal(one: tuple[Array, ...], other: tuple[Array, ...]) -> bool:
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))

@@ -1,0 +1,160 @@
+"""How large an effect shows, and from there sizes to start a fit or a scan at, for effects that name none."""
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.effects import CATALOGUE, Effect
+from plant.lanes import Lanes
+from plant.model import Model, initial, kernel
+from plant.quantity import Quantity
+from plant.run import laws, simulate
+
+Array = NDArray[np.float64]
+VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
+SHAPES = (1.0, 0.4, 2.5)  # times the usual value, for a parameter that does nothing alone
+DECADES = (-15, 13)  # where the size of a parameter without a hint is looked for
+ANCHOR = 2.0  # 1/s
+NOISE = {f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")}
+PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
+_NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^\s,;:]*)")
+
+
+def starts_of(effect: Effect, command: Array, load: Array | None = None) -> tuple[Mapping[str, float], ...]:
+    """Values of all fitted parameters to start from: the effect's own, or found from its ranges and its visibility.
+
+    A parameter that says in what range it is typical ("0.2-5 kN") starts at both ends and between. Of one that says
+    nothing, sizes are looked for that change what the sensors see over `command` by 3, 30 and 300 times their noise.
+
+    Args:
+        effect: with a law.
+        command: (n,) demand, m, one a cycle.
+        load: (n,) external force, N; none by default.
+
+    Returns:
+        Starts, "group.field" to SI value; none when nothing can be seen over this command.
+
+    Raises:
+        InputError: a law that cannot be compiled and run.
+    """
+    if effect.starts or effect.base or not effect.fitted:
+        return effect.starts
+    usual = {name: effect.off[name] for name in effect.fitted}
+    sized = {name: sizes for name in usual if (sizes := _sizes(effect, name, command, load))}
+    found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
+    for name, value in usual.items():
+        if name not in sized and (value or hinted(effect.parameters[name])):
+            shapes = hinted(effect.parameters[name]) or [
+                _within(effect.parameters[name], factor * value) for factor in SHAPES]
+            found = [start | {name: shape} for start in found for shape in dict.fromkeys(shapes)]
+    return tuple(found)
+
+
+def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effect:
+    """The effect of that name, which from now on has starts in the catalogue; see `starts_of`."""
+    effect = CATALOGUE[name]
+    if not effect.starts:
+        CATALOGUE[name] = effect = replace(effect, starts=starts_of(effect, command, load))
+    return effect
+
+
+def changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
+            load: Array | None = None) -> Array:
+    """What an effect changes when the nominal plant is driven by the same current, without noise.
+
+    An effect in the firmware changes no plant: then the first column is its current over the loop's gain, m, when it
+    sees the same positions, and the others are zero.
+
+    Args:
+        effect: any of the catalogue.
+        values: m sets of parameters, SI.
+        command: (n,) demand, m, that the nominal closed loop makes the current from.
+        load: (n,) external force, N.
+
+    Returns:
+        (m, n, 3): change of XJ m, P12 Pa, XS m.
+    """
+    bare = Model().replace(NOISE)
+    force = np.zeros_like(command) if load is None else load
+    run = simulate(bare, command, force)
+    model = bare if effect.base else bare.having([effect.name])
+    if effect.firmware:
+        return _in_firmware(model, values, run.com, run.xj)
+    names = list(dict.fromkeys(name for row in values for name in row))
+    rows = [[model[name] for name in names], *([row.get(name, model[name]) for name in names] for row in values)]
+    with laws(model):
+        out = Lanes(model, names).replay(np.array(rows), run.cor, force, run.xj, ANCHOR)
+    return out[1:] - out[:1]
+
+
+def rms(change: Array) -> Array:
+    """RMS of each column of `changes` (m, n, 3), SI, (m, 3); infinite where a run has no number any more."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        square: Array = (change**2).mean(axis=1)
+    return np.sqrt(np.nan_to_num(square, nan=np.inf, posinf=np.inf))
+
+
+def levels(change: Array) -> Array:
+    """`rms` of `changes` (m, n, 3) over the noise of each column's sensor, (m, 3)."""
+    noise: Array = rms(change) / np.array([Model()[name] for name in NOISE])
+    return noise
+
+
+def _in_firmware(model: Model, values: Sequence[Mapping[str, float]], com: Array, xj: Array) -> Array:
+    out = np.zeros((len(values) + 1, len(com), 3))
+    for row, changed in zip(out, ({}, *values), strict=True):
+        with laws(model):
+            kernel("firmware", model.effects)(initial(model.effects).memory.command, com, xj,
+                                              model.replace(changed).record(), row[:, 0])
+    return (out[1:] - out[:1]) / model["controller.proportional_gain"]
+
+
+def _sizes(effect: Effect, name: str, command: Array, load: Array | None) -> list[float]:
+    """Values of one parameter that can be seen with the others as usual; both signs where it may be negative."""
+    quantity, off = effect.parameters[name], effect.off[name]
+
+    def seen(values: Array) -> Array:
+        change = changes(effect, [{name: float(x)} for x in values], command, load)
+        highest: Array = levels(change).max(axis=1)
+        return highest
+
+    if hints := hinted(quantity):
+        return hints if seen(np.array(hints)).max() > 0.0 else []
+    found: list[float] = []
+    for sign in (1.0, -1.0):
+        decades = off + sign * np.logspace(*DECADES, DECADES[1] - DECADES[0] + 1)
+        decades = decades[[not quantity.refuses(x) for x in decades]]
+        shown = seen(decades) if len(decades) else decades
+        for level in VISIBLE:
+            above = np.flatnonzero(shown >= level)
+            if not len(above):
+                break
+            i = above[0]
+            finer = off + sign * np.geomspace(abs(decades[max(i - 1, 0)] - off), abs(decades[i] - off), 9)
+            distance = np.abs(np.log(np.clip(seen(finer), 1e-9, 1e9) / level))
+            found.append(float(finer[distance.argmin()]))
+    return list(dict.fromkeys(found))
+
+
+def hinted(quantity: Quantity) -> list[float]:
+    """Both ends of the typical range, where that is one ("0.2-5 kN"), and what lies between; in SI.
+
+    >>> hinted(Quantity("N", low=0, typical="1-4 kN"))
+    [1000.0, 2000.0, 4000.0]
+    """
+    said = _RANGE.match(quantity.typical)
+    if not said:
+        return []
+    low, high, unit = float(said[1]), float(said[2]), said[3]
+    factor = PREFIXES.get(unit.removesuffix(quantity.unit), 1.0) if unit.endswith(quantity.unit) else 1.0
+    sizes = [_within(quantity, x * factor) for x in (low, (low * high) ** 0.5, high)]
+    return [x for size in sizes for x in ((size, -size) if not quantity.refuses(-size) else (size,))]
+
+
+def _within(quantity: Quantity, x: float) -> float:
+    return min(max(x, quantity.low), quantity.high)
