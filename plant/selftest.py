@@ -63,7 +63,7 @@ def _faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Ar
         faults.append("at its off value it changes the plant")
     if not starts:
         faults.append("no size of it changes anything on this command")
-    for start in starts:
+    for start in (*starts, *extremes(effect)):
         if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all():
             faults.append(f"with {_said(start)} the plant has no number any more")
     if starts and not faults:
@@ -73,6 +73,12 @@ def _faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Ar
         if not _equal(*(simulate(model, SHORT, steps=STEPS, fast=fast) for fast in (True, False))):
             faults.append(f"with {said} compiled code and plain Python differ")
     return faults
+
+
+def extremes(effect: Effect) -> list[dict[str, float]]:
+    """The ends of the range of each fitted parameter: far out, but a plant that is there must have a number."""
+    ranges = {name: effect.parameters[name] for name in effect.fitted}
+    return [{name: end} for name, q in ranges.items() for end in (q.low, q.high) if not q.refuses(end)]
 
 
 def _said(start: Mapping[str, float]) -> str:

@@ -151,7 +151,12 @@ def hinted(quantity: Quantity) -> list[float]:
     if not said:
         return []
     low, high, unit = float(said[1]), float(said[2]), said[3]
-    factor = PREFIXES.get(unit.removesuffix(quantity.unit), 1.0) if unit.endswith(quantity.unit) else 1.0
+    if quantity.unit == "1":
+        factor = 0.01 if unit == "%" else 1.0
+    elif unit.endswith(quantity.unit) and unit.removesuffix(quantity.unit) in PREFIXES:
+        factor = PREFIXES[unit.removesuffix(quantity.unit)]
+    else:
+        return []
     sizes = [_within(quantity, x * factor) for x in (low, (low * high) ** 0.5, high)]
     return [x for size in sizes for x in ((size, -size) if not quantity.refuses(-size) else (size,))]
 

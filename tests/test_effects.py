@@ -1,254 +1,206 @@
-"""One suite for everything in the catalogue, and what effects with memory and a user's own must do."""
+"""One suite for everything in the catalogue: what it says of itself, and what every law must keep to."""
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 import pytest
-from effect_files import COGGING, HEAD, MEMORY, STIFF, restored_catalogue
+from effects_cases import EASY, LAWS, QUIET_SPOOL, WHOLE
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physics_cases import SILENT
+from physics_cases import PREFLIGHT, SILENT
 
 from plant import Actuator, InputError, Model, simulate
-from plant.effects import CATALOGUE, load_effects
-from plant.effects.sensors import Lag, sensor_lag
-from plant.state import Input, State
+from plant.effects import CATALOGUE
+from plant.model import meaning
+from plant.parameters import nominal
+from plant.selftest import extremes
+from plant.starts import changes, hinted, levels
 
-# A value met in practice for each effect: enough to be seen.
-TYPICAL: dict[str, dict[str, float]] = {
-    "filter_clogging": {"filter.clogging": 0.3},
-    "spool_friction": {"spool.static_friction": 35.0, "spool.dynamic_friction": 25.0},
-    "jack_friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0},
-    "viscous_drag": {"jack.damping": 10e3},
-    "moving_mass": {"jack.mass": 200.0},
-    "internal_leakage": {"jack.leakage": 3e-11},
-    "null_bias": {"null_bias.current": 2e-4},
-    "current_noise": {"current_noise.white": 1e-4, "current_noise.hum": 1e-4},
-    "spool_overlap": {"spool_overlap.overlap": 20e-6},
-    "constant_load": {"constant_load.force": 2e3},
-    "aero_stiffness": {"aero_stiffness.stiffness": 5e5},
-    "sensor_offset": {"sensor_offset.offset": 50e-6},
-    "sensor_lag": {"sensor_lag.time": 2e-3},
-}
-LAWS = [name for name, entry in CATALOGUE.items() if not entry.base]
-BASES = [name for name, entry in CATALOGUE.items() if entry.base]
+CANONICAL = (
+    "filter_clogging", "spool_friction", "jack_friction", "viscous_drag", "moving_mass", "internal_leakage",
+    "null_bias", "torque_motor_hysteresis", "coil_lag", "current_limit", "nozzle_asymmetry", "feedback_gap",
+    "spool_overlap", "spool_underlap", "orifice_root", "flow_force", "supply_droop", "supply_ripple", "compressibility",
+    "viscosity_drift", "stribeck", "presliding", "friction_asymmetry", "mount_compliance", "rod_backlash",
+    "aero_stiffness", "constant_load", "sensor_lag", "sensor_gain", "sensor_offset", "quantisation", "transport_delay",
+    "command_rate_limit",
+)
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
-FEW = 20  # steps a cycle where plain Python runs too
+SHORT = np.r_[np.zeros(3), np.full(22, 3e-3)]  # what plain Python runs
+FEW = 20  # steps a cycle
+BASES = [name for name, entry in CATALOGUE.items() if entry.base]
+EACH = [pytest.param(name, i, id=f"{name} {i}") for name in CANONICAL for i in range(len(CATALOGUE[name].starts))]
+NOISY = {"current_noise.white": 1e-4, "current_noise.hum": 1e-4}
+# shown by driving the plant with the current of a nominal one, under this load
+LOADED = {"internal_leakage": 5e3, "orifice_root": 10e3}
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Iterator[Path]:
-    """A place for an effect file; what it registers is forgotten afterwards."""
-    with restored_catalogue():
-        yield tmp_path / "mine.py"
+def largest(name: str) -> dict[str, float]:
+    return dict(CATALOGUE[name].starts[-1]) if name != "current_noise" else NOISY
 
 
-def columns(model: Model, **options) -> np.ndarray:
-    return np.array(simulate(model, COMMAND, **options))
+def columns(model: Model, command: np.ndarray = COMMAND, **options) -> np.ndarray:
+    return np.array(simulate(model, command, **options))
 
 
-def same_interpreted(model: Model, cycles: int = 40) -> bool:
-    short = COMMAND[:cycles]
-    fast, slow = (np.array(simulate(model, short, seed=3, steps=FEW, fast=fast)) for fast in (True, False))
+def same_interpreted(model: Model) -> bool:
+    fast, slow = (columns(model, SHORT, seed=3, steps=FEW, fast=fast) for fast in (True, False))
     return bool((fast == slow).all())
 
 
-def test_every_effect_has_a_typical_value_here() -> None:
-    assert set(TYPICAL) == set(CATALOGUE)
-    assert all(set(TYPICAL[name]) <= set(CATALOGUE[name].parameters) for name in TYPICAL)
+def test_the_catalogue_is_the_canonical_one() -> None:
+    assert set(CATALOGUE) == {*CANONICAL, "current_noise"}
 
 
-@pytest.mark.parametrize("name", TYPICAL)
-def test_finite_and_deterministic(name: str) -> None:
-    model = Model().replace(TYPICAL[name])
-    once, again = columns(model, seed=1), columns(model, seed=1)
-    assert np.isfinite(once).all()
-    assert (once == again).all()
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_it_says_what_it_is(name: str) -> None:
+    e = CATALOGUE[name]
+    assert e.law and e.symptoms and e.source and e.parameters
+    assert e.base or e.function.__doc__
+    assert set(e.fitted) <= set(e.parameters) and bool(e.fitted) == (not e.disturbance)
+    for other in e.confused_with:
+        assert other in CATALOGUE or meaning(other)
+        assert other not in CATALOGUE or name in CATALOGUE[other].confused_with
+    assert all(name in CATALOGUE[other].excludes for other in e.excludes)
+    assert e.firmware == (name == "command_rate_limit")
+
+
+@pytest.mark.parametrize("name", CANONICAL)
+def test_its_starts_are_values_that_it_allows(name: str) -> None:
+    e, usual = CATALOGUE[name], nominal() | dict(CATALOGUE[name].off)
+    assert len(e.starts) >= 2
+    for start in e.starts:
+        assert tuple(start) == e.fitted
+        assert not any(e.parameters[parameter].refuses(value) for parameter, value in start.items())
+        assert start != {parameter: usual[parameter] for parameter in start}
+        assert e.acts(start) or e.base
+    for parameter, quantity in e.parameters.items():  # what is said to be typical is what a fit tries
+        for value in hinted(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
+            sizes = [abs(start[parameter]) for start in e.starts]
+            assert min(sizes) / 4 <= abs(value) <= 4 * max(sizes)
+
+
+@pytest.mark.parametrize("steps", [FEW, 50, 100])
+def test_the_whole_catalogue_at_its_off_values_changes_no_bit(steps: int) -> None:
+    load = np.linspace(0.0, 8e3, len(COMMAND))
+    bare, off = (columns(m, load=load, seed=1, steps=steps) for m in (Model(), Model().having(LAWS)))
+    assert (bare == off).all()
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_absent_at_its_off_value(name: str) -> None:
-    """Bit for bit, so that a fit may start there."""
-    assert (columns(Model().having([name])) == columns(Model())).all()
+    """Alone, in plain Python: bit for bit the plant without it."""
+    alone, bare = (columns(m, SHORT, seed=2, steps=FEW, fast=False) for m in (Model().having([name]), Model()))
+    assert (alone == bare).all()
 
 
-@pytest.mark.parametrize("name", TYPICAL)
-def test_visible_at_a_typical_value(name: str) -> None:
-    with_it, without = simulate(SILENT.replace(TYPICAL[name]), COMMAND), simulate(SILENT, COMMAND)
+@pytest.mark.parametrize("name", LAWS)
+def test_compiled_equals_interpreted_alone_or_with_the_others(name: str) -> None:
+    """Compiled with the whole catalogue and interpreted by itself: the same numbers."""
+    fast = columns(Model().having(LAWS).replace(largest(name)), SHORT, seed=3, steps=FEW)
+    slow = columns(Model().replace(largest(name)), SHORT, seed=3, steps=FEW, fast=False)
+    assert (fast == slow).all()
+
+
+def test_the_reference_model_compiled_equals_interpreted() -> None:
+    everything = {k: v for name in BASES for k, v in largest(name).items()}
+    gains = {"controller.integral_gain": 20.0, "controller.derivative_gain": 1e-3}
+    assert same_interpreted(Model().having(LAWS).replace(everything | gains))
+
+
+def test_all_at_once() -> None:
+    """Each at its smallest start, but for the one that another excludes; finite, and the same in plain Python."""
+    together = {k: v for name in CANONICAL if name != "spool_underlap" for k, v in CATALOGUE[name].starts[0].items()}
+    model = Model().having(LAWS).replace(together | NOISY)
+    assert np.isfinite(columns(model)).all()
+    assert same_interpreted(model)
+
+
+@given(st.sets(st.sampled_from([name for name in LAWS if name != "spool_underlap"]), min_size=2, max_size=4))
+@settings(max_examples=2, deadline=None, derandomize=True)
+def test_sets_of_effects_compiled_equal_interpreted(names: set[str]) -> None:
+    model = Model().replace({k: v for name in names for k, v in largest(name).items()})
+    assert set(model.effects) == names
+    assert same_interpreted(model)
+
+
+@pytest.mark.parametrize(("name", "i"), EACH)
+def test_finite_and_deterministic_over_the_preflight(name: str, i: int) -> None:
+    model = WHOLE.replace(CATALOGUE[name].starts[i])
+    once = columns(model, PREFLIGHT, seed=1, steps=FEW)
+    assert np.isfinite(once).all()
+    assert i or (once == columns(model, PREFLIGHT, seed=1, steps=FEW)).all()
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_finite_at_the_ends_of_its_range(name: str) -> None:
+    for values in extremes(CATALOGUE[name]):
+        assert np.isfinite(columns(WHOLE.replace(values), steps=FEW)).all(), values
+
+
+@cache
+def nominal_change(name: str) -> np.ndarray:
+    """Levels over the sensors' noise of all starts of an effect, (starts, 3), driven by the nominal plant's current."""
+    load = np.full(len(PREFLIGHT), LOADED.get(name, 0.0))
+    return levels(changes(CATALOGUE[name], CATALOGUE[name].starts, PREFLIGHT, load))
+
+
+@pytest.mark.parametrize("name", ["command_rate_limit", "spool_overlap", "internal_leakage", "orifice_root"])
+def test_more_of_it_shows_more(name: str) -> None:
+    level = nominal_change(name).max(axis=1)
+    assert level[-1] > 3.0 and (np.diff(level) > 0.0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in CANONICAL if name != "internal_leakage"])
+def test_visible_at_its_largest_start(name: str) -> None:
+    """In closed loop over the preflight, without the phase of the spool's stick-slip, above the noise of one sensor."""
+    with_it, without = (simulate(m, PREFLIGHT, steps=FEW) for m in (QUIET_SPOOL.replace(largest(name)), QUIET_SPOOL))
     seen = [np.sqrt(((a - b) ** 2).mean()) / noise for a, b, noise in (
         (with_it.xj, without.xj, 2e-6), (with_it.p12, without.p12, 2e4), (with_it.xs, without.xs, 1e-6))]
     assert max(seen) > 1.0
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_compiled_equals_interpreted(name: str) -> None:
-    assert same_interpreted(Model().replace(TYPICAL[name]))
+@pytest.mark.parametrize("name", CANONICAL)
+def test_it_converges_with_the_step(name: str) -> None:
+    """50 us against 5 us over steps and a sine: what a fit runs is the plant to a fraction of the sensors' noise."""
+    dry = CATALOGUE[name].port == "jack_drag"  # a knife's edge is no matter of the step: friction only where it acts
+    model = (QUIET_SPOOL if dry else EASY).replace(CATALOGUE[name].starts[len(CATALOGUE[name].starts) // 2])
+    coarse, fine = (simulate(model, COMMAND, steps=steps) for steps in (20, 200))
+    assert np.sqrt(((coarse.xj - fine.xj) ** 2).mean()) < 1e-6
+    assert np.sqrt(((coarse.xs - fine.xs) ** 2).mean()) < 0.5e-6
 
 
-def test_the_reference_model_compiled_equals_interpreted() -> None:
-    everything = {k: v for name in BASES for k, v in TYPICAL[name].items()}
-    assert same_interpreted(Model().replace(everything | {"controller.integral_gain": 20.0,
-                                                          "controller.derivative_gain": 1e-3}))
-
-
-@given(st.sets(st.sampled_from(LAWS), min_size=2, max_size=4))
-@settings(max_examples=3, deadline=None, derandomize=True)
-def test_sets_of_effects_compiled_equal_interpreted(names: set[str]) -> None:
-    model = Model().replace({k: v for name in names for k, v in TYPICAL[name].items()})
-    assert set(model.effects) == names
-    assert same_interpreted(model)
-    assert np.isfinite(columns(model)).all()
+def test_the_actuator_with_the_whole_catalogue_is_the_simulation() -> None:
+    model = Model().having(LAWS).replace({"quantisation.lsb": 5e-6, "rod_backlash.width": 5e-5,
+                                          "transport_delay.cycles": 1.5, "presliding.deflection": 2e-5})
+    run, plant = simulate(model, COMMAND, seed=5), Actuator(model, seed=5)
+    for k, current in enumerate([0.0, *run.cor[:-1].tolist()]):
+        assert plant.sample() == (run.xj[k], run.p12[k], run.xs[k])
+        plant.advance(current)
 
 
 def test_the_order_in_which_effects_are_named_does_not_matter() -> None:
-    changes = TYPICAL["sensor_lag"] | TYPICAL["sensor_offset"] | TYPICAL["null_bias"]
-    back = dict(reversed(list(changes.items())))
-    assert Model().replace(changes).effects == Model().replace(back).effects  # and so the same code
-    assert Model().replace(changes).values == Model().replace(back).values
+    changed = largest("sensor_lag") | largest("sensor_offset") | largest("null_bias")
+    back = dict(reversed(list(changed.items())))
+    assert Model().replace(changed).effects == Model().replace(back).effects  # and so the same code
+    assert Model().replace(changed).values == Model().replace(back).values
 
 
-def test_two_effects_at_one_port_both_act() -> None:
-    load = {"constant_load.force": 1000.0, "aero_stiffness.stiffness": 5e5}
-    plain = SILENT.replace({"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0})
-    run = simulate(plain.replace(load), np.full(600, 2e-3))
-    assert run.p12[-100:].mean() * plain["jack.area"] == pytest.approx(1000.0 + 5e5 * run.xj[-100:].mean(), rel=0.01)
+def test_what_excludes_each_other_may_stand_side_by_side_but_not_act() -> None:
+    both = Model().having(["spool_overlap", "spool_underlap"])
+    assert both.replace({"spool_overlap.overlap": 1e-5}).effects == ("spool_overlap", "spool_underlap")
+    with pytest.raises(InputError, match="not both at work"):
+        both.replace({"spool_overlap.overlap": 1e-5, "spool_underlap.underlap": 1e-5})
 
 
-def test_constant_load_equals_the_load_of_the_command() -> None:
-    by_effect = simulate(SILENT.replace({"constant_load.force": 1500.0}), COMMAND)
-    by_input = simulate(SILENT, COMMAND, load=np.full(len(COMMAND), 1500.0))
-    assert (by_effect.xj == by_input.xj).all()
+def test_the_hint_of_a_range_is_read_with_its_unit() -> None:
+    typical = {name: hinted(q) for e in CATALOGUE.values() for name, q in e.parameters.items()}
+    assert typical["constant_load.force"] == pytest.approx([200, -200, 1000, -1000, 5000, -5000])
+    assert typical["spool_overlap.overlap"] == pytest.approx([5e-6, 17.3e-6, 60e-6], rel=1e-2)
+    assert typical["compressibility.coefficient"] == pytest.approx([0.7e-9, 1.18e-9, 2e-9], rel=1e-2)
+    assert typical["orifice_root.share"] == []
 
 
-def test_null_bias_shifts_position_and_not_pressure() -> None:
-    smooth = SILENT.replace({f"{b}.{k}_friction": 0.0 for b in ("spool", "jack") for k in ("static", "dynamic")})
-    run = simulate(smooth.replace(TYPICAL["null_bias"]), np.zeros(600))
-    assert run.xj[-1] == pytest.approx(2e-4 / smooth["controller.proportional_gain"], rel=1e-3)
-    assert run.p12[-1] == pytest.approx(0.0, abs=1.0)
-
-
-@pytest.mark.parametrize("tau", [0.3e-3, 3e-3])
-@pytest.mark.parametrize("signal", ["step", "ramp", "sine"])
-def test_sensor_lag_is_a_first_order_lag(tau: float, signal: str) -> None:
-    h = 1e-5
-    p = SILENT.replace({"sensor_lag.time": tau}).record()[0]
-    t, w = np.arange(1, 4001) * h, 2 * np.pi * 40
-    x, expected = {
-        "step": (np.full_like(t, 1e-3), 1e-3 * (1 - np.exp(-(t - h / 2) / tau))),  # it rises within the first step
-        "ramp": (t, t - tau * (1 - np.exp(-t / tau))),
-        "sine": (np.sin(w * t), (np.sin(w * t) - w * tau * (np.cos(w * t) - np.exp(-t / tau))) / (1 + (w * tau) ** 2)),
-    }[signal]
-    m, sensed = Lag(), np.empty_like(x)
-    for i, value in enumerate(x):
-        sensed[i], m = sensor_lag(value, m, State(), Input(h=h), p)
-    np.testing.assert_allclose(sensed, expected, atol=2e-4 * np.abs(x).max())
-
-
-def test_sensor_lag_in_the_loop() -> None:
-    """At constant speed the transducer is behind by the speed times its time constant."""
-    plant = Actuator(SILENT.replace({"sensor_lag.time": 2e-3}))
-    for _ in range(100):
-        plant.advance(2e-3)
-    lag = plant.state.jack_position - plant.sample()[0]
-    assert lag == pytest.approx(2e-3 * plant.state.jack_speed, rel=1e-3)
-
-
-@pytest.mark.parametrize("more", [{}, {"sensor_lag.time": 2e-3}])
-def test_the_first_sample_has_the_sensors_offset(more: dict[str, float]) -> None:
-    """The transducer shows it before the plant has made a step."""
-    model = SILENT.replace({"sensor_offset.offset": 50e-6} | more)
-    for fast in (True, False):
-        plant = Actuator(model, steps=FEW, fast=fast)
-        run = simulate(model, np.zeros(3), steps=FEW, fast=fast)
-        assert plant.sample()[0] == run.xj[0] == 50e-6
-        assert run.cor[0] == -50e-6 * model["controller.proportional_gain"]
-        plant.advance(0.0)
-        assert plant.sample()[0] == run.xj[1] == 50e-6  # nor is there a jump in the second
-
-
-def test_a_position_law_that_cannot_run_is_refused(file: Path) -> None:
-    file.write_text(COGGING.replace('"load"', '"position"').replace("p.cogging.force", "p.cogging.farce"))
-    load_effects(file)
-    with pytest.raises(InputError, match="cogging"):
-        Actuator(Model().having(["cogging"]))
-
-
-def test_the_users_effect_is_found_and_acts(file: Path) -> None:
-    file.write_text(STIFF.format(scale=1.0))
-    assert load_effects(file) == ["spring"]
-    model = SILENT.replace({"spring.stiffness": 5e5})
-    ours = columns(SILENT.replace({"aero_stiffness.stiffness": 5e5}))
-    assert np.abs(columns(model)[2] - ours[2]).max() < 5e-6  # the same physics, at the start of the step not its middle
-    assert same_interpreted(model)
-    assert (columns(Model().having(["spring"])) == columns(Model())).all()
-
-
-def test_the_users_effect_with_memory(file: Path) -> None:
-    file.write_text(MEMORY)
-    load_effects(file)
-    model = SILENT.replace({"wear.rate": 3e5, "constant_load.force": 100.0})
-    assert same_interpreted(model)
-    plant, way, last = Actuator(model), 0.0, 0.0
-    for current in 4e-3 * np.sin(np.arange(300) * 0.05):
-        plant.advance(current)
-        way += abs(plant.state.jack_position - last)
-        last = plant.state.jack_position
-    assert plant.state.memory.load[1].travelled == pytest.approx(way, rel=0.01)
-    assert way > 1e-3
-
-
-def test_the_users_effect_runs_at_full_speed(file: Path) -> None:
-    file.write_text(STIFF.format(scale=1.0))
-    load_effects(file)
-    long = np.tile(COMMAND, 8)
-
-    def cost(model: Model) -> float:
-        def once() -> float:
-            start = time.perf_counter()
-            simulate(model, long)
-            return time.perf_counter() - start
-        once()
-        return min(once() for _ in range(7))
-
-    assert cost(SILENT.replace({"spring.stiffness": 1e5})) < 2.0 * cost(SILENT)
-
-
-@pytest.mark.parametrize(("text", "said"), [
-    ("effect(", "a file that Python can run"),
-    ("import no_such_module", "a file that Python can run"),
-    ("x = 1 / 0", "ZeroDivisionError"),
-    ("x = 1", "at least one function marked @effect"),
-    (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
-    (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
-    (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
-    (HEAD + "raise ValueError('two\\nlines')", "a file that Python can run"),
-])
-def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
-    file.write_text(text)
-    with pytest.raises(InputError) as caught:
-        load_effects(file)
-    assert said in str(caught.value)
-    assert str(file) in str(caught.value)
-
-
-def test_a_file_with_annotations_as_text(file: Path) -> None:
-    file.write_text("from __future__ import annotations\n" + MEMORY)
-    assert load_effects(file) == ["wear"]
-    assert CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a Python file with effects"):
-        load_effects(tmp_path / "none.py")
-
-
-@pytest.mark.parametrize("body", ["return x + p.cogging.farce", "return x + open('f')", "return [x, 'text']"])
-def test_a_law_that_cannot_run_is_refused(file: Path, body: str) -> None:
-    start = COGGING.index("    return x +")
-    file.write_text(COGGING[:start] + f"    {body}\n")
-    load_effects(file)
-    with pytest.raises(InputError, match="cogging"):
-        simulate(Model().having(["cogging"]), COMMAND)
+def test_a_silent_plant_is_not_woken_by_its_effects() -> None:
+    """At rest, without load or command, the catalogue at its off values leaves everything zero."""
+    assert not columns(SILENT.having(LAWS), np.zeros(50))[1:].any()

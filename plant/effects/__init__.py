@@ -56,6 +56,11 @@ class Effect:
     source: str = ""  # where the law is from
 
     @property
+    def file(self) -> Path | None:
+        """Where its law is written; None for those of the reference model."""
+        return Path(self.function.__code__.co_filename) if self.function else None
+
+    @property
     def firmware(self) -> bool:
         """True when it acts in the controller: seen in Cor against Com and XJ alone."""
         return self.port == "command"
@@ -104,7 +109,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
         name = function.__name__
-        if name in GROUPS or (name in CATALOGUE and _file(CATALOGUE[name]) != Path(function.__code__.co_filename)):
+        if name in GROUPS or (name in CATALOGUE and CATALOGUE[name].file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
         if set(group._fields) - set(group._field_defaults):
             raise ValueError(f"{name}: every parameter needs a default, its off value")
@@ -145,14 +150,10 @@ def load_effects(path: Path) -> list[str]:
         exec(compile(path.read_bytes(), path, "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
-    new = [name for name, entry in CATALOGUE.items() if _file(entry) == path]
+    new = [name for name, entry in CATALOGUE.items() if entry.file == path]
     if not new:
         raise InputError(path, "", "at least one function marked @effect(...)")
     return new
-
-
-def _file(entry: Effect) -> Path | None:
-    return Path(entry.function.__code__.co_filename) if entry.function else None
 
 
 def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:

@@ -36,10 +36,10 @@ def run(args: argparse.Namespace) -> int:
     from plant.effects import CATALOGUE
     from plant.model import entry
 
-    shipped = set(CATALOGUE)
     options.load_user_effects(args.effects)
     chosen = [entry(args.name)] if args.name else list(CATALOGUE.values())
-    tried = chosen if args.test or (args.name and args.name not in shipped) else []
+    own = {file.absolute() for file in args.effects}
+    tried = chosen if args.test or (args.name and chosen[0].file in own) else []
     reports = {e.name: _tried(e) for e in tried}
     rows = [describe(e) | ({"self_test": _rows(reports[e.name])} if e.name in reports else {}) for e in chosen]
     text = json.dumps({"effects": rows}, indent=None if args.json else 1)
