@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from plant import Model
 from rig import codec
 from rig.bus import Embedded
 from rig.codec import Drive, Feedback, ValveState
@@ -101,8 +102,8 @@ class FirmwareDesk(Desk):
 
     node: Firmware
 
-    def __init__(self) -> None:
-        super().__init__(Firmware)
+    def __init__(self, model: Model | None = None) -> None:
+        super().__init__(lambda send: Firmware(send, model=model))
         self.k = 0
         self.nmt(1)
 

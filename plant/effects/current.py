@@ -40,15 +40,16 @@ def transport_delay(x: float, m: Past, s: Any, u: Any, p: Any) -> tuple[float, P
     rate = 1.0 / u.h
     late = (p.transport_delay.cycles * p.controller.period - u.phase) * rate  # steps until this cycle's current acts
     cycle = p.controller.period * rate
-    y = (x + (one - x) * _share(late) + (two - one) * _share(late - cycle) + (three - two) * _share(late - 2.0 * cycle)
-         + (four - three) * _share(late - 3.0 * cycle) + (five - four) * _share(late - 4.0 * cycle))
+    a, b, c = _share(late), _share(late - cycle), _share(late - 2.0 * cycle)
+    d, e = _share(late - 3.0 * cycle), _share(late - 4.0 * cycle)
+    y = x * (1.0 - a) + one * (a - b) + two * (b - c) + three * (c - d) + four * (d - e) + five * e
     return y, Past(x, one, two, three, four, five)
 
 
 def _share(steps: float) -> float:
-    """The part of a step in which the older current still acts, when the newer is `steps` away."""
-    steps = steps if steps > 0.0 else 0.0
-    return steps if steps < 1.0 else 1.0
+    """The part of a step in which the older current still acts, the newer being `steps` away; whole ones are whole."""
+    steps = steps if steps > 1e-9 else 0.0
+    return steps if steps < 1.0 - 1e-9 else 1.0
 
 
 class CurrentLimit(NamedTuple):
