@@ -22,11 +22,14 @@ from plant.step import Coefficients, coefficients, step
 WIDTH = 16  # lanes: two of the widest registers, so that one computes while the other waits for its results
 
 
-class Drive(NamedTuple):
-    """Current through the torque motor, A: in this cycle, and in the next."""
+class Row(NamedTuple):
+    """A row of the log, and the current that acts on the torque motor meanwhile: the answer of the row before."""
 
-    now: float = 0.0
-    next: float = 0.0
+    sensed: float = 0.0  # XJ, m
+    answer: float = 0.0  # Cor, A
+    pressure: float = 0.0  # P12, Pa
+    spool: float = 0.0  # XS, m
+    acting: float = 0.0  # A
 
 
 def _bound(*arguments: Any) -> Any:
@@ -34,8 +37,8 @@ def _bound(*arguments: Any) -> Any:
 
 
 # each of these stands for a model's own, which is put in its place: x_at(buffer, lane), keep_x(x, buffer, lane)
-state_at = parameters_at = coefficients_at = loop_at = drive_at = _bound
-keep_state = keep_coefficients = keep_loop = keep_drive = _bound
+state_at = parameters_at = coefficients_at = loop_at = row_at = _bound
+keep_state = keep_coefficients = keep_loop = keep_row = _bound
 
 
 def layout(effects: tuple[str, ...]) -> tuple[dict[str, Function], int, int]:
@@ -43,7 +46,7 @@ def layout(effects: tuple[str, ...]) -> tuple[dict[str, Function], int, int]:
     parameters, and how many numbers a lane has."""
     groups = known_groups(effects)
     parameters = namedtuple("parameters", groups)(*(g(*[0.0] * len(g._fields)) for g in groups.values()))
-    shapes = {"state": initial(effects), "parameters": parameters, "loop": Loop(), "drive": Drive(),
+    shapes = {"state": initial(effects), "parameters": parameters, "loop": Loop(), "row": Row(),
               "coefficients": Coefficients(*[0.0] * len(Coefficients._fields))}
     made, first, place = bindings(effects), {}, 0
     for name, shape in shapes.items():
@@ -67,7 +70,7 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
         steps: steps a cycle.
         out: (WIDTH, 3 or 4, n), written.
     """
-    h = period / steps
+    h, columns = period / steps, out.shape[1]
     for lane in range(WIDTH):
         p = parameters_at(a, lane)
         keep_coefficients(coefficients(p, h), a, lane)
@@ -76,7 +79,15 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
     for k in range(len(com)):
         t = k * period
         for lane in range(WIDTH):
-            sample(a, lane, t, com[k], closed, out, k)
+            sample(a, lane, t, com[k])
+        if closed:
+            for lane in range(WIDTH):
+                control(a, lane, t, com[k])
+        for lane in range(WIDTH):
+            row = row_at(a, lane)
+            out[lane, 0, k], out[lane, columns - 2, k], out[lane, columns - 1, k] = row.sensed, row.pressure, row.spool
+            if closed:
+                out[lane, 1, k] = row.answer
         if len(position):
             for lane in range(WIDTH):
                 s = state_at(a, lane)
@@ -84,21 +95,23 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
         for i in range(steps):
             # the loop that everything is for
             for lane in range(WIDTH):
-                u = Input(drive_at(a, lane).now, load[k], 0.0, t + i * h, i * h, h)
+                u = Input(row_at(a, lane).acting, load[k], 0.0, t + i * h, i * h, h)
                 keep_state(step(state_at(a, lane), u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
 
 
-def sample(a: Any, lane: int, t: float, com: float, closed: bool, out: Any, k: int) -> None:
-    """One lane's transducers read and its next current known, as `plant.solve` and `plant.replay` do for one run."""
-    s, p = state_at(a, lane), parameters_at(a, lane)
-    xj, p12, xs, m_reading = sense(s, s.memory.reading, SILENCE, t, p)
-    n = out.shape[1]
-    out[lane, 0, k], out[lane, n - 2, k], out[lane, n - 1, k] = xj, p12, xs
-    cor, m_command = com, s.memory.command
-    if closed:
-        demand, m_command = demanded(com, m_command, xj, t, p)
-        cor, c = answer(loop_at(a, lane), demand, xj, p.controller)
-        keep_loop(c, a, lane)
-        out[lane, 1, k] = cor
-    keep_state(sampled(s, m_command, m_reading), a, lane)
-    keep_drive(Drive(drive_at(a, lane).next, cor), a, lane)
+def sample(a: Any, lane: int, t: float, given: float) -> None:
+    """What one lane's transducers read at `t`, and the current of the next cycle as it was measured."""
+    s = state_at(a, lane)
+    xj, p12, xs, m_reading = sense(s, s.memory.reading, SILENCE, t, parameters_at(a, lane))
+    keep_state(sampled(s, s.memory.command, m_reading), a, lane)
+    keep_row(Row(xj, given, p12, xs, row_at(a, lane).answer), a, lane)
+
+
+def control(a: Any, lane: int, t: float, com: float) -> None:
+    """What the controller of one lane answers, in place of the measured current."""
+    s, p, row = state_at(a, lane), parameters_at(a, lane), row_at(a, lane)
+    demand, m_command = demanded(com, s.memory.command, row.sensed, t, p)
+    cor, c = answer(loop_at(a, lane), demand, row.sensed, p.controller)
+    keep_loop(c, a, lane)
+    keep_state(sampled(s, m_command, s.memory.reading), a, lane)
+    keep_row(Row(row.sensed, cor, row.pressure, row.spool, row.acting), a, lane)
