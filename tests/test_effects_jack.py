@@ -106,7 +106,7 @@ def test_mount_compliance_shows_the_force_as_position() -> None:
 def test_backlash_loses_its_width_at_every_reversal() -> None:
     model = EASY.replace({"rod_backlash.width": 1e-4})
     sensed, _, _, x, _ = driven(model, 3e-3 * np.sin(2 * np.pi * 4 * np.arange(500) * 1e-3))[1]
-    assert np.ptp(x[250:]) - np.ptp(sensed[250:]) == pytest.approx(1e-4, rel=1e-3)
+    assert np.ptp(x[250:]) - np.ptp(sensed[250:]) == pytest.approx(1e-4, rel=5e-3)  # peaks lie between samples
     assert (sensed - x).min() == pytest.approx(-0.5e-4) and (sensed - x).max() == pytest.approx(0.5e-4)
     standing = np.flatnonzero(np.diff(sensed[130:]) == 0.0) + 130
     assert np.ptp(x[standing[:5]]) < 1e-4 and len(standing) > 5
@@ -226,7 +226,9 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
     stiffness = 800.0 / deflection if deflection else 0.0
     last = np.inf
     for _ in range(60):
-        now = 0.5 * 100.0 * s.jack_speed**2 + 0.5 * stiffness * s.memory.jack_drag[1].deflection ** 2
+        bristle = s.memory.jack_drag[1]
+        bent = bristle.kept * (bristle.deflection + H * s.jack_speed)
+        now = 0.5 * 100.0 * s.jack_speed**2 + 0.5 * stiffness * bent**2
         assert now <= last * (1 + 1e-9) + 1e-15
         last, s = now, moved(s, u, p, k)
 
