@@ -1,6 +1,7 @@
 """What the documentation says is there, is there; what it shows, works."""
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator
 from dataclasses import fields
@@ -8,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import rig
 
 from plant import Model, segments, simulate
-from plant.effects import CATALOGUE, load_effects
+from plant.effects import CATALOGUE, effect, load_effects
 from plant.state import Input, Ports, State
 from rig import cli
 from rig.sequences import checks, faults
@@ -49,7 +51,7 @@ def test_the_sequence_in_the_readme_is_one() -> None:
 
 
 def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
-    text = next(block for block in blocks(README) if block.startswith("# my_effects.py")).split("\nrig run")[0]
+    text = next(block for block in blocks(README) if block.startswith("# my_effects.py")).split("\nrig ")[0]
     (tmp_path / "my_effects.py").write_text(text)
     try:
         assert load_effects(tmp_path / "my_effects.py") == ["cogging"]
@@ -61,12 +63,17 @@ def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
 
 
 def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
+    """The worked example as a user goes through it: file, trial, simulation."""
     text = (ROOT / "docs" / "effects.md").read_text()
-    found = re.findall(r"(?:^    .*\n|^\n(?=    ))+", text, re.MULTILINE)
-    code = re.sub(r"^    ", "", "\n".join(found), flags=re.MULTILINE)
-    (tmp_path / "manual.py").write_text(code)
+    code = [block for block in blocks(text) if re.match(r"# my_effects\.py|class ", block)]
+    assert all(len(block.splitlines()) <= 25 for block in code)
+    (tmp_path / "my_effects.py").write_text("\n".join(code))
     try:
-        assert load_effects(tmp_path / "manual.py") == ["seal_drag", "rod_play"]
+        assert load_effects(tmp_path / "my_effects.py") == ["seal_drag", "rod_play"]
+        said = rig("effects", "--effects", tmp_path / "my_effects.py", "seal_drag")
+        assert said.status == 0 and "sound seal_drag" in said.out
+        for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
+            assert " ".join(row.split()) in " ".join(said.out.split())
         command = np.full(100, 1e-3)
         plain, loose = (simulate(model, command).xj for model in (Model(), Model().replace({"rod_play.width": 1e-4})))
         assert np.abs(plain - loose).max() > 1e-5
@@ -74,6 +81,8 @@ def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
             assert f"| `{port}` |" in text
         for field in (*State._fields[:-1], *Input._fields):
             assert f"`{field}`" in text
+        for argument in inspect.signature(effect).parameters.keys() - {"port", "group", "law", "memory", "more"}:
+            assert f"| `{argument}` |" in text
     finally:
         for name in ("seal_drag", "rod_play"):
             CATALOGUE.pop(name, None)
