@@ -151,4 +151,6 @@ def _constant(value: Any) -> str:
     if isinstance(value, np.ndarray):  # its repr would leave out the middle
         return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
     fields = getattr(value, "_fields", None)
-    return f"{fields}" if fields and isinstance(value, type) else repr(value)
+    if fields and isinstance(value, type):  # numba's cache finds the type by its name: a user's renamed file is another
+        return f"{value.__module__}.{value.__qualname__}{fields}"
+    return repr(value)

@@ -110,6 +110,15 @@ def test_a_changed_effect_is_never_served_by_old_code(tmp_path: Path) -> None:
     assert set(kept) < set(after) and len(after) == 3  # the last run found the first one's code
 
 
+def test_a_renamed_file_finds_its_types_again(tmp_path: Path) -> None:
+    """Kept code names the types of the memory by their module, which has the name of the user's file."""
+    for name in ("before.py", "after.py"):
+        (tmp_path / name).write_text(MEMORY)
+        code = RUN.replace('"spring.stiffness": 4e5', '"wear.rate": 3e5')
+        subprocess.run([sys.executable, "-c", code, str(tmp_path / name)], check=True, capture_output=True,
+                       env=os.environ | {"EHA_RIG_CACHE": str(tmp_path / "cache")})
+
+
 def test_fingerprint_sees_what_a_function_depends_on() -> None:
     def made(source: str, **names) -> str:
         scope = dict(names)
