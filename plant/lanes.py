@@ -88,7 +88,7 @@ class Lanes:
         else:
             with ThreadPoolExecutor(self.workers) as pool:
                 list(pool.map(work, range(len(buffers))))
-        return out.reshape(-1, *out.shape[2:])[:len(values)].transpose(0, 2, 1)
+        return out.reshape(len(out) * block.WIDTH, *out.shape[2:])[:len(values)].transpose(0, 2, 1)
 
     def _buffers(self, values: Array) -> Array:
         """The blocks' buffers at the start, (blocks, numbers * WIDTH); idle lanes repeat the last run."""
@@ -98,10 +98,10 @@ class Lanes:
         state, record = flat.values(self.model.state()), self.model.record().view(np.float64)
         a[:, :len(state)] = np.array(state)[:, None]
         a[:, first:first + len(record)] = record[:, None]
-        runs = np.minimum(np.arange(blocks * block.WIDTH), len(values) - 1).reshape(blocks, block.WIDTH)
+        runs = np.minimum(np.arange(blocks * block.WIDTH), max(len(values), 1) - 1).reshape(blocks, block.WIDTH)
         for column, place in enumerate(self._places):
             a[:, first + place] = values[runs, column]
-        return a.reshape(blocks, -1)
+        return a.reshape(blocks, numbers * block.WIDTH)
 
     def _kernel(self) -> Function:
         return _compiled(self.model.effects, _laws(self.model.effects))

@@ -9,7 +9,7 @@ from plant.solve import cycle, sense
 from plant.state import Input, Ports, State
 
 SILENCE = (0.0, 0.0, 0.0, 0.0)  # no noise
-SETTLING = 50  # cycles, twice, that the transducer rests where the ram starts
+SETTLING = 40  # cycles, three times, that the transducer rests where the ram starts
 
 
 def _with(*paths: str) -> Function:
@@ -37,7 +37,7 @@ def rested(s: State, x: float, p: Any, steps: int) -> Any:
     """`s` at rest where its transducer shows `x` m: a lag has caught up, an offset or a gain is made up for."""
     u = Input(0.0, 0.0, 0.0, 0.0, 0.0, p.controller.period / steps)
     sensed = 0.0
-    for _ in range(2):
+    for _ in range(3):
         s = moved(s, s.jack_position + (x - sensed))
         for _ in range(SETTLING * steps):
             sensed, m = at_position(s.jack_position, s.memory.position, s, u, p)

@@ -1,0 +1,167 @@
+"""Runs side by side give the bits of one run after the other, whatever the model has, and do it in wide registers."""
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_files import COGGING, MEMORY, restored_catalogue
+from llvmlite.binding import get_host_cpu_features
+
+from plant import Actuator, InputError, Model, block, simulate
+from plant.compile import interpreted
+from plant.effects import CATALOGUE, load_effects
+from plant.lanes import Lanes, _compiled
+from plant.model import bindings
+from plant.replay import replay
+
+QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
+COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
+LOAD = np.linspace(0.0, 3e3, len(COMMAND))
+CURRENT = np.r_[np.zeros(3), np.full(12, 4e-3), np.full(15, -6e-3), np.linspace(-3e-4, 3e-4, 10)]
+FORCE = np.linspace(0.0, 3e3, len(CURRENT))
+EFFECTS = [name for name, entry in CATALOGUE.items() if not entry.base]
+
+
+def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.ndarray | None = None,
+            anchor: float = 0.0, steps: int = 10) -> np.ndarray:
+    """The same in plain Python, one run, (n, 3)."""
+    out = np.empty((len(current), 3))
+    run = interpreted(replay, bindings(model.effects))
+    run(model.state(), current, load, np.empty(0) if position is None else position, anchor, model.record(), steps, out)
+    return out
+
+
+def test_closed_loop_is_that_of_simulate() -> None:
+    names = ["spool.static_friction", "spool.dynamic_friction", "jack.damping", "controller.integral_gain"]
+    values = np.random.default_rng(1).uniform([5, 5, 1e3, 0], [40, 5, 9e3, 2], (19, 4))  # not a whole block
+    lanes = Lanes(QUIET, names, steps=20)
+    runs = lanes.closed_loop(values, COMMAND, LOAD)
+    assert runs.shape == (19, len(COMMAND), 4)
+    for row in (0, 7, 16, 18):
+        one = simulate(QUIET.replace(dict(zip(names, values[row], strict=True))), COMMAND, LOAD, steps=20)
+        assert (runs[row] == np.column_stack([one.xj, one.cor, one.p12, one.xs])).all()
+
+
+def test_replay_is_that_of_the_actuator() -> None:
+    runs = Lanes(QUIET, ["jack.mass"], steps=20).replay(np.array([[400.0], [900.0]]), COMMAND, LOAD)
+    for mass, rows in zip((400.0, 900.0), runs, strict=True):
+        plant = Actuator(QUIET.replace({"jack.mass": mass}), steps=20)
+        for k in range(100):
+            assert tuple(rows[k]) == plant.sample()
+            plant.advance(COMMAND[k - 1] if k else 0.0, LOAD[k])
+
+
+@pytest.fixture(scope="module")
+def catalogue() -> Lanes:
+    """The whole catalogue, all parameters of all effects free."""
+    model = QUIET.having(EFFECTS)
+    return Lanes(model, [name for e in EFFECTS for name in CATALOGUE[e].off], steps=10)
+
+
+def with_effects(lanes: Lanes, changes: dict[str, float]) -> np.ndarray:
+    return np.array([[changes.get(name, lanes.model[name]) for name in lanes.names]])
+
+
+def start(effect: str, which: int) -> dict[str, float]:
+    """Values at which the effect is at work."""
+    entry = CATALOGUE[effect]
+    return dict(entry.starts[which]) if entry.starts else {"current_noise.hum": 2e-4}
+
+
+def test_each_effect_alone_among_all_that_are_off(catalogue: Lanes) -> None:
+    """Against one run of a model that has that effect only: the others, at their off values, change no bit."""
+    values = np.vstack([with_effects(catalogue, start(effect, -1)) for effect in EFFECTS])
+    runs = catalogue.replay(values, CURRENT, FORCE)
+    bare = one_run(QUIET, CURRENT, FORCE)
+    for effect, rows in zip(EFFECTS, runs, strict=True):
+        assert (rows == one_run(QUIET.replace(start(effect, -1)), CURRENT, FORCE)).all(), effect
+    assert sum((rows != bare).any() for rows in runs) >= 20  # some cannot show here: no demand, no stop, too slow
+
+
+def test_all_effects_at_once(catalogue: Lanes) -> None:
+    together: list[str] = []
+    for effect in EFFECTS:
+        if not any(effect in CATALOGUE[other].excludes or other in CATALOGUE[effect].excludes for other in together):
+            together.append(effect)
+    changes = {name: value for effect in together for name, value in start(effect, 0).items()}
+    assert len(together) > 20
+    run = catalogue.replay(with_effects(catalogue, changes), CURRENT, FORCE)[0]
+    assert (run == one_run(QUIET.replace(changes), CURRENT, FORCE)).all()
+
+
+def test_effects_of_a_user(tmp_path: Path) -> None:
+    """With a sine and with a memory; and a file that was changed is not served by old code."""
+    with restored_catalogue():
+        file = tmp_path / "mine.py"
+        for text in (COGGING + MEMORY, COGGING.replace("sin(2", "3.0 * sin(2") + MEMORY):
+            file.write_text(text)
+            load_effects(file)
+            model = QUIET.replace({"cogging.force": 500.0, "wear.rate": 1e4})
+            runs = Lanes(model, ["cogging.force"], steps=10).replay(np.array([[500.0], [0.0]]), CURRENT, FORCE)
+            assert (runs[0] == one_run(model, CURRENT, FORCE)).all()
+            assert (runs[1] == one_run(model.replace({"cogging.force": 0.0}), CURRENT, FORCE)).all()
+
+
+def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:
+    """A missing sample does not pull; an offset, a gain and a lag of the transducer are settled at the start."""
+    model = QUIET.replace({"sensor_offset.offset": 1e-4, "sensor_gain.error": 0.02, "sensor_lag.time": 1e-3})
+    position = np.full(len(CURRENT), 2e-3)
+    position[5:9] = np.nan
+    lanes = Lanes(model, ["sensor_offset.offset"], steps=10)
+    values, none = np.array([[0.0], [1e-4], [-3e-4]]), np.zeros_like(CURRENT)
+    for anchor in (0.0, 5.0):
+        runs = lanes.replay(values, CURRENT, FORCE, position, anchor)
+        assert (runs[1] == one_run(model, CURRENT, FORCE, position, anchor)).all()
+        assert runs[:, 0, 0] == pytest.approx(2e-3, abs=1e-6)
+    still = lanes.replay(values, none, none, position)
+    assert still[:, :, 0] == pytest.approx(2e-3, abs=1e-6)
+
+
+def test_the_pull_holds_a_drifting_run() -> None:
+    n = 400
+    current, load, position = np.full(n, 2e-4), np.zeros(n), np.zeros(n)
+    lanes = Lanes(QUIET, [], steps=10)
+    free, held = (lanes.replay(np.empty((1, 0)), current, load, position, a)[0, -1, 0] for a in (0.0, 50.0))
+    assert 0.0 < held < 0.2 * free
+
+
+def test_threads_do_not_matter() -> None:
+    values = np.linspace(5.0, 40.0, 70)[:, None]
+    alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
+                     for workers in (1, 3))
+    assert (alone == shared).all() and len(np.unique(alone[:, -1, 0])) > 50
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    lanes = Lanes(QUIET, ["jack.mass"])
+    for values, current, load, position in (
+            (np.ones((2, 2)), CURRENT, FORCE, None), (np.ones(2), CURRENT, FORCE, None),
+            (np.ones((2, 1)), CURRENT, FORCE[1:], None), (np.ones((2, 1)), CURRENT, FORCE, FORCE[1:])):
+        with pytest.raises(InputError):
+            lanes.replay(values, current, load, position)
+    for name in ("jack.moss", "controller.period", "null_bias.current"):
+        with pytest.raises(InputError, match=name):
+            Lanes(QUIET, [name])
+
+
+def test_no_runs_and_no_cycles() -> None:
+    lanes = Lanes(QUIET, ["jack.mass"])
+    assert lanes.replay(np.empty((0, 1)), CURRENT, FORCE).shape == (0, len(CURRENT), 3)
+    assert lanes.closed_loop(np.array([[400.0]]), np.empty(0), np.empty(0)).shape == (1, 0, 4)
+
+
+@pytest.mark.skipif(not get_host_cpu_features().get("avx2"), reason="no wide registers for doubles here (AVX2)")
+def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop over the lanes became vector code: nothing in the step stops it."""
+    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
+    lanes = Lanes(QUIET, [], 10)
+    run = _compiled.__wrapped__((), ())
+    monkeypatch.setattr(lanes, "_kernel", lambda: run)
+    lanes.replay(np.empty((1, 0)), CURRENT, FORCE)
+    (code,) = run.inspect_asm().values()
+    loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
+    step = max((body for _, body in loops), key=len)
+    assert len(re.findall("%[yz]mm", step)) > 100 and not re.search(r"v(add|sub|mul|div|min|max)sd", step)
+    assert block.WIDTH % 8 == 0
