@@ -1,0 +1,176 @@
+"""Which physical effect is missing from a model: the verdict, with its evidence and its doubt."""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.fingerprints import Fingerprint, comb, firmware
+from fdi.discovery.nulls import SEEN, Sensitivity, sensitivity
+from fdi.discovery.problem import Problem
+from fdi.discovery.record import Record
+from fdi.discovery.search import Hypothesis, Search
+from plant.effects import CATALOGUE
+from plant.model import Model
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+FINE = 20  # steps a cycle of the last fits
+MOST = 3  # effects looked for one after the other
+EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
+CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
+BETTER = 0.8  # times the error before: what counts as a part of the explanation
+HELD_OUT = 1.2  # times the floor, on a run with another command
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What `explain` found."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    base: Hypothesis
+    ranked: tuple[Hypothesis, ...]  # best first
+    ledger: tuple[Hypothesis, ...]  # base, then one more effect each
+    floor: Mapping[str, float]
+    holdout: Mapping[tuple[str, ...], Mapping[str, float]]
+    prints: tuple[Fingerprint, ...]
+    controller: float  # error of the firmware's answer, in units of its resolution
+    blind: Sensitivity
+    search: Search = field(repr=False)
+
+
+def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: Record | None = None,
+            progress: Progress = lambda what, part: None, workers: int | None = None) -> Explanation:
+    """The verdict on a model and a measured run.
+
+    Args:
+        model: what the user believes.
+        est: the run to explain.
+        repeats: further runs of the same command: they tell noise from physics.
+        holdout: a run of another command: it tells physics from luck.
+        progress: called with what is being done and the part done, 0..1.
+        workers: threads; default one a core.
+    """
+    controller, prints = firmware(model, [est, *repeats])
+    tooth = comb(est)
+    found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
+    candidates = [e for e in CATALOGUE if CATALOGUE[e].port not in ("command", "reading") and CATALOGUE[e].starts]
+    search = Search(model, est, repeats, candidates, workers)
+    if tooth:
+        search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
+    progress("fitting the tolerances", 0.05)
+    base = search.base()
+    if base.reached:
+        search.learn_noise(base)
+        base = search.again(base)
+    levels = _levels(search, base, progress)
+    progress("last fits, with finer steps", 0.8)
+    return _concluded(search, levels, found, controller, holdout)
+
+
+def _levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[Hypothesis]]:
+    """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
+    levels, beam = [[base]], [base]
+    for count in range(1, MOST + 1):
+        progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
+        tried = [h for parent in beam for h in search.add_one(parent, 8 if count == 1 else 4)]
+        tried = _distinct(tried)
+        if not tried:
+            break
+        if count == 1 and not base.reached:
+            search.learn_noise(tried[0])
+            tried = sorted((search.again(h) for h in tried[:4]), key=lambda h: h.cost) + tried[4:]
+            levels[0] = [search.again(base)]
+        levels.append(tried)
+        if tried[0].reached or not _significant(levels[-2][0], tried[0]):
+            break
+        beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
+    return levels
+
+
+def _distinct(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+    best: dict[frozenset[str], Hypothesis] = {}
+    for h in sorted(tried, key=lambda h: h.cost):
+        best.setdefault(frozenset(h.effects), h)
+    return list(best.values())
+
+
+def gain(parent: Hypothesis, h: Hypothesis) -> float:
+    """What a hypothesis gains in -2 log likelihood: on its own run, and no more than about that on the repeats."""
+    own = parent.cost - h.cost
+    return min(own, 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
+
+
+def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool:
+    return gain(parent, h) > least
+
+
+def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
+               holdout: Record | None) -> Explanation:
+    fine = [replace(p, steps=FINE, _lanes={}) for p in (search.problem, *search.repeats)]
+    search.problem, search.repeats = fine[0], fine[1:]
+    depth = max((i for i in range(1, len(levels)) if _significant(levels[i - 1][0], levels[i][0])), default=0)
+    if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
+        depth = 1
+    base = search.again(levels[0][0], 6)
+    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:5] if depth else []
+    close = sorted((search.again(h, 6) for h in close), key=lambda h: h.cost + h.repeat_cost)
+    others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])
+              if h.effects not in [c.effects for c in close]]
+    ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
+    floor = search.floor(close[0] if close else base)
+    held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
+    verdict, named = _verdict(base, close, depth, found, controller, floor, held)
+    blind = sensitivity(search.problem, (close[0] if close and verdict == "EXPLAINED" else base).fit, search.effects)
+    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
+                       blind, search)
+
+
+def _parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypothesis:
+    return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
+
+
+def _verdict(base: Hypothesis, close: Sequence[Hypothesis], depth: int, found: Sequence[Fingerprint], controller: float,
+             floor: Mapping[str, float], held: Mapping[tuple[str, ...], Mapping[str, float]]
+             ) -> tuple[str, tuple[str, ...]]:
+    """The verdict and the effects it names."""
+    prints = tuple(f.effect for f in found)
+    firmware_left = controller > 3.0 and not any(CATALOGUE[f.effect].firmware for f in found)
+    if not depth:
+        if not base.reached:
+            return ("PARTLY" if prints else "UNEXPLAINED"), prints
+        if firmware_left:
+            return "UNEXPLAINED", prints
+        return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
+    best = close[0]
+    least = gain(base, best)
+    if base.reached and least < CONVINCING:
+        return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
+    there = [h for h in close if h.reached and _holds(h, floor, held)]
+    if best.reached and there and not firmware_left:
+        equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * EQUAL]
+        if len(equal) > 1:
+            return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
+        return "EXPLAINED", (*prints, *there[0].effects)
+    better = min(_error(best, floor), 1e9) < BETTER * _error(base, floor)
+    return ("PARTLY", (*prints, *best.effects)) if better or prints else ("UNEXPLAINED", prints)
+
+
+def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
+    """How far above the floor what is left is, in all signals together."""
+    return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
+
+
+def _holds(h: Hypothesis, floor: Mapping[str, float], held: Mapping[tuple[str, ...], Mapping[str, float]]) -> bool:
+    return h.effects not in held or all(e <= HELD_OUT * floor[s] for s, e in held[h.effects].items())
+
+
+def held_out(search: Search, h: Hypothesis, record: Record) -> dict[str, float]:
+    """RMS residual on a run that the fit never saw, SI units."""
+    problem: Problem = replace(search.problem, record=record)
+    residuals = problem.residuals(h.fit.free, h.fit.x[None])[0]
+    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, residuals, strict=True)}

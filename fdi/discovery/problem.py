@@ -1,0 +1,132 @@
+"""A model with parameters to be found, held against measured runs: many trial values at once."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.noise import Noise
+from fdi.discovery.record import Record
+from plant.effects import CATALOGUE, Effect
+from plant.lanes import Lanes
+from plant.model import Model, meaning
+from plant.parameters import nominal
+
+Floats = NDArray[np.float64]
+
+STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
+ANCHOR = 20.0  # 1/s; a free replay adds up every bias for ever, this one forgets within 50 ms
+FURTHEST = 5.0  # tolerances that a healthy unit may be off; beyond, something is wrong with it
+HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
+QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
+
+
+class Free(NamedTuple):
+    """A parameter that a fit may change. Fits work on x = (value - centre) / scale."""
+
+    name: str
+    centre: float
+    scale: float
+    prior: float  # standard deviation of x that is known beforehand; inf: nothing is
+    low: float
+    high: float
+    step: float  # of x, for differences
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units, within what is possible."""
+        return min(max(self.centre + self.scale * x, self.low), self.high)
+
+
+def tolerances(model: Model) -> tuple[Free, ...]:
+    """The parameters in which one healthy unit differs from another, each with its tolerance as prior."""
+    usual = nominal()
+    free = []
+    for name, value in model.values.items():
+        q = meaning(name)
+        if q.tolerance > 0.0:
+            scale = q.tolerance * (abs(usual.get(name, value)) or 1.0)
+            low, high = value - FURTHEST * scale, value + FURTHEST * scale
+            free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
+    return tuple(free)
+
+
+def unknowns(effect: Effect) -> tuple[Free, ...]:
+    """The parameters of an effect that is to be fitted: nothing is known of them but the possible range."""
+    usual, free = nominal(), []
+    for name in effect.fitted:
+        q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
+        sizes = sorted(abs(start[name] - off) for start in effect.starts)
+        scale = sizes[len(sizes) // 2] or 1.0
+        free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), 0.05))
+    return tuple(free)
+
+
+@dataclass
+class Problem:
+    """A model, the whole catalogue ready in it at off values, and a run to hold it against."""
+
+    model: Model  # with every effect that may be tried
+    record: Record
+    noise: tuple[Noise, ...]  # of each signal
+    steps: int = STEPS
+    anchor: float = ANCHOR
+    workers: int = 1
+    _lanes: dict[tuple[str, ...], Lanes] = field(default_factory=dict)
+
+    def predict(self, names: Sequence[str], values: Floats) -> Floats:
+        """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
+        key = tuple(names)
+        if key not in self._lanes:
+            self._lanes[key] = Lanes(self.model, key, self.steps, self.workers)
+        r = self.record
+        out = self._lanes[key].replay(values, r.current, r.load, r.position, self.anchor)
+        return out.transpose(0, 2, 1)[:, r.columns]
+
+    def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
+        values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])
+        return self.left(self.predict([f.name for f in free], _sorted_friction(free, values)))
+
+    def left(self, predicted: Floats) -> Floats:
+        """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
+        residuals = predicted - self.record.measured
+        lines = mains(residuals.shape[-1], self.model.values["controller.period"])
+        whole: Floats = residuals - (np.nan_to_num(residuals) @ lines) @ lines.T
+        return whole
+
+    def whitened(self, residuals: Floats) -> Floats:
+        """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
+        return np.stack([n.whiten(residuals[:, i]) for i, n in enumerate(self.noise)], axis=1)
+
+
+@cache
+def mains(n: int, period: float) -> Floats:
+    """Orthonormal sines and cosines of the mains' lines over n samples, (n, k): what a steady hum looks like.
+
+    A hum that starts with the test has the same phase in every run, so no repeat tells it from physics.
+    """
+    t = 2.0 * np.pi * period * np.arange(n)
+    lines = [f for f in HUM if f < 0.45 / period]
+    waves: Floats = np.linalg.qr(np.column_stack([w(f * t) for f in lines for w in (np.sin, np.cos)]))[0]
+    return waves
+
+
+def _sorted_friction(free: Sequence[Free], values: Floats) -> Floats:
+    """Dynamic friction is never above static friction: trial values of a fit are made so."""
+    names = [f.name for f in free]
+    for body in ("spool", "jack"):
+        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
+        if static in names and dynamic in names:
+            i, j = names.index(static), names.index(dynamic)
+            values[:, j] = np.minimum(values[:, i], values[:, j])
+    return values
+
+
+def whole(model: Model) -> Model:
+    """The model without sensor noise and with all of the catalogue's effects at their off values."""
+    acting = [name for name, e in CATALOGUE.items() if not e.disturbance]
+    return model.having(acting).replace(QUIET)

@@ -1,0 +1,168 @@
+"""A cheap look at every effect: what would it gain, if everything fitted so far gave way linearly?"""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from fdi.discovery.fit import Fit, misfit, weights
+from fdi.discovery.problem import Free, Problem, unknowns
+from plant.effects import CATALOGUE
+
+Floats = NDArray[np.float64]
+Start = Mapping[str, float]
+
+ZOOM = ((0.4, 0.6, 0.8, 1.3, 1.7, 2.5), (0.88, 0.94, 1.06, 1.13), (0.96, 0.98, 1.02, 1.04), (0.99, 1.01))  # on the size
+LOOKED_AT = (20, 12, 8, 6)  # effects in each of these passes
+TOGETHER = 64  # runs at a time
+THINNED = 5  # every so many samples, for the linear shift alone
+
+
+class Trial(NamedTuple):
+    """An effect at one start on top of a fit: `cost` after the fit's unknowns, (p,), have moved to `x`."""
+
+    effect: str
+    start: Start
+    cost: float
+    x: Floats
+
+
+class Prospect(NamedTuple):
+    """An effect with the start that promises most: `cost` is what would be left, `x` the start of all unknowns."""
+
+    effect: str
+    cost: float
+    free: tuple[Free, ...]
+    x: Floats  # (p,), those of the fit scanned from first
+
+
+def scan(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Prospect]:
+    """Expected cost of each effect on top of `fit`, best first.
+
+    Every start of an effect is simulated; the fit's own unknowns then move linearly, within their bounds and priors, to
+    take up what they can. Further passes try sizes around the best start, closer each time.
+    """
+    effects = list(effects)
+    first = [(name, start) for name in effects for start in (*CATALOGUE[name].starts, *tones(problem, fit, name))]
+    best = _best(_tried(problem, fit, first))
+    for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
+        promising = sorted(best.values(), key=lambda t: t.cost)[:count]
+        near = [(t.effect, start) for t in promising for start in _near(t, factors)]
+        best = _best([*best.values(), *_tried(problem, fit, near)])
+    return sorted((_prospect(fit, t) for t in best.values()), key=lambda p: p.cost)
+
+
+def _prospect(fit: Fit, t: Trial) -> Prospect:
+    mine = {u.name: u for u in unknowns(CATALOGUE[t.effect])}
+    kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
+    own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
+    found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
+    values = {**found, **t.start}
+    free = (*kept, *own)
+    return Prospect(t.effect, t.cost, free, np.array([(values[f.name] - f.centre) / f.scale for f in free]))
+
+
+def _near(t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
+    """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
+    free = unknowns(CATALOGUE[t.effect])
+    units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
+    starts = []
+    for unit in units:
+        if unit in ("Hz", "rad"):
+            continue
+        for factor in factors:
+            new = dict(t.start)
+            for u in free:
+                if CATALOGUE[t.effect].parameters[u.name].unit == unit:
+                    new[u.name] = min(max(u.centre + factor * (t.start[u.name] - u.centre), u.low), u.high)
+            starts.append(new)
+    return starts
+
+
+def tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]]:
+    """Starts for an effect with a frequency: a fit finds none that it does not begin within a period of.
+
+    The effect at next to no frequency and a quarter turn shows how the residual answers a constant; the residual times
+    that answer has a line where the effect has its frequency.
+    """
+    entry = CATALOGUE[effect]
+    named = {entry.parameters[n].unit: n for n in entry.fitted}
+    if not {"Hz", "rad"} <= set(named) or not entry.starts:
+        return []
+    still = {**entry.starts[0], named["Hz"]: max(1e-6, entry.parameters[named["Hz"]].low), named["rad"]: 0.5 * np.pi}
+    names = list(still)
+    answer = problem.whitened(problem.left(problem.predict(names, np.array([list(still.values())]))))[0]
+    product = -(fit.white * (answer - problem.whitened(problem.left(problem.predict(names, np.array([[
+        entry.off.get(n, still[n]) for n in names]]))))[0])).sum(axis=0)
+    n = len(product)
+    spectrum = np.fft.rfft(product - product.mean(), 4 * n)
+    hertz = np.fft.rfftfreq(4 * n, problem.model.values["controller.period"])
+    found = []
+    for _ in range(3):
+        k = int(np.argmax(np.abs(spectrum) * (hertz > 0.5)))
+        phase = float(np.angle(spectrum[k])) + 0.5 * np.pi
+        found.append({**still, named["Hz"]: float(hertz[k]), named["rad"]: phase})
+        spectrum[np.abs(hertz - hertz[k]) < 1.0] = 0.0
+    return found
+
+
+def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
+    best: dict[str, Trial] = {}
+    for t in trials:
+        if t.effect not in best or t.cost < best[t.effect].cost:
+            best[t.effect] = t
+    return best
+
+
+def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start]]) -> list[Trial]:
+    """The starts simulated at the fit's values, side by side."""
+    if not starts:
+        return []
+    names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start in starts for n in start]))
+    usual = [fit.values.get(n, problem.model.values[n]) for n in names]
+    rows = np.array([[start.get(n, v) for n, v in zip(names, usual, strict=True)] for _, start in starts])
+    trials, steep = [], slope(fit)
+    for part in np.array_split(np.arange(len(rows)), -(-len(rows) // TOGETHER)):
+        white = problem.whitened(problem.left(problem.predict(names, rows[part])))
+        for i, r in zip(part, white, strict=True):
+            effect, start = starts[i]
+            trials.append(Trial(effect, start, *absorbed(fit, steep, r, set(start))))
+    return trials
+
+
+class Slope(NamedTuple):
+    """A fit's Jacobian as `absorbed` needs it: whole, thinned, and what is known of the unknowns."""
+
+    whole: Floats  # (p, s * n)
+    thin: Floats  # (p, s, n / THINNED)
+    prior: Floats  # (p,)
+    low: Floats  # (p,)
+    high: Floats  # (p,)
+
+
+def slope(fit: Fit) -> Slope:
+    """Prepared once for many residuals."""
+    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in fit.free]) for end in ("low", "high"))
+    return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::THINNED]),
+                 np.array([f.prior**-2 for f in fit.free]), low, high)
+
+
+def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str]) -> tuple[float, Floats]:
+    """Cost of a whitened residual (s, n) after the fit's unknowns, but for those `held`, have shifted linearly.
+
+    Twice, as what can be fitted is known only after the first time.
+    """
+    move = np.array([f.name not in held for f in fit.free])
+    prior = np.where(move, s.prior, 1e30)  # what is held does not move
+    flat, left, x = s.thin.reshape(len(fit.x), -1), white, fit.x
+    few = white[:, ::THINNED].reshape(-1)
+    for _ in range(2):
+        heavy = (THINNED * s.thin * weights(left)[:, ::THINNED]).reshape(flat.shape)
+        hessian = heavy @ flat.T + np.diag(prior + 1e-9)
+        gradient = heavy @ few + s.prior * fit.x * move
+        x = np.where(move, np.clip(fit.x - cho_solve(cho_factor(hessian), gradient), s.low, s.high), fit.x)
+        left = white + ((x - fit.x) @ s.whole).reshape(white.shape)
+    return float(misfit(left[None])[0] + (x * move) ** 2 @ s.prior), x

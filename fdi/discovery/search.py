@@ -1,0 +1,171 @@
+"""Which effects are missing: scan, fit, look at what is left, and once more for the next effect."""
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery import noise as noises
+from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
+from fdi.discovery.noise import Noise
+from fdi.discovery.problem import Problem, tolerances, whole
+from fdi.discovery.record import NOISE, Record
+from fdi.discovery.scan import Prospect, scan
+from plant.effects import CATALOGUE
+from plant.model import Model
+
+Floats = NDArray[np.float64]
+
+FITTED = 8  # effects of a scan that get a full fit
+RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
+WORTH = 20.0  # expected gain in cost that makes a full fit worth its time
+BEAM = 3  # hypotheses from which the next missing effect is looked for
+REACHED = 1.08  # times the floor; what is left above it is physics
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Effects that may be missing, fitted; `ratio` says how far above the floor what is left of each signal is."""
+
+    effects: tuple[str, ...]
+    fit: Fit
+    errors: dict[str, float]  # RMS residual, SI
+    repeated: dict[str, float] = field(default_factory=dict)  # RMS residual on the repeats
+    ratio: dict[str, float] = field(default_factory=dict)  # error that repeats, over the floor; 1 = only noise
+    repeat_cost: float = 0.0
+    others: tuple[Floats, ...] = ()  # residuals (s, n) on the repeats
+
+    @property
+    def reached(self) -> bool:
+        """True when nothing but noise is left."""
+        return max(self.ratio.values()) <= REACHED
+
+    @property
+    def cost(self) -> float:
+        """Robust sum of squares on the fit's run, with priors."""
+        return self.fit.cost
+
+
+class Search:
+    """The state of one search: the problem, its noise, every hypothesis tried."""
+
+    def __init__(self, model: Model, record: Record, repeats: Sequence[Record], effects: Iterable[str],
+                 workers: int | None = None) -> None:
+        self.workers = workers or os.cpu_count() or 1
+        self.noise = tuple(noises.white(model[NOISE[name]]) for name in record.signals)
+        ready = whole(model)
+        self.problem = Problem(ready, record, self.noise, workers=1)
+        self.repeats = [Problem(ready, r, self.noise) for r in repeats]
+        self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
+        self.coarse: dict[str, float] = {}  # RMS of rounding, where a signal comes in steps
+
+    def base(self) -> Hypothesis:
+        """The model without a further effect, its tolerances fitted."""
+        return self.judged((), fit(self.problem, tolerances(self.problem.model)))
+
+    def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
+        """`start` with one more effect: the promising ones fitted, best first."""
+        effects = [e for e in self.effects if e not in start.effects and not self._excluded(e, start.effects)]
+        prospects = scan(self.problem, start.fit, effects)
+        if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
+            nominal = linearised(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
+            prospects = _merged(prospects, scan(self.problem, nominal, effects))
+        worth = [p for p in prospects if p.cost < start.cost - WORTH][:fitted]
+        with ThreadPoolExecutor(self.workers) as pool:
+            fits = list(zip([p.effect for p in worth], pool.map(self._begun, worth), strict=True))
+            for rounds, kept in RACE:
+                fits.sort(key=lambda each: each[1].cost)
+                fits[:kept] = pool.map(partial(self._further, rounds), fits[:kept])
+            done = pool.map(lambda each: self.judged((*start.effects, each[0]), each[1]), fits)
+            return sorted(done, key=lambda h: h.cost)
+
+    def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
+        return each[0], each[1] if each[1].converged else improved(self.problem, each[1], rounds)
+
+    def _begun(self, p: Prospect) -> Fit:
+        """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
+        own = np.isin([f.name for f in p.free], CATALOGUE[p.effect].fitted)
+        starts = np.array([p.x, np.where(own, p.x, 0.0)])
+        prior = np.array([f.prior**-2 for f in p.free])
+        costs = misfit(self.problem.whitened(self.problem.residuals(p.free, starts))) + (starts**2) @ prior
+        return linearised(self.problem, p.free, starts[int(np.argmin(costs))])
+
+    def _excluded(self, effect: str, present: Sequence[str]) -> bool:
+        return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
+
+    def judged(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
+        """What a fit leaves, on its own run and on the repeats."""
+        signals = self.problem.record.signals
+        errors = _rms(found.residuals, signals)
+        coarse = [self.coarse.get(s, 0.0) for s in signals]
+        x = found.x[None, :]
+        others = [p.residuals(found.free, x)[0] for p in self.repeats]
+        if not others:
+            floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
+            return Hypothesis(effects, found, errors, {}, {s: errors[s] / floor[s] for s in signals})
+        cost = float(np.mean([misfit(p.whitened(r[None]))[0] for p, r in zip(self.repeats, others, strict=True)]))
+        repeated = {s: float(np.sqrt(np.mean([_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
+        ratio = dict(zip(signals, common(found.residuals, others, coarse), strict=True))
+        return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
+
+    def learn_noise(self, best: Hypothesis) -> None:
+        """Take the noise from what differs between the runs under the best hypothesis."""
+        self.noise = tuple(noise_of(best, self.problem.record, self.noise))
+        self.problem = replace(self.problem, noise=self.noise)
+        self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
+
+    def floor(self, best: Hypothesis) -> dict[str, float]:
+        """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
+        found = noise_of(best, self.problem.record, self.noise)
+        return {s: float(np.hypot(n.level, self.coarse.get(s, 0.0)))
+                for s, n in zip(self.problem.record.signals, found, strict=True)}
+
+    def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
+        """A hypothesis refitted with the noise as known now."""
+        return self.judged(h.effects, fit(self.problem, h.fit.free, h.fit.x, rounds))
+
+
+def noise_of(h: Hypothesis, record: Record, before: Sequence[Noise]) -> list[Noise]:
+    """Noise of each signal: of the difference between repeats, else of the residual where only noise is left."""
+    found = []
+    for i, old in enumerate(before):
+        if h.others:
+            n = min(h.fit.residuals.shape[1], *(o.shape[1] for o in h.others))
+            difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
+            found.append(noises.fitted(difference))
+        else:
+            found.append(noises.fitted(h.fit.residuals[i]) if h.reached else old)
+    return found
+
+
+def common(residual: Floats, others: Sequence[Floats], coarse: Sequence[float]) -> list[float]:
+    """What repeats in residuals (s, n) of runs of one command, as total over noise: 1 where only noise is left.
+
+    Independent noise of any colour averages out of the product of two runs; physics that is missing does not.
+    Rounding, `coarse` (s,) RMS, repeats where the ram rests: it is taken for noise.
+    """
+    ratios = []
+    for own, rounding, i in zip(residual, coarse, range(len(residual)), strict=True):
+        n = min(len(own), *(o.shape[1] for o in others))
+        shared = float(np.mean([np.nanmean(own[:n] * o[i, :n]) for o in others]))
+        different = np.concatenate([own[:n] - o[i, :n] for o in others]) / np.sqrt(2.0)
+        noise = noises.level(different) ** 2 + rounding**2 + 1e-300
+        ratios.append(float(np.sqrt(max(1.0 + (shared - rounding**2) / noise, 0.0))))
+    return ratios
+
+
+def _rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
+    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(signals, residuals, strict=True)}
+
+
+def _merged(a: Sequence[Prospect], b: Sequence[Prospect]) -> list[Prospect]:
+    best = {p.effect: p for p in a}
+    for p in b:
+        if p.effect not in best or p.cost < best[p.effect].cost:
+            best[p.effect] = p
+    return sorted(best.values(), key=lambda p: p.cost)
