@@ -7,13 +7,12 @@ of constant length, around the very step that a single run takes; whatever it ca
 """
 from __future__ import annotations
 
-from collections import namedtuple
 from typing import Any, NamedTuple
 
-from plant.compile import Function
+from plant.compile import Function, record_at
 from plant.controller import Loop, answer
 from plant.flat import lane_packers
-from plant.model import bindings, initial, known_groups
+from plant.model import Model, bindings, initial
 from plant.replay import SILENCE, moved, pull, rested, sampled, shown
 from plant.solve import demanded, sense
 from plant.state import Input
@@ -42,17 +41,20 @@ keep_state = keep_coefficients = keep_loop = keep_row = _bound
 
 
 def layout(effects: tuple[str, ...]) -> tuple[dict[str, Function], int, int]:
-    """For a model with `effects`: what stands for the functions above and the ports; the first number of its
-    parameters, and how many numbers a lane has."""
-    groups = known_groups(effects)
-    parameters = namedtuple("parameters", groups)(*(g(*[0.0] * len(g._fields)) for g in groups.values()))
-    shapes = {"state": initial(effects), "parameters": parameters, "loop": Loop(), "row": Row(),
+    """How a block of a model with `effects` is laid out.
+
+    Returns:
+        What stands for the functions above and for the ports; the number of the first parameter, which follow each
+        other as in `Model.names`; how many numbers a lane has.
+    """
+    record = Model().having(effects).record()
+    shapes = {"state": initial(effects), "loop": Loop(), "row": Row(),
               "coefficients": Coefficients(*[0.0] * len(Coefficients._fields))}
-    made, first, place = bindings(effects), {}, 0
+    made, place = bindings(effects), 0
     for name, shape in shapes.items():
-        first[name] = place
         made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, WIDTH, place)
-    return made, first["parameters"], place
+    made["parameters_at"] = record_at(record.dtype, place * WIDTH, WIDTH)
+    return made, place, place + record.view(float).size
 
 
 def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
