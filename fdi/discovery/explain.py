@@ -84,7 +84,7 @@ def _levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[H
         if count == 1 and not base.reached:
             search.learn_noise(tried[0])
             tried = sorted((search.again(h) for h in tried[:4]), key=lambda h: h.cost) + tried[4:]
-            levels[0] = [search.again(base)]
+            levels[0] = [search.without(search.again(base), tried[:1])]
         levels.append(tried)
         if tried[0].reached or not _significant(levels[-2][0], tried[0]):
             break

@@ -138,7 +138,8 @@ def _normal(fit: Fit) -> tuple[Floats, Floats]:
 
 def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
     flat = (jacobian * np.sqrt(weights(white))).reshape(len(free), -1)
-    return np.linalg.pinv(flat @ flat.T + np.diag(_prior(free)))
+    inverse: Floats = np.linalg.pinv(flat @ flat.T + np.diag(_prior(free)))
+    return inverse
 
 
 def _widths(free: Sequence[Free], hessian: Floats) -> Floats:

@@ -57,7 +57,8 @@ class Search:
     def __init__(self, model: Model, record: Record, repeats: Sequence[Record], effects: Iterable[str],
                  workers: int | None = None) -> None:
         self.workers = workers or os.cpu_count() or 1
-        self.noise = tuple(noises.white(model[NOISE[name]]) for name in record.signals)
+        self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
+        self.noise = tuple(self.sensors[name] for name in record.signals)
         ready = whole(model)
         self.problem = Problem(ready, record, self.noise, workers=1)
         self.repeats = [Problem(ready, r, self.noise) for r in repeats]
@@ -66,7 +67,28 @@ class Search:
 
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
-        return self.judged((), fit(self.problem, tolerances(self.problem.model)))
+        first = self.judged((), fit(self.problem, tolerances(self.problem.model)))
+        return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
+
+    def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
+        """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
+        for x in starts:
+            other = fit(self.problem, h.fit.free, x)
+            if other.cost < h.cost - 1.0:
+                h = self.judged(h.effects, other)
+        return h
+
+    def without(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis:
+        """The base fitted again from where fits with an effect have left its parameters.
+
+        What an effect gains is then not what the base's own fit had left lying about.
+        """
+        names = [f.name for f in base.fit.free]
+        starts = []
+        for h in tried:
+            there = {f.name: (float(x), f) for f, x in zip(h.fit.free, h.fit.x, strict=True)}
+            starts.append(np.array([there[n][0] if np.isfinite(there[n][1].prior) else 0.0 for n in names]))
+        return self.retried(base, starts)
 
     def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""

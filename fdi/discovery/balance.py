@@ -1,0 +1,104 @@
+"""What is missing in the balance of forces, flows and torques, over time, from measured signals."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from fdi.discovery.record import SIGNALS
+from fdi.discovery.search import Hypothesis, Search
+
+Floats = NDArray[np.float64]
+
+SPEED_WINDOW, ACCELERATION_WINDOW = 15, 31  # samples of the smoothing polynomials; a millisecond apart at 1 kHz
+EDGE = 50  # samples at both ends that smoothing knows one side of only
+DRAWS = 4  # simulated runs without anything missing
+
+
+class Balance(NamedTuple):
+    """What is missing at one place: `missing` (n,) in `unit`, and how it compares with sensor noise alone."""
+
+    place: str  # "force", "flow", "current"
+    unit: str
+    missing: Floats
+    noise: float  # RMS that sensor noise alone gives
+    ratio: float  # RMS of what is missing over that
+
+    @property
+    def size(self) -> float:
+        """RMS of what is missing, the noise taken out."""
+        return float(np.sqrt(max(float(np.nanmean(self.missing**2)) - self.noise**2, 0.0)))
+
+
+class States(NamedTuple):
+    """The signals a law may depend on, (n,) each, SI units."""
+
+    position: Floats
+    speed: Floats
+    pressure: Floats
+    spool: Floats
+    current: Floats
+    time: Floats
+
+
+def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
+    """The balances of ram, valve and torque motor under a hypothesis, the most unbalanced first.
+
+    Each is taken on the measurement and on the model's own replay, smoothed alike; the difference is what is missing.
+    Signals that were not measured are the replay's: then a place behind them cannot show anything.
+    """
+    problem, record = search.problem, search.problem.record
+    names = [f.name for f in h.fit.free]
+    values = {**problem.model.values, **h.fit.values}
+    replay = problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    measured = replay.copy()
+    for row, signal in enumerate(record.signals):
+        there = ~np.isnan(record.measured[row])
+        measured[SIGNALS.index(signal), there] = record.measured[row, there]
+    before = np.concatenate([[0.0], record.current[:-1]])
+    own = _terms(replay, before, record.load, values, problem.model.values["controller.period"])
+    seen = _terms(measured, before, record.load, values, problem.model.values["controller.period"])
+    level = [search.floor(h).get(s, 0.0) for s in SIGNALS]
+    rng = np.random.default_rng(0)
+    noisy = [_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, record.load, values,
+                    problem.model.values["controller.period"]) for _ in range(DRAWS)]
+    found = []
+    for place, unit in (("force", "N"), ("flow", "m3/s"), ("current", "A")):
+        missing = seen[place] - own[place]
+        noise = float(np.sqrt(np.mean([_square(n[place] - own[place]) for n in noisy])))
+        rms = float(np.sqrt(_square(missing)))
+        found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0))
+    states = States(replay[0] if np.isnan(measured[0]).all() else savgol_filter(measured[0], SPEED_WINDOW, 3),
+                    _speed(measured[0], problem.model.values["controller.period"]), measured[1], measured[2], before,
+                    record.trace.t)
+    return sorted(found, key=lambda b: -b.ratio), states
+
+
+def _square(x: Floats) -> float:
+    """Mean square of what counts: neither the ends nor the few samples in which something stops or breaks away."""
+    inner = x[EDGE:-EDGE] ** 2
+    return float(np.nanmean(np.minimum(inner, np.nanpercentile(inner, 99.5))))
+
+
+def _speed(x: Floats, period: float) -> Floats:
+    speed: Floats = savgol_filter(x, SPEED_WINDOW, 3, deriv=1, delta=period)
+    return speed
+
+
+def _terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float) -> dict[str, Floats]:
+    """Left side minus right side of the three equations of motion (physics of the reference model), from (3, n)."""
+    x, p12, xs = signals
+    v = _speed(x, period)
+    a = savgol_filter(x, ACCELERATION_WINDOW, 3, deriv=2, delta=period)
+    smooth = savgol_filter(p12, ACCELERATION_WINDOW, 3)
+    sliding = np.clip(v / 2e-4, -1.0, 1.0) * p["jack.dynamic_friction"]
+    force = p["jack.area"] * smooth - p["jack.damping"] * v - load - sliding - p["jack.mass"] * a
+    spool = savgol_filter(xs, SPEED_WINDOW, 3)
+    conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
+    flow = p["valve.flow_gain"] * spool - conductance * savgol_filter(p12, SPEED_WINDOW, 3) - p["jack.area"] * v
+    flapper = p["spool.end_area"] * _speed(xs, period) / p["pilot.flow_gain"]
+    torque = p["flapper.stiffness"] * flapper + p["feedback_spring.stiffness"] * spool
+    return {"force": force, "flow": flow, "current": current - torque / p["torque_motor.gain"]}

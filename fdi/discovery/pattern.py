@@ -1,0 +1,168 @@
+"""The shape of what is missing: a curve over the state it follows, in words, and as an effect file to go on from."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lombscargle
+
+from fdi.discovery.balance import EDGE, balances
+from fdi.discovery.search import Hypothesis, Search
+from fdi.output import write_text
+
+Floats = NDArray[np.float64]
+
+KNOTS = 15  # of a curve
+FEWEST = 20  # samples in a bin
+VISIBLE = 1.3  # times what sensor noise alone gives
+FOLLOWS = 0.25  # share of what is missing that a curve has to explain to be told
+PERIODS = np.geomspace(2.0, 60.0, 600)  # over the range of the position
+
+WORDS = {"force": "a force on the ram, against extension", "flow": "a flow that leaves the jack",
+         "current": "a current that does not reach the torque motor"}
+# what a cause may depend on; the pressure answers a force, the speed a flow: they follow whatever is missing
+CAUSES = {"force": ("position", "speed", "spool", "time"), "flow": ("pressure", "spool", "position", "time"),
+          "current": ("current", "spool", "pressure", "position", "time")}
+STATES = {"position": ("m", "s.jack_position"), "speed": ("m/s", "s.jack_speed"), "pressure": ("Pa", "s.pressure"),
+          "spool": ("m", "s.spool_position"), "current": ("A", "u.current"), "time": ("s", "u.t")}
+PORTS = {"force": ("load", "x + {0}"), "flow": ("metering", "x - ({0}) / p.valve.flow_gain"),
+         "current": ("current", "x - ({0})")}
+
+
+class Pattern(NamedTuple):
+    """What is missing, as a curve: `height` (k,) in `unit` at `at` (k,) of `state`; or a wave over the position."""
+
+    place: str
+    unit: str
+    size: float  # RMS, noise taken out
+    state: str  # "" where it follows none
+    share: float  # of what is missing that the curve explains, 0..1
+    at: Floats
+    height: Floats
+    doubt: Floats  # (k,) standard error of the height
+    wave: tuple[float, float, float] | None  # amplitude, length in m or s, phase rad
+    trace: Floats  # (n,) what is missing, over time
+
+    def __str__(self) -> str:
+        """In words."""
+        if not self.place:
+            return "what is left is too small to be seen as a force, a flow or a current"
+        said = f"{WORDS[self.place]}, {self.size:.3g} {self.unit} RMS"
+        if self.wave:
+            amplitude, length = self.wave[:2]
+            return (f"{said}; {self.share:.0%} of it is periodic in {self.state}: {amplitude:.3g} {self.unit} every "
+                    f"{1e3 * length:.4g} m{STATES[self.state][0]}")
+        if not self.state:
+            return f"{said}; it follows none of position, speed, pressure, spool, current or time alone"
+        return f"{said}; {self.share:.0%} of it follows the {self.state}: {_described(self)}"
+
+
+def _described(p: Pattern) -> str:
+    unit, middle = STATES[p.state][0], float(np.interp(0.5 * (p.at[0] + p.at[-1]), p.at, p.height))
+    return (f"{p.height[0]:.3g} {p.unit} at {p.at[0]:.3g} {unit}, {middle:.3g} in the middle, "
+            f"{p.height[-1]:.3g} at {p.at[-1]:.3g} {unit}")
+
+
+def pattern(search: Search, h: Hypothesis) -> Pattern:
+    """The shape of what a hypothesis leaves unexplained."""
+    found, states = balances(search, h)
+    best = found[0]
+    if best.ratio < VISIBLE:
+        none = np.empty(0)
+        return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
+    missing = best.missing[EDGE:-EDGE]
+    seen = {name: getattr(states, name)[EDGE:-EDGE] for name in CAUSES[best.place]}
+    curves = {name: curve(missing, x, best.noise) for name, x in seen.items()}
+    name = max(curves, key=lambda n: curves[n][0])
+    share, at, height, doubt = curves[name]
+    waves = {name: wave(missing, seen[name], best.noise) for name in ("position", "time")}
+    over = max(waves, key=lambda n: waves[n][1])
+    if waves[over][1] > max(share + 0.05, FOLLOWS):
+        shape, share = waves[over]
+        return Pattern(best.place, best.unit, best.size, over, share, at, height, doubt, shape, best.missing)
+    state = name if share >= FOLLOWS else ""
+    return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, None, best.missing)
+
+
+def curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Floats]:
+    """Means of y over bins of x: share explained, bin centres, means, their errors.
+
+    Half of the edges share out the samples, half the range: most of a run is spent near rest.
+    """
+    even = np.linspace(float(x.min()), float(x.max()), KNOTS // 2 + 1)
+    edges = np.unique(np.concatenate([np.quantile(x, np.linspace(0.0, 1.0, KNOTS // 2 + 2)), even]))
+    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(place, minlength=len(edges) - 1)
+    kept = count >= FEWEST
+    total = np.bincount(place, y, len(count))
+    at = np.bincount(place, x, len(count))[kept] / count[kept]
+    height = total[kept] / count[kept]
+    spread = np.sqrt(np.bincount(place, y * y, len(count))[kept] / count[kept] - height**2)
+    there = kept[place]
+    left = y[there] - np.interp(x[there], at, height)
+    whole = float(np.mean(y[there] ** 2)) - noise**2
+    share = 1.0 - max(float(np.mean(left**2)) - noise**2, 0.0) / max(whole, 1e-300)
+    return max(share, 0.0), at, height, spread / np.sqrt(count[kept])
+
+
+def wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, float], float]:
+    """The best wave over x: (amplitude, length, phase), and the share of y it explains."""
+    y = np.clip(y, *np.percentile(y, [0.5, 99.5]))
+    span = float(np.ptp(x)) or 1.0
+    if (np.diff(x) > 0.0).all():  # time: evenly spaced, and many more periods than a stroke has
+        power = np.abs(np.fft.rfft(y - y.mean(), 4 * len(y)))
+        best = max(int(np.argmax(power)), 1) * span / (4 * float(np.median(np.diff(x))) * len(y))
+    else:
+        x, y = x[::2], y[::2]
+        best = PERIODS[int(np.argmax(lombscargle(x, y - y.mean(), 2.0 * np.pi * PERIODS / span)))]
+    for width in (0.02, 0.004, 0.001):
+        near = best * (1.0 + np.linspace(-width, width, 21))
+        best = near[int(np.argmax(lombscargle(x, y - y.mean(), 2.0 * np.pi * near / span)))]
+    turn = 2.0 * np.pi * best / span
+    basis = np.column_stack([np.sin(turn * x), np.cos(turn * x), np.ones_like(x)])
+    found = np.linalg.lstsq(basis, y, rcond=None)[0]
+    left = float(np.mean((y - basis @ found) ** 2)) - noise**2
+    share = 1.0 - max(left, 0.0) / max(float(np.mean(y**2)) - noise**2, 1e-300)
+    return (float(np.hypot(found[0], found[1])), span / best, float(np.arctan2(found[1], found[0]))), share
+
+
+def write_effect(p: Pattern, path: str | Path, name: str = "discovered") -> None:
+    """The pattern as an effect file to edit, fit and add: `rig explain --effects FILE` then ranks it with the others.
+
+    Raises:
+        InputError: a place that cannot be written.
+    """
+    port, law = PORTS[p.place or "force"]
+    unit = p.unit or "N"
+    if p.wave:
+        over, variable = STATES[p.state]
+        fields = [("amplitude", unit, "0.0", ""), ("length", over, f"{p.wave[1]:.6g}", ", above=0"),
+                  ("phase", "rad", f"{p.wave[2]:.4g}", "")]
+        what = f"p.{name}.amplitude * sin(2.0 * pi * {variable} / p.{name}.length + p.{name}.phase)"
+        starts = f"({p.wave[0]:.6g}, {p.wave[1]:.6g}, {p.wave[2]:.4g}),"
+        body: list[str] = []
+    else:
+        fields, starts = [("gain", "1", "0.0", "")], "0.5, 1.0,"
+        q = STATES[p.state or "position"][1]
+        body = [f"    q = {q}", f"    curve = {_interpolated(p)}"]
+        what = f"p.{name}.gain * curve"
+    lines = [f'"""Found in a measurement: {p}."""', "from math import pi, sin",
+             "from typing import Annotated, NamedTuple", "from plant.effects import effect",
+             "from plant.quantity import Quantity", "", "",
+             f"class {name.title()}(NamedTuple):",
+             *(f'    {f}: Annotated[float, Quantity("{u}"{more})] = {value}' for f, u, value, more in fields), "", "",
+             f'@effect("{port}", {name.title()}, law="{WORDS[p.place or "force"]}", starts=({starts}))',
+             f"def {name}(x, s, u, p):", *body, f"    return {law.format(what)}", ""]
+    write_text(path, "\n".join(lines), "--write-effect")
+
+
+def _interpolated(p: Pattern) -> str:
+    """Straight lines between the knots, flat beyond, as sums of clipped ramps: a law without branches."""
+    if len(p.at) < 2:
+        return "0.0"
+    slopes = np.diff(p.height) / np.diff(p.at)
+    ramps = [f"{slope:+.6g} * (min(max(q, {a:.6g}), {b:.6g}) - {a:.6g})"
+             for slope, a, b in zip(slopes, p.at[:-1], p.at[1:], strict=True)]
+    return f"({p.height[0]:.6g}\n             " + "\n             ".join(ramps) + ")"

@@ -1,0 +1,118 @@
+"""Two explanations fit equally well: which sensor or which command would tell them apart, proven by simulation."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.fit import fit
+from fdi.discovery.noise import Noise
+from fdi.discovery.problem import Problem
+from fdi.discovery.record import SIGNALS, Record, record
+from fdi.discovery.search import Hypothesis, Search
+from fdi.trace import Trace
+from plant.lanes import Lanes
+
+Floats = NDArray[np.float64]
+
+SPLITS = 50.0  # misfit, in -2 log likelihood, of the wrong explanation fitted to what the other one predicts
+ROUNDS = 3  # of that fit
+PAIRS = 3  # looked at of a larger set
+SECONDS = 3.0
+
+
+class Separation(NamedTuple):
+    """What would split a set: `misfit` is what the wrong explanations would leave at least."""
+
+    between: tuple[str, ...]
+    by: str
+    command: dict[str, Any]
+    misfit: float
+
+
+def separate(search: Search, equal: Sequence[Hypothesis]) -> Separation | None:
+    """The first sensor, or else the best command, that splits a set of hypotheses; None if none that was tried does.
+
+    One explanation's prediction stands for the measurement; the other is fitted to it, its tolerances and all.
+    """
+    pairs = list(combinations(equal, 2))[:PAIRS]
+    if not pairs:
+        return None
+    names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
+    own = search.problem.record
+    for more in _sensors(own.signals):
+        left = min(_misfit(search, a, b, _same_command(search, a, (*own.signals, *more))) for a, b in pairs)
+        if left > SPLITS:
+            return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
+    best = None
+    for words, command, play in commands(search.problem.model.values["controller.period"]):
+        left = min(_misfit(search, a, b, _played(search, a, play, own.signals)) for a, b in pairs)
+        if left > SPLITS and (best is None or left > best.misfit):
+            best = Separation(names, words, command, left)
+    return best
+
+
+def _sensors(there: Sequence[str]) -> list[tuple[str, ...]]:
+    missing = tuple(s for s in SIGNALS if s not in there)
+    return [*((s,) for s in missing), missing] if len(missing) > 1 else [missing] if missing else []
+
+
+def commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
+    """Commands to try, in words, as segments of a sequence, and as functions of time giving demand m and load N."""
+    def sine(amplitude: float, hertz: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
+        return lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load))
+
+    def step(to: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
+        return lambda t: (np.where((t > 0.3) & (t < 1.8), to, 0.0), np.full_like(t, load))
+
+    def segments(*parts: dict[str, Any], load: float = 0.0) -> dict[str, Any]:
+        return {"main": list(parts), "load": [{"kind": "hold", "time": SECONDS, "value": load}] if load else []}
+
+    def sines(amplitude: float, hertz: float, load: float = 0.0) -> dict[str, Any]:
+        return segments({"kind": "sine", "amplitude": amplitude, "frequency": hertz, "time": SECONDS}, load=load)
+
+    def steps(to: float) -> dict[str, Any]:
+        return segments({"kind": "hold", "time": 0.3}, {"kind": "step", "to": to, "time": 1.5},
+                        {"kind": "step", "to": 0.0, "time": 1.2})
+
+    return [("a sine of 3 mm at 1 Hz against a load of 5 kN", sines(3e-3, 1.0, 5e3), sine(3e-3, 1.0, 5e3)),
+            ("a sine of 2 mm at 10 Hz", sines(2e-3, 10.0), sine(2e-3, 10.0)),
+            ("a sine of 0.2 mm at 20 Hz", sines(2e-4, 20.0), sine(2e-4, 20.0)),
+            ("a sine of 20 mm at 1 Hz", sines(20e-3, 1.0), sine(20e-3, 1.0)),
+            ("a step of 20 mm and back", steps(20e-3), step(20e-3)),
+            ("a step into the end stop, 45 mm, and back", steps(45e-3), step(45e-3))]
+
+
+def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Record:
+    """The run as a hypothesis predicts it, with more sensors."""
+    names = [f.name for f in h.fit.free]
+    predicted = search.problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    own = search.problem.record
+    chosen = tuple(s for s in SIGNALS if s in signals)
+    return replace(own, signals=chosen, measured=predicted[[SIGNALS.index(s) for s in chosen]], position=predicted[0])
+
+
+def _played(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
+            signals: tuple[str, ...]) -> Record:
+    """Another command as a hypothesis predicts it, with the model's own controller."""
+    problem = search.problem
+    period = problem.model.values["controller.period"]
+    com, load = play(np.arange(0.0, SECONDS, period))
+    names = [f.name for f in h.fit.free]
+    lanes = Lanes(problem.model, names, problem.steps, 1)
+    out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
+    columns = dict(zip(("xj", "cor", "p12", "xs"), out.T, strict=True))
+    return record(Trace.of({"com": com, "load": load, **columns}, period, {}), signals)
+
+
+def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Record) -> float:
+    """What `wrong` leaves of what `truth` predicts, noise aside, -2 log likelihood."""
+    known = dict(zip(search.problem.record.signals, search.noise, strict=True))
+    noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
+                                     for s in seen.signals)
+    problem: Problem = replace(search.problem, record=seen, noise=noise)
+    return fit(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit
