@@ -103,7 +103,7 @@ static inline void flapper(const struct plant *p, struct state *s, double curren
 /* P1 = clip(gpf xf - gpf/gqf ASV v, ps1), implicit in v: once as if unsaturated, else with the limit as the force. */
 static inline void spool(const struct plant *p, struct state *s, const struct now *n)
 {
-    double xn = s->xf * (1.0 + copysign(p->nozzle, s->xf)), h = n->h;
+    double xn = s->xf * (1.0 + copysign(1.0, s->xf) * p->nozzle), h = n->h;
     if (p->pilot_tau != 0.0) xn = s->nozzle += h / p->pilot_tau * (xn - s->nozzle);
     double push = n->gpf * xn, damping = n->pilot * p->ASV;
     double back = p->flow_force * s->xs * (n->psr - fabs(s->p12));
@@ -176,7 +176,7 @@ static inline double ram_speed(const struct plant *p, const struct state *s, dou
         slide += p->stribeck * p->FSJ * exp(-part * part);
         if (slide > stick) stick = slide;
     }
-    double scale = 1.0 + copysign(p->asymmetry, s->vj != 0.0 ? s->vj : force);
+    double scale = 1.0 + copysign(1.0, s->vj != 0.0 ? s->vj : force) * p->asymmetry;
     if (p->rough != 0.0) scale *= 1.0 + p->rough * sin(PI2 * s->xj / p->rough_l);
     return dry(s->vj, force, p->MJ, c, h, stick * scale, slide * scale);
 }
