@@ -32,15 +32,14 @@ def compressibility(x: Line, m: Metered, s: Any, u: Any, p: Any) -> tuple[Line, 
     The pressure is implicit in itself and takes speed and opening of the start of the step: a leapfrog, which damps
     nothing. Where the step is too long for that (h w near 2, w the resonance) it takes the more of both at its end.
     """
-    g = p.jack
     stored = 0.25 * p.compressibility.volume * p.compressibility.coefficient  # m3/Pa
-    step = u.h * g.area
-    new = 1.0 / (1.0 + 8.0 * stored * g.mass / (step * step))  # (h w)^2 / ((h w)^2 + 8); 1 without compressibility
-    rest = stored * x.slope / step
-    share = 1.0 / (1.0 + rest)
+    step = u.h * p.jack.area
+    new = step * step / (step * step + 8.0 * stored * p.jack.mass)  # (h w)^2 / ((h w)^2 + 8); 1 where the oil is rigid
     old = 1.0 - new
-    offset = (rest * s.pressure + (new * x.offset + old * m.offset) - x.slope * old * s.jack_speed) * share
-    line = Line(offset, x.slope * new * share, x.limit, (new * x.drive + old * m.drive) * share)
+    share = step / (step + stored * x.slope)
+    taken = new * x.offset + old * m.offset - x.slope * old * s.jack_speed
+    line = Line((1.0 - share) * s.pressure + share * taken, x.slope * new * share, x.limit,
+                (new * x.drive + old * m.drive) * share)
     return line, Metered(x.offset, x.drive)
 
 
@@ -61,12 +60,13 @@ def orifice_root(x: Line, s: Any, u: Any, p: Any) -> Line:
     """
     part = p.orifice_root.share * x.drive
     size = abs(part)
-    on = size > 0.0
+    on = size > 1e-3  # Pa; below, the law is the linear one and its squares may vanish
     sign = 1.0 if part > 0.0 else -1.0
     left = x.limit - sign * (x.offset - part - x.slope * s.jack_speed)
     left = left if left > 0.0 else 0.0
-    root = size + sqrt(size * size + 4.0 * x.limit * left)
-    w = 2.0 * left / (root if on else 1.0)
-    slope = x.slope * (2.0 * x.limit * w) / ((2.0 * x.limit * w + size) if on else 1.0)
+    root = sqrt(size * size + 4.0 * x.limit * left)
+    both = 1.0 / ((root * (root + size)) if on else 1.0)  # one division for 1/root and 1/(root + size)
+    w = 2.0 * left * root * both
+    slope = x.slope * (1.0 - size * (root + size) * both)
     offset = sign * x.limit * (1.0 - w * w) + slope * s.jack_speed
     return Line(offset if on else x.offset, slope if on else x.slope, x.limit, x.drive)
