@@ -101,7 +101,7 @@ class Supply(NamedTuple):
 class Jack(NamedTuple):
     """The cylinder with the surface it moves."""
 
-    area: Annotated[float, _q("m2", "AJ", low=1e-7, high=1)]
+    area: Annotated[float, _q("m2", "AJ", low=1e-7, high=1, tolerance=0.015)]
     mass: Annotated[float, _q("kg", "MJ", low=1e-2, high=1e6, tolerance=0.015)]
     damping: Annotated[float, _q("N s/m", "CJ", low=0, high=1e9, tolerance=0.015)]
     static_friction: Annotated[float, _q("N", "FSJ", low=0, high=1e7, tolerance=0.015)]

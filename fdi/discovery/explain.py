@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.fingerprints import Fingerprint, comb, firmware
+from fdi.discovery.fit import BLOCK, blocks
 from fdi.discovery.nulls import SEEN, Sensitivity, sensitivity
 from fdi.discovery.problem import Problem
 from fdi.discovery.record import Record
@@ -23,7 +24,8 @@ MOST = 3  # effects looked for one after the other
 EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
 CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
 BETTER = 0.8  # times the error before: what counts as a part of the explanation
-HELD_OUT = 1.2  # times the floor, on a run with another command
+HELD_OUT = 1.2  # times the floor, in the typical block of a run with another command
+TYPICAL = 0.85  # of the blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +113,20 @@ def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool
 
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
                holdout: Record | None) -> Explanation:
-    fine = [replace(p, steps=FINE, _lanes={}) for p in (search.problem, *search.repeats)]
-    search.problem, search.repeats = fine[0], fine[1:]
+    search.refine(FINE)
     depth = max((i for i in range(1, len(levels)) if _significant(levels[i - 1][0], levels[i][0])), default=0)
     if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
         depth = 1
-    base = search.again(levels[0][0], 6)
-    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:5] if depth else []
+    base = search.again(levels[0][0], 4)
+    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
     close = sorted((search.again(h, 6) for h in close), key=lambda h: h.cost + h.repeat_cost)
     others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])
               if h.effects not in [c.effects for c in close]]
     ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.floor(close[0] if close else base)
     held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
-    verdict, named = _verdict(base, close, depth, found, controller, floor, held)
+    holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
+    verdict, named = _verdict(base, close, holding, depth, found, controller, floor)
     blind = sensitivity(search.problem, (close[0] if close and verdict == "EXPLAINED" else base).fit, search.effects)
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
                        blind, search)
@@ -134,10 +136,10 @@ def _parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypoth
     return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
 
 
-def _verdict(base: Hypothesis, close: Sequence[Hypothesis], depth: int, found: Sequence[Fingerprint], controller: float,
-             floor: Mapping[str, float], held: Mapping[tuple[str, ...], Mapping[str, float]]
+def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], depth: int,
+             found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
              ) -> tuple[str, tuple[str, ...]]:
-    """The verdict and the effects it names."""
+    """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run."""
     prints = tuple(f.effect for f in found)
     firmware_left = controller > 3.0 and not any(CATALOGUE[f.effect].firmware for f in found)
     if not depth:
@@ -150,7 +152,7 @@ def _verdict(base: Hypothesis, close: Sequence[Hypothesis], depth: int, found: S
     least = gain(base, best)
     if base.reached and least < CONVINCING:
         return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
-    there = [h for h in close if h.reached and _holds(h, floor, held)]
+    there = [h for h in holding if h.reached]
     if best.reached and there and not firmware_left:
         equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * EQUAL]
         if len(equal) > 1:
@@ -165,12 +167,26 @@ def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
     return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
 
 
-def _holds(h: Hypothesis, floor: Mapping[str, float], held: Mapping[tuple[str, ...], Mapping[str, float]]) -> bool:
-    return h.effects not in held or all(e <= HELD_OUT * floor[s] for s, e in held[h.effects].items())
+def _holds(search: Search, h: Hypothesis, record: Record, floor: Mapping[str, float]) -> bool:
+    left = typical(_unseen(search, h, record))
+    return all(e <= HELD_OUT * floor[s] for s, e in zip(record.signals, left, strict=True))
 
 
 def held_out(search: Search, h: Hypothesis, record: Record) -> dict[str, float]:
     """RMS residual on a run that the fit never saw, SI units."""
-    problem: Problem = replace(search.problem, record=record)
-    residuals = problem.residuals(h.fit.free, h.fit.x[None])[0]
+    residuals = _unseen(search, h, record)
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, residuals, strict=True)}
+
+
+def _unseen(search: Search, h: Hypothesis, record: Record) -> Floats:
+    problem: Problem = replace(search.problem, record=record, also=())
+    left: Floats = problem.residuals(h.fit.free, h.fit.x[None])[0]
+    return left
+
+
+def typical(residuals: Floats) -> Floats:
+    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
+    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
+    kept = squares[:, :max(1, round(TYPICAL * squares.shape[1]))]
+    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
+    return rms

@@ -138,7 +138,7 @@ def _normal(fit: Fit) -> tuple[Floats, Floats]:
 
 def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
     flat = (jacobian * np.sqrt(weights(white))).reshape(len(free), -1)
-    inverse: Floats = np.linalg.pinv(flat @ flat.T + np.diag(_prior(free)))
+    inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior(free))), np.float64)
     return inverse
 
 

@@ -67,7 +67,10 @@ def unknowns(effect: Effect) -> tuple[Free, ...]:
 
 @dataclass
 class Problem:
-    """A model, the whole catalogue ready in it at off values, and a run to hold it against."""
+    """A model, the whole catalogue ready in it at off values, and runs to hold it against.
+
+    Predictions and residuals of several runs follow one another along time.
+    """
 
     model: Model  # with every effect that may be tried
     record: Record
@@ -75,16 +78,23 @@ class Problem:
     steps: int = STEPS
     anchor: float = ANCHOR
     workers: int = 1
+    also: tuple[Record, ...] = ()  # further runs, of the same signals, that a fit takes in
     _lanes: dict[tuple[str, ...], Lanes] = field(default_factory=dict)
 
     def predict(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
+        runs = [self.all_signals(names, values, r)[:, r.columns] for r in (self.record, *self.also)]
+        return np.concatenate(runs, axis=-1) if self.also else runs[0]
+
+    def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:
+        """XJ, P12 and XS of one run (default: the first), whichever were measured: (m, 3, n)."""
         key = tuple(names)
         if key not in self._lanes:
             self._lanes[key] = Lanes(self.model, key, self.steps, self.workers)
-        r = self.record
+        r = r or self.record
         out = self._lanes[key].replay(values, r.current, r.load, r.position, self.anchor)
-        return out.transpose(0, 2, 1)[:, r.columns]
+        signals: Floats = out.transpose(0, 2, 1)
+        return signals
 
     def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
@@ -93,10 +103,13 @@ class Problem:
 
     def left(self, predicted: Floats) -> Floats:
         """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
-        residuals = predicted - self.record.measured
-        lines = mains(residuals.shape[-1], self.model.values["controller.period"])
-        whole: Floats = residuals - (np.nan_to_num(residuals) @ lines) @ lines.T
-        return whole
+        parts, start = [], 0
+        for r in (self.record, *self.also):
+            residuals = predicted[..., start:start + len(r)] - r.measured
+            lines = mains(len(r), self.model.values["controller.period"])
+            parts.append(residuals - (np.nan_to_num(residuals) @ lines) @ lines.T)
+            start += len(r)
+        return np.concatenate(parts, axis=-1) if self.also else parts[0]
 
     def whitened(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""

@@ -104,7 +104,12 @@ class Search:
                 fits.sort(key=lambda each: each[1].cost)
                 fits[:kept] = pool.map(partial(self._further, rounds), fits[:kept])
             done = pool.map(lambda each: self.judged((*start.effects, each[0]), each[1]), fits)
-            return sorted(done, key=lambda h: h.cost)
+            ranked = sorted(done, key=lambda h: h.cost)
+        if ranked and not ranked[0].reached:
+            x = ranked[0].fit.x
+            settled = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
+            ranked[0] = self.retried(ranked[0], [np.where(settled & (np.abs(x) > 1.0), 0.0, x)])
+        return ranked
 
     def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else improved(self.problem, each[1], rounds)
@@ -123,7 +128,8 @@ class Search:
     def judged(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats."""
         signals = self.problem.record.signals
-        errors = _rms(found.residuals, signals)
+        own = found.residuals[:, :len(self.problem.record)]  # the first run of a fit to several
+        errors = _rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         x = found.x[None, :]
         others = [p.residuals(found.free, x)[0] for p in self.repeats]
@@ -132,7 +138,7 @@ class Search:
             return Hypothesis(effects, found, errors, {}, {s: errors[s] / floor[s] for s in signals})
         cost = float(np.mean([misfit(p.whitened(r[None]))[0] for p, r in zip(self.repeats, others, strict=True)]))
         repeated = {s: float(np.sqrt(np.mean([_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
-        ratio = dict(zip(signals, common(found.residuals, others, coarse), strict=True))
+        ratio = dict(zip(signals, common(own, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
 
     def learn_noise(self, best: Hypothesis) -> None:
@@ -148,8 +154,13 @@ class Search:
                 for s, n in zip(self.problem.record.signals, found, strict=True)}
 
     def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
-        """A hypothesis refitted with the noise as known now."""
+        """A hypothesis refitted with the noise, the steps and the runs as they are now."""
         return self.judged(h.effects, fit(self.problem, h.fit.free, h.fit.x, rounds))
+
+    def refine(self, steps: int) -> None:
+        """Finer steps from here on, and fits to the repeats as well."""
+        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.record for p in self.repeats))
+        self.repeats = [replace(p, steps=steps, _lanes={}) for p in self.repeats]
 
 
 def noise_of(h: Hypothesis, record: Record, before: Sequence[Noise]) -> list[Noise]:
@@ -157,7 +168,7 @@ def noise_of(h: Hypothesis, record: Record, before: Sequence[Noise]) -> list[Noi
     found = []
     for i, old in enumerate(before):
         if h.others:
-            n = min(h.fit.residuals.shape[1], *(o.shape[1] for o in h.others))
+            n = min(len(record), *(o.shape[1] for o in h.others))
             difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
             found.append(noises.fitted(difference))
         else:

@@ -114,5 +114,5 @@ def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Record) 
     known = dict(zip(search.problem.record.signals, search.noise, strict=True))
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
                                      for s in seen.signals)
-    problem: Problem = replace(search.problem, record=seen, noise=noise)
+    problem: Problem = replace(search.problem, record=seen, noise=noise, also=())
     return fit(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit
