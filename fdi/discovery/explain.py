@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 FINE = 20  # steps a cycle of the last fits
+FINEST = 80  # the same where that is not enough: a resonance of trapped oil, say
+COARSE = 0.2  # times the floor; a solver's error beyond it is not hidden by the noise
 MOST = 3  # effects looked for one after the other
 EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
 CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
@@ -119,11 +121,14 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
         depth = 1
     base = search.again(levels[0][0], 4)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
-    close = sorted((search.again(h, 6) for h in close), key=lambda h: h.cost + h.repeat_cost)
+    close = sorted((search.settle(h) for h in close), key=lambda h: h.cost + h.repeat_cost)
     others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])
               if h.effects not in [c.effects for c in close]]
     ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.floor(close[0] if close else base)
+    if search.solver_error(close[0] if close else base, floor) > COARSE:
+        search.refine(FINEST)
+        base, close = search.again(base, 2), [search.settle(h, 2) for h in close[:2]]
     held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
     verdict, named = _verdict(base, close, holding, depth, found, controller, floor)

@@ -17,6 +17,7 @@ Floats = NDArray[np.float64]
 BLOCK = 100  # cycles; shorter than most stick-slip events are apart, longer than a period of hum
 ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
 PARSIMONY = 4.0  # gain in -2 log likelihood that a further coefficient has to bring (Akaike asks for 2)
+CALM = 1.8  # times the median block's variance, up to which a block holds noise alone
 CONSISTENT = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
 
 
@@ -61,9 +62,13 @@ def fitted(residual: Floats, order: int = ORDER) -> Noise:
     sigma = level(x)
     if sigma == 0.0:
         return white(float(np.finfo(float).tiny))
-    x = np.clip(x, -5 * sigma, 5 * sigma)
-    n = len(x)
-    covariance = np.array([x[k:] @ x[:n - k] for k in range(order + 1)]) / n
+    size = BLOCK * (len(x) // BLOCK) or len(x)
+    blocks = x[:size].reshape(-1, min(BLOCK, size))
+    calm = blocks[(blocks**2).mean(axis=1) <= CALM * sigma**2]  # the others hold a stop that came a little later
+    n = calm.size
+    pairs = [np.einsum("ij,ij->", calm[:, k:], calm[:, :calm.shape[1] - k]) for k in range(order + 1)]
+    covariance = np.array(pairs) / n
+    covariance *= sigma**2 / covariance[0]
     best, cost = white(float(np.sqrt(covariance[0]))), 0.0
     for p in range(1, order + 1):
         a = solve_toeplitz(covariance[:p], covariance[1:p + 1])

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from fdi.discovery import noise as noises
 from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
+from fdi.discovery.known import free_of
 from fdi.discovery.noise import Noise
-from fdi.discovery.problem import Problem, tolerances, whole
+from fdi.discovery.problem import Problem, whole
 from fdi.discovery.record import NOISE, Record
 from fdi.discovery.scan import Prospect, scan
+from fdi.discovery.settle import settled
 from plant.effects import CATALOGUE
 from plant.model import Model
 
@@ -25,6 +27,7 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 WORTH = 20.0  # expected gain in cost that makes a full fit worth its time
 BEAM = 3  # hypotheses from which the next missing effect is looked for
+SETTLING = 5  # rounds of the last fit
 REACHED = 1.08  # times the floor; what is left above it is physics
 
 
@@ -59,7 +62,7 @@ class Search:
         self.workers = workers or os.cpu_count() or 1
         self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
         self.noise = tuple(self.sensors[name] for name in record.signals)
-        ready = whole(model)
+        self.model, ready = model, whole(model)
         self.problem = Problem(ready, record, self.noise, workers=1)
         self.repeats = [Problem(ready, r, self.noise) for r in repeats]
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
@@ -67,7 +70,7 @@ class Search:
 
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
-        first = self.judged((), fit(self.problem, tolerances(self.problem.model)))
+        first = self.judged((), fit(self.problem, free_of(self.model)))
         return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
     def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
@@ -156,6 +159,19 @@ class Search:
     def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
         return self.judged(h.effects, fit(self.problem, h.fit.free, h.fit.x, rounds))
+
+    def settle(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
+        """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
+        return self.judged(h.effects, settled(self.problem, fit(self.problem, h.fit.free, h.fit.x, 2), rounds))
+
+    def solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
+        """What half the step changes in a replay, over the floor, in the worst signal."""
+        halved = replace(self.problem, steps=2 * self.problem.steps, also=(), _lanes={})
+        coarse = replace(self.problem, also=(), _lanes={})
+        x = h.fit.x[None]
+        change = (halved.residuals(h.fit.free, x) - coarse.residuals(h.fit.free, x))[0]
+        typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
+        return max(float(t) / floor[s] for s, t in zip(self.problem.record.signals, typical, strict=True))
 
     def refine(self, steps: int) -> None:
         """Finer steps from here on, and fits to the repeats as well."""

@@ -1,0 +1,82 @@
+"""The last rounds of a fit, with differences along principal directions: they find the floor of a valley and its length.
+
+Stick-slip makes residuals rough: a step of a parameter shifts a hundred small events, some more, some less. Parameters
+that make up for each other, such as pressure and friction of the spool, are each known to a thousandth when the other
+is held; differences that narrow drown in the roughness, the valley along which both move together is not seen, fits end
+in it anywhere and their intervals are far too narrow. Differences along the principal directions of the covariance are
+as wide as each direction is open, and what they show is the next round's covariance.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.fit import DAMPINGS, ENOUGH, Fit, _stepped, misfit, weights
+from fdi.discovery.problem import Free, Problem
+
+Floats = NDArray[np.float64]
+
+ROUNDS = 8
+PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
+WIDTH = 3.0  # of a difference, standard deviations
+WIDEST, NARROWEST = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
+
+
+def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS) -> Fit:
+    """A fit taken to the end, with a covariance that holds at the width of its own intervals."""
+    now, idle = fit, 0
+    for _ in range(rounds):
+        here = along(problem, now.free, now.x, now.covariance)
+        there = _better(problem, here)
+        idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
+        now = there
+        if idle >= PATIENCE:
+            break
+    return replace(now, converged=True)
+
+
+def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats) -> Fit:
+    """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p)."""
+    directions = _principal(covariance)
+    moves = np.array([_inside(free, x, d) for d in directions.T])
+    residuals = problem.residuals(free, np.vstack([x, x + moves]))
+    white = problem.whitened(residuals)
+    slopes = np.linalg.lstsq(moves, (white[1:] - white[0]).reshape(len(x), -1), rcond=None)[0]
+    prior = np.diag([f.prior**-2 for f in free])
+    heavy = (slopes.reshape(len(x), *white[0].shape) * weights(white[0])).reshape(len(x), -1)
+    held = float(misfit(white[:1])[0])
+    return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ slopes.T + prior), residuals[0],
+               white[0], slopes.reshape(len(x), *white[0].shape))
+
+
+def _principal(covariance: Floats) -> Floats:
+    """Principal directions (p, p), one a column, `WIDTH` standard deviations long."""
+    variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    wide: Floats = WIDTH * vectors * np.sqrt(np.clip(variances, NARROWEST, WIDEST))
+    return wide
+
+
+def _inside(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
+    """The move, or its opposite, cut off at the bounds: whichever is longer then."""
+    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    ways = [np.clip(x + way, low, high) - x for way in (move, -move)]
+    return max(ways, key=lambda way: float(way @ way))
+
+
+def _better(problem: Problem, fit: Fit) -> Fit:
+    """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
+    prior = np.diag([f.prior**-2 for f in fit.free])
+    flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * weights(fit.white)))
+    gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
+    trials = np.array([_stepped(fit, hessian, gradient, damping) for damping in DAMPINGS])
+    residuals = problem.residuals(fit.free, trials)
+    white = problem.whitened(residuals)
+    held = misfit(white)
+    costs = held + np.einsum("ij,jk,ik->i", trials, prior, trials)
+    k = int(np.argmin(costs))
+    if costs[k] >= fit.cost:
+        return fit
+    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k], white=white[k])
