@@ -12,23 +12,21 @@ from typing import Any, NamedTuple
 from plant.compile import Function, record_at
 from plant.controller import Loop, answer
 from plant.flat import lane_packers
-from plant.model import Model, bindings, initial
+from plant.model import bare, bindings, initial
+from plant.plants import find
 from plant.replay import SILENCE, moved, pull, rested, sampled, shown
 from plant.solve import demanded, sense
 from plant.state import Input
-from plant.step import Coefficients, coefficients, step
+from plant.step import coefficients, step
 
 WIDTH = 16  # lanes: two of the widest registers, so that one computes while the other waits for its results
 
 
-class Row(NamedTuple):
-    """A row of the log, and the current that acts on the torque motor meanwhile: the answer of the row before."""
+class Drive(NamedTuple):
+    """Current through the torque motor, A: in this cycle, and the controller's answer for the next."""
 
-    sensed: float = 0.0  # XJ, m
-    answer: float = 0.0  # Cor, A
-    pressure: float = 0.0  # P12, Pa
-    spool: float = 0.0  # XS, m
-    acting: float = 0.0  # A
+    now: float = 0.0
+    next: float = 0.0
 
 
 def _bound(*arguments: Any) -> Any:
@@ -36,21 +34,21 @@ def _bound(*arguments: Any) -> Any:
 
 
 # each of these stands for a model's own, which is put in its place: x_at(buffer, lane), keep_x(x, buffer, lane)
-state_at = parameters_at = coefficients_at = loop_at = row_at = _bound
-keep_state = keep_coefficients = keep_loop = keep_row = _bound
+state_at = parameters_at = coefficients_at = loop_at = drive_at = _bound
+keep_state = keep_coefficients = keep_loop = keep_drive = _bound
 
 
-def layout(effects: tuple[str, ...]) -> tuple[dict[str, Function], int, int]:
-    """How a block of a model with `effects` is laid out.
+def layout(effects: tuple[str, ...], plant: str) -> tuple[dict[str, Function], int, int]:
+    """How a block of a plant with `effects` is laid out.
 
     Returns:
         What stands for the functions above and for the ports; the number of the first parameter, which follow each
         other as in `Model.names`; how many numbers a lane has.
     """
-    record = Model().having(effects).record()
-    shapes = {"state": initial(effects), "loop": Loop(), "row": Row(),
-              "coefficients": Coefficients(*[0.0] * len(Coefficients._fields))}
-    made, place = bindings(effects), 0
+    record = bare(plant).having(effects).record()
+    shapes = {"state": initial(effects), "loop": Loop(), "drive": Drive(),
+              "coefficients": find(plant).coefficients(record[0], 1.0)}
+    made, place = bindings(effects, plant), 0
     for name, shape in shapes.items():
         made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, WIDTH, place)
     made["parameters_at"] = record_at(record.dtype, place * WIDTH, WIDTH)
@@ -81,15 +79,14 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
     for k in range(len(com)):
         t = k * period
         for lane in range(WIDTH):
-            sample(a, lane, t, com[k])
-        if closed:
-            for lane in range(WIDTH):
-                control(a, lane, t, com[k])
+            xj, p12, xs = sample(a, lane, t)
+            out[lane, 0, k], out[lane, columns - 2, k], out[lane, columns - 1, k] = xj, p12, xs
+        given = com[k - 1] if k else 0.0
         for lane in range(WIDTH):
-            row = row_at(a, lane)
-            out[lane, 0, k], out[lane, columns - 2, k], out[lane, columns - 1, k] = row.sensed, row.pressure, row.spool
             if closed:
-                out[lane, 1, k] = row.answer
+                out[lane, 1, k] = control(a, lane, t, com[k], out[lane, 0, k])
+            else:
+                keep_drive(Drive(given, 0.0), a, lane)
         if len(position):
             for lane in range(WIDTH):
                 s = state_at(a, lane)
@@ -97,23 +94,24 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
         for i in range(steps):
             # the loop that everything is for
             for lane in range(WIDTH):
-                u = Input(row_at(a, lane).acting, load[k], 0.0, t + i * h, i * h, h)
+                u = Input(drive_at(a, lane).now, load[k], 0.0, t + i * h, i * h, h)
                 keep_state(step(state_at(a, lane), u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
 
 
-def sample(a: Any, lane: int, t: float, given: float) -> None:
-    """What one lane's transducers read at `t`, and the current of the next cycle as it was measured."""
+def sample(a: Any, lane: int, t: float) -> tuple[float, float, float]:
+    """What one lane's transducers read at `t`: XJ m, P12 Pa, XS m."""
     s = state_at(a, lane)
     xj, p12, xs, m_reading = sense(s, s.memory.reading, SILENCE, t, parameters_at(a, lane))
     keep_state(sampled(s, s.memory.command, m_reading), a, lane)
-    keep_row(Row(xj, given, p12, xs, row_at(a, lane).answer), a, lane)
+    return xj, p12, xs
 
 
-def control(a: Any, lane: int, t: float, com: float) -> None:
-    """What the controller of one lane answers, in place of the measured current."""
-    s, p, row = state_at(a, lane), parameters_at(a, lane), row_at(a, lane)
-    demand, m_command = demanded(com, s.memory.command, row.sensed, t, p)
-    cor, c = answer(loop_at(a, lane), demand, row.sensed, p.controller)
+def control(a: Any, lane: int, t: float, com: float, xj: float) -> float:
+    """What the controller of one lane answers to the demand `com` and the position `xj` it sensed; it acts later."""
+    s, p, d = state_at(a, lane), parameters_at(a, lane), drive_at(a, lane)
+    demand, m_command = demanded(com, s.memory.command, xj, t, p)
+    cor, c = answer(loop_at(a, lane), demand, xj, p.controller)
     keep_loop(c, a, lane)
     keep_state(sampled(s, m_command, s.memory.reading), a, lane)
-    keep_row(Row(row.sensed, cor, row.pressure, row.spool, row.acting), a, lane)
+    keep_drive(Drive(d.next, cor), a, lane)
+    return cor

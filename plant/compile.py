@@ -125,6 +125,12 @@ def _calls(function: Function) -> dict[str, Function]:
     return {name: g for name, g in named.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
 
 
+def called(function: Function) -> set[str]:
+    """The names of all functions that `function` calls, and that these call."""
+    below = _calls(function)
+    return set(below).union(*(called(g) for g in below.values()))
+
+
 def _ours(value: Any) -> Any:
     """Our own version of a function of `math` or `numpy` if there is one, else the value itself."""
     known = isinstance(value, BuiltinFunctionType | np.ufunc)

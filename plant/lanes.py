@@ -92,7 +92,7 @@ class Lanes:
 
     def _buffers(self, values: Array) -> Array:
         """The blocks' buffers at the start, (blocks, numbers * WIDTH); idle lanes repeat the last run."""
-        _, first, numbers = _laid_out(self.model.effects, _laws(self.model.effects))
+        _, first, numbers = _laid_out(self.model.effects, _laws(self.model.effects), self.model.plant)
         blocks = -(-len(values) // block.WIDTH)
         a = np.zeros((blocks, numbers, block.WIDTH))
         state, record = flat.values(self.model.state()), self.model.record().view(np.float64)
@@ -104,7 +104,7 @@ class Lanes:
         return a.reshape(blocks, numbers * block.WIDTH)
 
     def _kernel(self) -> Function:
-        return _compiled(self.model.effects, _laws(self.model.effects))
+        return _compiled(self.model.effects, _laws(self.model.effects), self.model.plant)
 
 
 def _laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
@@ -112,10 +112,10 @@ def _laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 @cache
-def _laid_out(effects: tuple[str, ...], laws: tuple[Any, ...]) -> tuple[dict[str, Function], int, int]:
-    return block.layout(effects)
+def _laid_out(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> tuple[dict[str, Function], int, int]:
+    return block.layout(effects, plant)
 
 
 @cache
-def _compiled(effects: tuple[str, ...], laws: tuple[Any, ...]) -> Function:
-    return compiled(block.run, _laid_out(effects, laws)[0])
+def _compiled(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str = "eha") -> Function:
+    return compiled(block.run, _laid_out(effects, laws, plant)[0])

@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 from plant.errors import InputError
 from plant.quantity import Quantity, quantities
@@ -125,6 +125,16 @@ GROUPS: dict[str, type[Any]] = {
 }
 
 
+def in_unit(group: type[Any], unit: str, other: str, wider: float) -> type[Any]:
+    """A parameter group whose fields are in another unit, such as raw/m for A/m, and as much wider in range."""
+    known = quantities(group).items()
+    changed = [(name, q._replace(unit=q.unit.replace(unit, other), high=wider * q.high) if unit in q.unit else q)
+               for name, q in known]
+    made: Any = NamedTuple(group.__name__, [(name, Annotated[float, q]) for name, q in changed])  # type: ignore[misc]
+    made.__doc__ = group.__doc__
+    return cast("type[Any]", made)
+
+
 def accept(where: object, name: str, quantity: Quantity, value: object) -> float:
     """`value` as the number it stands for.
 
@@ -217,6 +227,8 @@ def _nominal() -> Mapping[str, float]:
 def sensible(where: object, values: Mapping[str, float]) -> None:
     """Refuse combinations that no actuator can have, each value being possible alone."""
     for body in ("spool", "jack"):
+        if f"{body}.static_friction" not in values:
+            continue
         static, dynamic = values[f"{body}.static_friction"], values[f"{body}.dynamic_friction"]
         if dynamic > static and not math.isclose(dynamic, static):
             raise InputError(where, f"{body}.dynamic_friction",

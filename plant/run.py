@@ -67,7 +67,8 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     out = np.empty((len(com), 4))
     record = model.record()
     with laws(model):
-        kernel("closed_loop", model.effects, fast)(model.state(), com, force, noise(seed, len(com)), record, steps, out)
+        run = kernel("closed_loop", model.effects, fast, model.plant)
+        run(model.state(), com, force, noise(seed, len(com)), record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)
@@ -92,7 +93,7 @@ def _in_plain_python(model: Model) -> tuple[str, Exception] | None:
     laws = [CATALOGUE[name].function for name in model.effects]
     files = {law.__code__.co_filename for law in laws if law is not None}
     try:
-        step = kernel("cycle", model.effects, fast=False)
+        step = kernel("cycle", model.effects, False, model.plant)
         step(model.state(), 0.0, 0.0, 0.0, 0.0, model.record(), 1)
     except Exception as error:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
@@ -137,7 +138,7 @@ class Actuator:
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
         self._draws = draws(seed)
         self._noise = [0.0] * NOISES
-        self._advance = kernel("advance", model.effects, fast)
+        self._advance = kernel("advance", model.effects, fast, model.plant)
         # a reading that nothing changes is faster without a call of compiled code
         changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
         self._read = kernel("read", model.effects, fast) if changed else None

@@ -54,6 +54,7 @@ class Effect:
     excludes: tuple[str, ...] = ()  # effects that cannot be at work together with this one
     confused_with: tuple[str, ...] = ()  # effects, or parameters, that position alone cannot tell from it
     source: str = ""  # where the law is from
+    plant: str = ""  # the one plant that has it; "" for any that has its port
 
     @property
     def file(self) -> Path | None:
@@ -75,7 +76,26 @@ class Effect:
         return self.function is None
 
 
-CATALOGUE: dict[str, Effect] = {}
+class Catalogue(dict[str, Effect]):
+    """Effects by name. Those that belong to one plant are found by name, but not listed: they suit no other."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.special: dict[str, Effect] = {}
+
+    def __missing__(self, name: str) -> Effect:
+        return self.special[name]
+
+    def enter(self, e: Effect) -> None:
+        """Put an effect in its place."""
+        (self.special if e.plant else self)[e.name] = e
+
+    def whole(self) -> dict[str, Effect]:
+        """All of them."""
+        return {**self, **self.special}
+
+
+CATALOGUE = Catalogue()
 
 
 Start = float | tuple[float, ...]  # values of the fitted parameters, in their order
@@ -95,7 +115,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         disturbance: noise of the bench, which nobody fits.
         fitted: fields that a fit frees; default all.
         starts: values of these, one tuple a start; without any, `plant.starts` finds some.
-        more: `excludes`, `confused_with`, `source` of `Effect`.
+        more: `excludes`, `confused_with`, `source`, `plant` of `Effect`.
 
     Raises:
         ValueError: unknown port or field, a parameter without default, or a name already taken.
@@ -109,15 +129,16 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
         name = function.__name__
-        if name in GROUPS or (name in CATALOGUE and CATALOGUE[name].file != Path(function.__code__.co_filename)):
+        known = CATALOGUE.whole().get(name)
+        if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
         if set(group._fields) - set(group._field_defaults):
             raise ValueError(f"{name}: every parameter needs a default, its off value")
         meaning = {f"{name}.{field}": q for field, q in quantities(group).items()}
         off = {f"{name}.{field}": float(value) for field, value in group._field_defaults.items()}
         names = tuple(f"{name}.{field}" for field in free)
-        CATALOGUE[name] = Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
-                                 names, _starts(names, starts), **more)
+        CATALOGUE.enter(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
+                               names, _starts(names, starts), **more))
         return function
 
     return register
@@ -127,11 +148,12 @@ def _starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mapping[st
     return tuple(dict(zip(names, start if isinstance(start, tuple) else (start,), strict=True)) for start in values)
 
 
-def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start], **more: Any) -> None:
-    """Register an effect that the reference model has already, by the parameters that carry it; a fit frees all."""
-    meaning = {field: quantities(GROUPS[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
-    CATALOGUE[name] = Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_starts(fields, starts),
-                             **more)
+def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start],
+         groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> None:
+    """Register an effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
+    meaning = {field: quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
+    CATALOGUE.enter(Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_starts(fields, starts),
+                           **more))
 
 
 def load_effects(path: Path) -> list[str]:
@@ -162,5 +184,6 @@ def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
     return chain((entry.function, entry.memory) for entry in acting)
 
 
-for _family in ("base", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "sensors"):
+for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",
+                "sensors"):
     importlib.import_module(f"plant.effects.{_family}")

@@ -1,0 +1,80 @@
+"""An electro-hydrostatic position servo: a motor turns a pump, the pump moves a ram that presses against a load.
+
+Nominal is the bare integrator, a ram as fast as the pump delivers; what else there is, `rig explain` has to find.
+Rig and data: github.com/ivliev123/Electro-Hydraulic-Actuator, 4_ANALIZE_DATA/DATA_Experiment_Processed, 1 kHz. "raw" is
+the unit of its motor speed, which its authors do not state.
+"""
+from collections import namedtuple
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+
+from plant.effects import base
+from plant.parameters import GROUPS, in_unit
+from plant.plants import Array, Plant, Table, Term
+from plant.ports import at_current, at_position, at_valve
+from plant.quantity import Quantity
+from plant.state import Input, Line, Ports, State
+from plant.step import jack
+
+AREA, ROD = 1.963e-3, 0.686  # m2, piston of 50 mm; the other side over it: the usual rod of 28 mm
+SEALED = 1e-16  # m3/s/Pa, no leak to speak of: so pressure has an answer even where no oil gives way
+
+
+class Pump(NamedTuple):
+    """The pump, and the valve that gives its flow to one chamber and the other chamber to the tank."""
+
+    displacement: Annotated[float, Quantity("m3/s/raw", "D", low=1e-10, high=1e-6, tolerance=0.1)]
+    area_ratio: Annotated[float, Quantity("1", low=0.1, high=2)]  # that the flow meets, backwards over forwards
+    drain: Annotated[float, Quantity("s", low=1e-3, high=10)]  # time constant of a chamber that is given to the tank
+
+
+Coefficients = namedtuple("Coefficients", "gain valve_slope jack_damping jack_free jack_coupled")
+
+
+def coefficients(p: Any, h: float) -> Any:
+    """D w = AJ XJ' + CLK P12, solved for P12."""
+    slope, mass = p.jack.area / (p.jack.leakage + SEALED), p.jack.mass + h * p.jack.damping
+    return Coefficients(p.pump.displacement / p.jack.area * slope, slope, p.jack.damping, 1.0 / mass,
+                        1.0 / (mass + h * p.jack.area * slope))
+
+
+def step(s: State, u: Input, p: Any, k: Any) -> State:
+    """The plant `u.h` seconds later; P12 is what pushes the ram, over the piston's larger side."""
+    m = s.memory
+    w, m_current = at_current(u.current, m.current, s, u, p)
+    r = 1.0 if (w if w != 0.0 else s.pressure) >= 0.0 else p.pump.area_ratio  # without flow the valve is closed
+    held = s.pressure * (1.0 if w * s.pressure >= 0.0 else p.pump.drain / (p.pump.drain + u.h))
+    before = State(0.0, 0.0, 0.0, 0.0, s.jack_position, s.jack_speed, held, s.sensed, m)
+    pump = Line(r * k.gain * w, r * r * k.valve_slope, p.supply.pressure, 0.0)
+    line, m_valve = at_valve(pump, m.valve, before, u, p)
+    x, v, p12, m_load, m_drag = jack(s, u, p, k, line)
+    sensed, m_position = at_position(x, m.position, State(0.0, 0.0, 0.0, 0.0, x, v, p12, s.sensed, m), u, p)
+    return State(0.0, 0.0, 0.0, 0.0, x, v, p12, sensed, Ports(
+        m.command, m_current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m_valve, m_load,
+        m_drag, m_position, m.reading))
+
+
+def tare(c: Mapping[str, Array]) -> Array:
+    """The load of a run, N: in the sum of the pressures where the demand rises and where it falls friction cancels."""
+    rate, p = np.diff(c["com"], prepend=c["com"][0]), c["p12"]
+    return np.full_like(p, AREA * (np.nanmedian(p[rate > 0.0]) + np.nanmedian(p[rate < 0.0])))
+
+
+base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs", law="AJ times the ratio, backwards",
+     symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
+
+PLANT = Plant(
+    "ehs", "raw", step, coefficients,
+    {"controller": in_unit(GROUPS["controller"], "A", "raw", 1e6), "pump": Pump, **{
+        name: GROUPS[name] for name in ("supply", "jack", "sensors")}},
+    {"controller.proportional_gain": 4e5, "controller.current_limit": 3e3, "controller.period": 1e-3,
+     "pump.displacement": 2.3e-8, "pump.area_ratio": 1.0, "pump.drain": 0.05, "supply.pressure": 1e7,
+     "jack.area": AREA, "jack.mass": 20.0, "jack.travel": 0.1, "sensors.position_noise": 1e-6,
+     "sensors.pressure_noise": 2e4, "sensors.spool_noise": 1e-6, "quantisation.lsb": 2.5e-5,
+     "compressibility.volume": 6e-3},  # m3, of oil between pump and ram, with its hoses
+    has=("quantisation",), controller=False, table=Table(skip=60, separator=";", load=tare, columns={
+        "t": (Term("EXP_Time"),), "com": (Term("EXP_PosRef", 1e-3),), "xj": (Term("EXP_PosFb", 1e-3),),
+        "cor": (Term("EXP_Velocity"),),  # the pressures are means of 20 and 60 rows, here put back by half of that
+        "p12": (Term("EXP_Pressure_A", 1e5, 10), Term("EXP_Pressure_B", -ROD * 1e5, 30))}))

@@ -1,0 +1,109 @@
+"""Which plants there are: each a step function with its parameters, built from the same parts and effects.
+
+A plant's `step` and `coefficients` stand in place of the reference model's in every kernel (`plant.compile` binds by
+name), so whatever runs the one runs the other: one run, lanes, the emulator, fits.
+"""
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant import step as reference
+from plant.compile import Function, called
+from plant.effects import Effect
+from plant.errors import InputError
+from plant.parameters import GROUPS, nominal
+
+Array = NDArray[np.float64]
+MODULES = {"ehs": "plant.ehs"}  # plants beside the reference model; read when first named
+
+
+class Term(NamedTuple):
+    """A column of a file of the plant's own rig as part of a trace's column: `factor` times the value `later` rows on.
+
+    A mean of the last m rows stands (m - 1)/2 rows late in its file: `later` puts it back.
+    """
+
+    source: str
+    factor: float = 1.0
+    later: int = 0
+
+
+@dataclass(frozen=True)
+class Table:
+    """How files of the plant's own rig are read as a trace."""
+
+    columns: Mapping[str, tuple[Term, ...]]  # t, com, xj, cor and what else of a trace there is, as sums
+    skip: int = 0  # rows of start-up
+    separator: str = ","
+    load: Callable[[Mapping[str, Array]], Array] | None = None  # from these columns, (n,) N
+
+    @property
+    def sources(self) -> set[str]:
+        """The columns that a file must have."""
+        return {term.source for terms in self.columns.values() for term in terms}
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """One kind of actuator."""
+
+    name: str
+    unit: str  # of what drives it, the columns `cor`
+    step: Function  # (state, input, parameters, coefficients) -> state
+    coefficients: Function  # (parameters, step length) -> a NamedTuple of floats
+    groups: Mapping[str, type[Any]]  # its parameters
+    given: Mapping[str, float]  # their values, 0 if not given; and what is not as usual here of effects' parameters
+    has: tuple[str, ...] = ()  # effects of the nominal model
+    controller: bool = True  # the controller is known, so that Cor can be held against com and XJ
+    table: Table | None = field(default=None, repr=False)
+
+    @cached_property
+    def nominal(self) -> Mapping[str, float]:
+        """All values of the nominal plant, "group.field" to SI value."""
+        zero = {f"{group}.{name}": 0.0 for group, cls in self.groups.items() for name in cls._fields}
+        return {**zero, **self.given}
+
+    @cached_property
+    def ports(self) -> frozenset[str]:
+        """Where effects can act: the ports that its step calls, and those of the sampled loop around it."""
+        calls = called(self.step) | (called(reference.changing_oil) if self.step is reference.step else set())
+        return frozenset({"command", "reading"} | {name[3:] for name in calls if name.startswith("at_")})
+
+    def offers(self, e: Effect) -> bool:
+        """Whether an effect makes sense here: its port or its parameters are there, and its input has this unit."""
+        if e.plant not in ("", self.name):
+            return False
+        if e.base:
+            return all(name in self.nominal for name in e.fitted)
+        return e.port in self.ports and (self.unit == "A" or "A" not in {q.unit for q in e.parameters.values()})
+
+
+def find(name: str) -> Plant:
+    """The plant of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name == "eha":
+        return _reference()
+    if name not in MODULES:
+        raise InputError("plant", name, f"one of {', '.join(names())}")
+    plant: Plant = importlib.import_module(MODULES[name]).PLANT
+    return plant
+
+
+def names() -> tuple[str, ...]:
+    """All plants."""
+    return ("eha", *MODULES)
+
+
+@cache
+def _reference() -> Plant:
+    return Plant("eha", "A", reference.step, reference.coefficients, GROUPS, nominal())
