@@ -60,11 +60,14 @@ def run(explain: str, seeds: Sequence[int], folder: Path, jobs: int = 2,
     `explain` names the callable as "module:function", for the processes to import.
 
     Raises:
-        InputError: no such callable; no C compiler.
+        InputError: no such callable, no C compiler, or no such folder can be made.
     """
     load_explain(explain)
     truth.fields()  # built once, before the processes need it
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "", f"a folder that can be made ({error.strerror})") from error
     known = {r["seed"]: r for r in _lines(folder / RESULTS) if r["sources"] == sources() and r["by"] == explain}
     found = {seed: known[seed] for seed in seeds if seed in known}
     missing = [seed for seed in seeds if seed not in found]
