@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 FINE = 20  # steps a cycle of the last fits
-FINEST = 80  # the same where that is not enough: a resonance of trapped oil, say
+FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
 COARSE = 0.2  # times the floor; a solver's error beyond it is not hidden by the noise
 MOST = 3  # effects looked for one after the other
 EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
@@ -128,7 +128,7 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     floor = search.floor(close[0] if close else base)
     if search.solver_error(close[0] if close else base, floor) > COARSE:
         search.refine(FINEST)
-        base, close = search.again(base, 2), [search.settle(h, 2) for h in close[:2]]
+        base, close = search.again(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
     verdict, named = _verdict(base, close, holding, depth, found, controller, floor)

@@ -14,7 +14,7 @@ from fdi.discovery import noise as noises
 from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
 from fdi.discovery.known import free_of
 from fdi.discovery.noise import Noise
-from fdi.discovery.problem import Problem, whole
+from fdi.discovery.problem import QUIET, Problem, whole
 from fdi.discovery.record import NOISE, Record
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.settle import settled
@@ -63,8 +63,9 @@ class Search:
         self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
         self.noise = tuple(self.sensors[name] for name in record.signals)
         self.model, ready = model, whole(model)
-        self.problem = Problem(ready, record, self.noise, workers=1)
-        self.repeats = [Problem(ready, r, self.noise) for r in repeats]
+        bare = model.replace(QUIET)
+        self.problem = Problem(ready, record, self.noise, workers=1, bare=bare)
+        self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
         self.coarse: dict[str, float] = {}  # RMS of rounding, where a signal comes in steps
 
