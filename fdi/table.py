@@ -16,14 +16,15 @@ from plant.errors import InputError
 Floats = NDArray[np.float64]
 
 
-def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> tuple[dict[str, Floats], tuple[str, ...]]:
+def read_csv(path: Path, required: Iterable[str], optional: Iterable[str],
+             separator: str = ",") -> tuple[dict[str, Floats], tuple[str, ...]]:
     """-> the known columns, shape (rows,), NaN where a field is empty; and the names of columns that are not known.
 
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
     try:
-        with _opened(path) as stream:
-            return _parse(path, csv.reader(stream), tuple(required), tuple(optional))
+        with opened(path) as stream:
+            return _parse(path, csv.reader(stream, delimiter=separator), tuple(required), tuple(optional))
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
     except (OSError, EOFError) as error:
@@ -43,7 +44,8 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
         raise InputError(path, "", f"a place that can be written ({error.strerror})") from error
 
 
-def _opened(path: Path) -> io.TextIOBase:
+def opened(path: Path) -> io.TextIOBase:
+    """A text file, unpacked if it is a `.gz`."""
     if path.suffix == ".gz":
         return io.TextIOWrapper(gzip.open(path), encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.foreign import read_foreign, recorded_by
 from fdi.log import Log, open_log
 from fdi.sections import Section, sections
 from fdi.table import read_csv, write_csv
@@ -156,7 +157,11 @@ class Trace:
 
 
 def _from_csv(path: Path) -> Trace:
-    columns, unknown = read_csv(path, REQUIRED, OPTIONAL)
+    plant = recorded_by(path)
+    if plant and plant.table:
+        columns, unknown = read_foreign(path, plant.table)
+    else:
+        columns, unknown = read_csv(path, REQUIRED, OPTIONAL)
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")
@@ -169,7 +174,8 @@ def _from_csv(path: Path) -> Trace:
     grid, gaps = _on_grid(path, rows, {**columns, "t": t})
     lost = np.isnan(grid["t"])
     grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
-    return _trace(grid, period, gaps, provenance={"source": path.name},
+    return _trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
+                  units=UNITS | ({"cor": plant.unit} if plant else {}),
                   notes=tuple(f"column {name} is not known and was left out" for name in unknown))
 
 

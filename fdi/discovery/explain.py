@@ -14,7 +14,7 @@ from fdi.discovery.problem import Problem
 from fdi.discovery.record import Record
 from fdi.discovery.search import Hypothesis, Search
 from plant.effects import CATALOGUE
-from plant.model import Model
+from plant.model import Model, offered
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -62,7 +62,7 @@ def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: 
     controller, prints = firmware(model, [est, *repeats])
     tooth = comb(est)
     found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
-    candidates = [e for e in CATALOGUE if CATALOGUE[e].port not in ("command", "reading") and CATALOGUE[e].starts]
+    candidates = [e.name for e in offered(model.plant) if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, workers)
     if tooth:
         search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +38,7 @@ def resolution(model: Model) -> float:
 def firmware_residual(model: Model, record: Record) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     firmware = tuple(e for e in model.effects if CATALOGUE[e].firmware)
-    own = Model(model.name, model.values, firmware)
+    own = replace(model, effects=firmware)
     out = np.empty(len(record))
     position = held(record.position)
     kernel("firmware", firmware)(own.state().memory.command, record.com, position, own.record(), out)
@@ -47,7 +48,12 @@ def firmware_residual(model: Model, record: Record) -> Floats:
 
 
 def firmware(model: Model, records: Sequence[Record]) -> tuple[float, list[Fingerprint]]:
-    """RMS of Cor against the model's firmware in units of its resolution, and the firmware effects that explain it."""
+    """RMS of Cor against the model's firmware in units of its resolution, and the firmware effects that explain it.
+
+    Of a plant whose controller is not known, neither.
+    """
+    if not model.kind.controller:
+        return 0.0, []
     unit = resolution(model)
     before = _rms(model, records) / unit
     found = []

@@ -3,22 +3,21 @@ from __future__ import annotations
 
 from fdi.discovery.problem import FURTHEST, Free, tolerances, unknowns
 from plant.effects import CATALOGUE, Effect
-from plant.model import Model
-from plant.parameters import nominal
+from plant.model import Model, offered
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
 
 
 def effects_of(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
-    return tuple(name for name, e in CATALOGUE.items()
-                 if (_off_nominal(e, model) if e.base else name in model.effects and e.acts(model.values)))
+    return tuple(e.name for e in offered(model.plant)
+                 if (_off_nominal(e, model) if e.base else e.name in model.effects and e.acts(model.values)))
 
 
 def unknowns_of(model: Model) -> tuple[Free, ...]:
     """The parameters of these effects, to be fitted from the values they have; nothing else is known of them."""
     replayed = [CATALOGUE[name] for name in effects_of(model) if CATALOGUE[name].port not in UNREPLAYED]
-    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in unknowns(e))
+    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in unknowns(e, model))
 
 
 def free_of(model: Model) -> tuple[Free, ...]:
@@ -29,6 +28,6 @@ def free_of(model: Model) -> tuple[Free, ...]:
 
 
 def _off_nominal(e: Effect, model: Model) -> bool:
-    usual = nominal()
+    usual = model.kind.nominal
     return any(abs(model[name] - usual[name]) > (FURTHEST * e.parameters[name].tolerance + 1e-12) * abs(usual[name])
                for name in e.fitted)

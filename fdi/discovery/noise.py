@@ -45,6 +45,11 @@ def white(level: float) -> Noise:
     return Noise(level, np.ones(1), level)
 
 
+def rounded(noise: Noise, step: float) -> Noise:
+    """White noise and rounding, `step` RMS: for weights; the level stays that of the noise."""
+    return noise._replace(innovation=float(np.hypot(noise.innovation, step)))
+
+
 def level(difference: Floats, block: int = BLOCK) -> float:
     """Standard deviation of noise, (n,), in which now and then something else happens: the median block's."""
     n = len(difference) // block * block

@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from fdi.discovery.fit import Fit
 from fdi.discovery.problem import Problem
 from plant.effects import CATALOGUE
-from plant.parameters import nominal
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +31,7 @@ class Sensitivity(NamedTuple):
 
 def sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
-    usual = nominal()
+    usual = problem.model.kind.nominal
     starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]

@@ -13,8 +13,7 @@ from fdi.discovery.noise import Noise
 from fdi.discovery.record import Record
 from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
-from plant.model import Model, meaning
-from plant.parameters import nominal
+from plant.model import Model, meaning, offered
 
 Floats = NDArray[np.float64]
 
@@ -43,20 +42,20 @@ class Free(NamedTuple):
 
 def tolerances(model: Model) -> tuple[Free, ...]:
     """The parameters in which one healthy unit differs from another, each with its tolerance as prior."""
-    usual = nominal()
+    usual = model.kind.nominal
     free = []
     for name, value in model.values.items():
-        q = meaning(name)
-        if q.tolerance > 0.0:
+        q = meaning(name, plant=model.plant)
+        if q.tolerance > 0.0 and usual.get(name, value) != 0.0:  # what is not there does not scatter
             scale = q.tolerance * (abs(usual.get(name, value)) or 1.0)
             low, high = value - FURTHEST * scale, value + FURTHEST * scale
             free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
     return tuple(free)
 
 
-def unknowns(effect: Effect) -> tuple[Free, ...]:
+def unknowns(effect: Effect, model: Model) -> tuple[Free, ...]:
     """The parameters of an effect that is to be fitted: nothing is known of them but the possible range."""
-    usual, free = nominal(), []
+    usual, free = model.kind.nominal, []
     for name in effect.fitted:
         q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
         sizes = sorted(abs(start[name] - off) for start in effect.starts)
@@ -142,6 +141,11 @@ def _sorted_friction(free: Sequence[Free], values: Floats) -> Floats:
 
 
 def whole(model: Model) -> Model:
-    """The model without sensor noise and with all of the catalogue's effects at their off values."""
-    acting = [name for name, e in CATALOGUE.items() if not e.disturbance]
-    return model.having(acting).replace(QUIET)
+    """The model without sensor noise and with all effects that its plant may have, at their off values."""
+    return quiet(model.having(e.name for e in offered(model.plant) if not e.disturbance))
+
+
+def quiet(model: Model) -> Model:
+    """The model without sensor noise and rounding: these are what fits allow for."""
+    readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
+    return model.replace(QUIET | {name: value for e in readings for name, value in e.off.items()})

@@ -50,13 +50,13 @@ def scan(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Prospect]:
     best = _best(_tried(problem, fit, first))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
-        near = [(t.effect, start) for t in promising for start in _near(t, factors)]
+        near = [(t.effect, start) for t in promising for start in _near(problem, t, factors)]
         best = _best([*best.values(), *_tried(problem, fit, near)])
-    return sorted((_prospect(fit, t) for t in best.values()), key=lambda p: p.cost)
+    return sorted((_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
 
-def _prospect(fit: Fit, t: Trial) -> Prospect:
-    mine = {u.name: u for u in unknowns(CATALOGUE[t.effect])}
+def _prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
+    mine = {u.name: u for u in unknowns(CATALOGUE[t.effect], problem.model)}
     kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
     own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
     found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
@@ -65,9 +65,9 @@ def _prospect(fit: Fit, t: Trial) -> Prospect:
     return Prospect(t.effect, t.cost, free, np.array([(values[f.name] - f.centre) / f.scale for f in free]))
 
 
-def _near(t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
+def _near(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
-    free = unknowns(CATALOGUE[t.effect])
+    free = unknowns(CATALOGUE[t.effect], problem.model)
     units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
     starts = []
     for unit in units:

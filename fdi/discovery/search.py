@@ -14,7 +14,7 @@ from fdi.discovery import noise as noises
 from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
 from fdi.discovery.known import free_of
 from fdi.discovery.noise import Noise
-from fdi.discovery.problem import QUIET, Problem, whole
+from fdi.discovery.problem import Problem, quiet, whole
 from fdi.discovery.record import NOISE, Record
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.settle import settled
@@ -61,13 +61,14 @@ class Search:
                  workers: int | None = None) -> None:
         self.workers = workers or os.cpu_count() or 1
         self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
-        self.noise = tuple(self.sensors[name] for name in record.signals)
+        lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
+        self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
+        self.noise = tuple(noises.rounded(self.sensors[name], self.coarse.get(name, 0.0)) for name in record.signals)
         self.model, ready = model, whole(model)
-        bare = model.replace(QUIET)
+        bare = quiet(model)
         self.problem = Problem(ready, record, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
-        self.coarse: dict[str, float] = {}  # RMS of rounding, where a signal comes in steps
 
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
