@@ -44,8 +44,8 @@ def signals(trace: Trace) -> str:
         axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
             if name == "xj":
-                ax.plot(*_thin(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
-            ax.plot(*_thin(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
+                ax.plot(*thin(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
+            ax.plot(*thin(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
             _missing(ax, trace, values[name])
             ax.set_ylabel(label)
             if name == "close":
@@ -62,7 +62,7 @@ def signals(trace: Trace) -> str:
         axes[-1].set_xlabel("time from the start of the main phase [s]")
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
         figure.align_ylabels()
-        return _svg(figure, "signals")
+        return svg(figure, "signals")
 
 
 def faults(trace: Trace) -> list[tuple[str, float, float]]:
@@ -97,10 +97,10 @@ def timing(trace: Trace) -> str:
             ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
             ax.set_xlabel(f"{name} [µs]")
         axes[0].set_ylabel("cycles (dotted: p99)")
-        return _svg(figure, "timing")
+        return svg(figure, "timing")
 
 
-def _thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
+def thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     """The smallest and largest value of each of COLUMNS pieces, in their order: looks like the whole line."""
     if len(t) <= 2 * COLUMNS:
         return t, values
@@ -177,7 +177,8 @@ def _windows(ax: Axes, trace: Trace) -> None:
     ax.set_ylabel("checks")
 
 
-def _svg(figure: Figure, salt: str) -> str:
+def svg(figure: Figure, salt: str) -> str:
+    """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures."""
     out = io.StringIO()
     with rc_context(STYLE | {"svg.hashsalt": salt}):  # ids must differ between the drawings of a page
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})

@@ -181,7 +181,7 @@ def test_thinned_line_keeps_its_extremes() -> None:
     t, values = np.arange(50_000) * 1e-3, np.zeros(50_000)
     values[[12_345, 40_001]] = 1.0, -1.0
     values[20_000:20_100] = np.nan
-    thin_t, thin = figures._thin(t, values)
+    thin_t, thin = figures.thin(t, values)
     assert len(thin) < 5000 and np.nanmax(thin) == 1 and np.nanmin(thin) == -1 and np.isnan(thin).any()
     assert t[12_345] in thin_t and (np.diff(thin_t) > 0).all()
 
