@@ -1,6 +1,6 @@
 """A block of runs side by side: one run a lane of the processor's wide registers.
 
-All that a block knows is in one flat buffer, number f of a lane at f * WIDTH + lane: the distances between any two
+All that a block knows is in one flat buffer, number f of a lane at f * width + lane: the distances between any two
 accesses are constants, so the compiler sees by itself that lanes do not touch each other. With one array a quantity it
 would have to check that at run time, and gives up for the number of checks. The loop over the lanes is the innermost,
 of constant length, around the very step that a single run takes; whatever it calls must not branch.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from plant.compile import Function, record_at
+from plant.compile import Function, compiled, rebind, record_at
 from plant.controller import Loop, answer
 from plant.flat import lane_packers
 from plant.model import bare, bindings, initial
@@ -19,8 +19,18 @@ from plant.solve import demanded, sense
 from plant.state import Input
 from plant.step import coefficients, step
 
-WIDTH = 16  # lanes: two of the widest registers, so that one computes while the other waits for its results
+WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
+# two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
+NARROW, WIDE = 16, 32
 
+
+class Layout(NamedTuple):
+    """How the buffer of a block is laid out for a plant with certain effects."""
+
+    names: dict[str, Function]  # what stands for the functions below and for the ports
+    parameters: int  # the number of the first parameter, which follow each other as in `Model.names`
+    numbers: int  # of a lane
+    width: int  # lanes
 
 class Drive(NamedTuple):
     """Current through the torque motor, A: in this cycle, and the controller's answer for the next."""
@@ -38,26 +48,26 @@ state_at = parameters_at = coefficients_at = loop_at = drive_at = _bound
 keep_state = keep_coefficients = keep_loop = keep_drive = _bound
 
 
-def layout(effects: tuple[str, ...], plant: str) -> tuple[dict[str, Function], int, int]:
-    """How a block of a plant with `effects` is laid out.
-
-    Returns:
-        What stands for the functions above and for the ports; the number of the first parameter, which follow each
-        other as in `Model.names`; how many numbers a lane has.
-    """
+def layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> Layout:
+    """The layout for a plant with `effects`, `width` lanes."""
     record = bare(plant).having(effects).record()
     shapes = {"state": initial(effects), "loop": Loop(), "drive": Drive(),
               "coefficients": find(plant).coefficients(record[0], 1.0)}
     made, place = bindings(effects, plant), 0
     for name, shape in shapes.items():
-        made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, WIDTH, place)
-    made["parameters_at"] = record_at(record.dtype, place * WIDTH, WIDTH)
-    return made, place, place + record.view(float).size
+        made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, width, place)
+    made["parameters_at"] = record_at(record.dtype, place * width, width)
+    return Layout(made, place, place + record.view(float).size, width)
+
+
+def kernel(plan: Layout) -> Function:
+    """`run` as machine code."""
+    return compiled(rebind(run, WIDTH=plan.width), plan.names)
 
 
 def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
-        out: Any) -> None:
-    """A block of runs; fills out[lane, :, k] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
+        rows: Any, out: Any) -> None:
+    """A block of runs; fills out[rows[lane], :, k] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
 
     Args:
         a: the block's buffer: state at the start and parameters in place, the rest zero. Used up.
@@ -68,7 +78,8 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
         closed: with the model's own controller.
         period: of a cycle, s.
         steps: steps a cycle.
-        out: (WIDTH, 3 or 4, n), written.
+        rows: (WIDTH,) where in `out` each lane goes.
+        out: (m, 3 or 4, n), written.
     """
     h, columns = period / steps, out.shape[1]
     for lane in range(WIDTH):
@@ -79,12 +90,12 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
     for k in range(len(com)):
         t = k * period
         for lane in range(WIDTH):
-            xj, p12, xs = sample(a, lane, t)
-            out[lane, 0, k], out[lane, columns - 2, k], out[lane, columns - 1, k] = xj, p12, xs
+            row = rows[lane]
+            out[row, 0, k], out[row, columns - 2, k], out[row, columns - 1, k] = sample(a, lane, t)
         given = com[k - 1] if k else 0.0
         for lane in range(WIDTH):
             if closed:
-                out[lane, 1, k] = control(a, lane, t, com[k], out[lane, 0, k])
+                out[rows[lane], 1, k] = control(a, lane, t, com[k], out[rows[lane], 0, k])
             else:
                 keep_drive(Drive(given, 0.0), a, lane)
         if len(position):

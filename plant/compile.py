@@ -131,6 +131,14 @@ def called(function: Function) -> set[str]:
     return set(below).union(*(called(g) for g in below.values()))
 
 
+def costly(function: Function) -> bool:
+    """Whether `function`, or one that it calls, divides or calls an elementary function."""
+    plain = getattr(function, "py_func", function)
+    divides = any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(plain))
+    elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
+    return divides or not elementary.isdisjoint(plain.__code__.co_names) or any(map(costly, _calls(plain).values()))
+
+
 def _ours(value: Any) -> Any:
     """Our own version of a function of `math` or `numpy` if there is one, else the value itself."""
     known = isinstance(value, BuiltinFunctionType | np.ufunc)

@@ -2,8 +2,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import block, flat
-from plant.compile import Function, compiled
-from plant.effects import CATALOGUE
+from plant.compile import Function, costly
+from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
-from plant.model import Model
+from plant.model import Model, bare
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
+FEW = 6  # effects that a model may have and still get one kernel for all its runs
 
 
 class Lanes:
@@ -30,7 +32,7 @@ class Lanes:
         for name in self.names:
             if name not in known or name == "controller.period":
                 raise InputError("lanes", name, f"a parameter of the model {model.name} other than the period")
-        self._places = [known.index(name) for name in self.names]
+        self._rungs = ladder(model)
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
                anchor: float = 0.0) -> Array:
@@ -75,47 +77,105 @@ class Lanes:
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")
-        buffers = self._buffers(values)
-        out = np.empty((len(buffers), block.WIDTH, 4 if closed else 3, len(driven)))
-        run, period = self._kernel(), float(self.model["controller.period"])
+        out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
+        inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
+        work = [(run, buffer, rows) for rung, members in self._shared_out(values)
+                for run, buffer, rows in rung.blocks(self.names, values, members)]
 
-        def work(i: int) -> None:
-            run(buffers[i], driven, load, position, float(anchor), closed, period, self.steps, out[i])
+        def do(task: tuple[Function, Array, NDArray[np.int64]]) -> None:
+            run, buffer, rows = task
+            run(buffer, *inputs, rows, out)
 
-        if min(self.workers, len(buffers)) < 2:
-            for i in range(len(buffers)):
-                work(i)
+        if min(self.workers, len(work)) < 2:
+            for task in work:
+                do(task)
         else:
             with ThreadPoolExecutor(self.workers) as pool:
-                list(pool.map(work, range(len(buffers))))
-        return out.reshape(len(out) * block.WIDTH, *out.shape[2:])[:len(values)].transpose(0, 2, 1)
+                list(pool.map(do, work))
+        return out[:-1].transpose(0, 2, 1)
 
-    def _buffers(self, values: Array) -> Array:
-        """The blocks' buffers at the start, (blocks, numbers * WIDTH); idle lanes repeat the last run."""
-        _, first, numbers = _laid_out(self.model.effects, _laws(self.model.effects), self.model.plant)
-        blocks = -(-len(values) // block.WIDTH)
-        a = np.zeros((blocks, numbers, block.WIDTH))
-        state, record = flat.values(self.model.state()), self.model.record().view(np.float64)
-        a[:, :len(state)] = np.array(state)[:, None]
-        a[:, first:first + len(record)] = record[:, None]
-        runs = np.minimum(np.arange(blocks * block.WIDTH), max(len(values), 1) - 1).reshape(blocks, block.WIDTH)
-        for column, place in enumerate(self._places):
-            a[:, first + place] = values[runs, column]
-        return a.reshape(blocks, numbers * block.WIDTH)
+    def _shared_out(self, values: Array) -> list[tuple[Rung, NDArray[np.int64]]]:
+        """Which runs go where: each to the model with the fewest effects that has all that are at work in it."""
+        effects = self.model.effects
+        if len(self._rungs) == 1:
+            return [(self._rungs[0], np.arange(len(values)))]
+        at_work = np.column_stack([self._at_work(CATALOGUE[name], values) for name in effects])
+        left, shared = np.ones(len(values), bool), []
+        for rung in self._rungs:
+            others = [name not in rung.model.effects for name in effects]
+            fits = left & ~at_work[:, others].any(axis=1)
+            left &= ~fits
+            if fits.any():
+                shared.append((rung, np.flatnonzero(fits)))
+        return shared
 
-    def _kernel(self) -> Function:
-        return _compiled(self.model.effects, _laws(self.model.effects), self.model.plant)
+    def _at_work(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
+        """In which runs a parameter of the effect is off its off value."""
+        changed = np.zeros(len(values), bool)
+        for name, off in effect.off.items():
+            column = values[:, self.names.index(name)] if name in self.names else self.model[name]
+            changed |= column != off
+        return changed
 
 
-def _laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
-    return tuple(CATALOGUE[e].function for e in effects)  # a user's file may have been loaded anew
+class Rung:
+    """A model's kernel, or that of the same model with fewer effects."""
+
+    def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
+        own = set(bare(model.plant).having(effects).values)
+        self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
+        self._names, self._laws = self.model.names(), laws(effects)
+
+    def blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
+               ) -> Iterator[tuple[Function, Array, NDArray[np.int64]]]:
+        """The runs `members` in blocks: the kernel, the buffer at the start, and where the rows go.
+
+        Idle lanes repeat the last run; their rows go behind all others.
+        """
+        model = self.model
+        width = block.WIDE if len(members) >= 2 * block.WIDE and not model.effects else block.NARROW
+        plan, run = _compiled(model.effects, self._laws, model.plant, width)
+        start = np.zeros((plan.numbers, width))
+        state = np.array(flat.values(model.state()))
+        start[:len(state)] = state[:, None]
+        start[plan.parameters:] = model.record().view(np.float64)[:, None]
+        for first in range(0, len(members), width):
+            lanes = members[first:first + width]
+            buffer = start.copy()
+            for column, name in enumerate(names):
+                if name in self._names:
+                    place = buffer[plan.parameters + self._names.index(name)]
+                    place[:len(lanes)], place[len(lanes):] = values[lanes, column], values[lanes[-1], column]
+            yield run, buffer.reshape(-1), np.r_[lanes, np.full(width - len(lanes), len(values))]
+
+
+def ladder(model: Model) -> list[Rung]:
+    """Kernels for the runs of a model, from few effects to all it has.
+
+    An effect at its off value changes no bit, so a run may be made without it. A model with many effects has three:
+    none of them, those whose laws are cheap, and all; they run at 400, 200 and 70 million steps a second. More kernels
+    would save less than they take to compile.
+    """
+    if len(model.effects) <= FEW:
+        return [Rung(model, model.effects)]
+    cheap = tuple(name for name in model.effects if _cheap(CATALOGUE[name]))
+    return [Rung(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
+
+
+def _cheap(effect: Effect) -> bool:
+    """Whether a law of ours neither divides nor calls elementary functions, nor changes the oil, which does both."""
+    if effect.port in ("supply", "viscosity") or effect.function is None:
+        return False
+    return effect.function.__module__.startswith("plant.") and not costly(effect.function)
+
+
+def laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
+    """The functions behind the names, as a user's file may have been loaded anew."""
+    return tuple(CATALOGUE[e].function for e in effects)
 
 
 @cache
-def _laid_out(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> tuple[dict[str, Function], int, int]:
-    return block.layout(effects, plant)
-
-
-@cache
-def _compiled(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str = "eha") -> Function:
-    return compiled(block.run, _laid_out(effects, laws, plant)[0])
+def _compiled(effects: tuple[str, ...], functions: tuple[Any, ...], plant: str, width: int
+              ) -> tuple[block.Layout, Function]:
+    plan = block.layout(effects, plant, width)
+    return plan, block.kernel(plan)

@@ -10,9 +10,10 @@ from effect_files import COGGING, MEMORY, restored_catalogue
 from llvmlite.binding import get_host_cpu_features
 
 from plant import Actuator, InputError, Model, block, simulate
+from plant import lanes as lanes_module
 from plant.compile import interpreted
 from plant.effects import CATALOGUE, load_effects
-from plant.lanes import Lanes, _compiled
+from plant.lanes import Lanes, ladder
 from plant.model import bindings
 from plant.replay import replay
 
@@ -78,6 +79,19 @@ def test_each_effect_alone_among_all_that_are_off(catalogue: Lanes) -> None:
     for effect, rows in zip(EFFECTS, runs, strict=True):
         assert (rows == one_run(QUIET.replace(start(effect, -1)), CURRENT, FORCE)).all(), effect
     assert sum((rows != bare).any() for rows in runs) >= 20  # some cannot show here: no demand, no stop, too slow
+
+
+def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And get the bits that the kernel with all effects would give them."""
+    none, cheap, every = (len(rung.model.effects) for rung in ladder(catalogue.model))
+    assert none == 0 and 10 < cheap < 20 and every == len(EFFECTS)
+    assert len(ladder(QUIET.having(EFFECTS[:3]))) == 1
+    at_work = [{}, *(start(effect, 0) for effect in ("null_bias", "stribeck", "rod_backlash", "orifice_root")), {}]
+    values = np.vstack([with_effects(catalogue, changes) for changes in at_work])
+    shared = catalogue.replay(values, CURRENT, FORCE)
+    monkeypatch.setattr(lanes_module, "FEW", 99)
+    whole = Lanes(catalogue.model, catalogue.names, catalogue.steps)
+    assert (shared == whole.replay(values, CURRENT, FORCE)).all()
 
 
 def test_all_effects_at_once(catalogue: Lanes) -> None:
@@ -156,12 +170,11 @@ def test_no_runs_and_no_cycles() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    lanes = Lanes(QUIET, [], 10)
-    run = _compiled.__wrapped__((), ())
-    monkeypatch.setattr(lanes, "_kernel", lambda: run)
-    lanes.replay(np.empty((1, 0)), CURRENT, FORCE)
+    plan = block.layout((), "eha")
+    run = block.kernel(plan)
+    run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
+        np.arange(plan.width), np.empty((plan.width, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
     step = max((body for _, body in loops), key=len)
     assert len(re.findall("%[yz]mm", step)) > 100 and not re.search(r"v(add|sub|mul|div|min|max)sd", step)
-    assert block.WIDTH % 8 == 0
