@@ -166,16 +166,29 @@ def metering(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Li
     return line, m_metering, m_valve
 
 
+def as_ever(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
+    """How the ram yields to an impulse, 1/kg, at the limit of the pressure and on its slope: no effect changes it."""
+    return k.jack_free, k.jack_coupled
+
+
+def as_resisted(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
+    """The same with effects that may change drag or slope, at two divisions; if they do not, bit for bit `k`."""
+    mass = p.jack.mass + h * (k.jack_damping + drag.damping)
+    free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
+    same = drag.damping == 0.0 and line.slope == k.valve_slope
+    return free, k.jack_coupled if same else 1.0 / (mass + h * p.jack.area * line.slope)
+
+
+yielding = as_ever
+
+
 def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line) -> tuple[float, float, float, Memory, Memory]:
     """The ram: XJ, XJ', P12, memory of the load and of the drag."""
     g, h, v0 = p.jack, u.h, s.jack_speed
     load, m_load = at_load(u.load, s.memory.load, s, u, p)
     drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
-    # an effect that changes slope or damping pays for its division; without one these two fold away
-    push, mass = h * g.area, g.mass + h * (k.jack_damping + drag.damping)
-    free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
-    same = drag.damping == 0.0 and line.slope == k.valve_slope
-    coupled = k.jack_coupled if same else 1.0 / (mass + push * line.slope)
+    push = h * g.area
+    free, coupled = yielding(k, drag, line, p, h)
     dry = h * drag.static if v0 == 0.0 else h * drag.dynamic
     impulse = g.mass * v0 - h * (load + drag.force)
     v = slide(v0, impulse, push, line.offset, line.slope, line.limit, dry, free, coupled)
