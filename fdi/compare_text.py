@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdi.answer import DISAGREES
-from fdi.compare import Comparison, Signal
+from fdi.compare import BLOCK, Comparison, Signal
 from fdi.diagnostics import LEAST_SHARE, Diagnosis
 
 SHOWN = {"xj": ("XJ", "um", 1e6), "p12": ("P12", "bar", 1e-5), "xs": ("XS", "um", 1e6)}
@@ -19,6 +19,7 @@ BLOCKS = {
 WHOLE_VALVE = "Cor to flow, as XS was not measured"
 STRONG = 0.15  # a correlation below that explains 1 % of the power and is not worth a word
 LONG = 3.0  # times the noise's own memory
+NOTABLE = 0.005  # of the ram's way
 PLACES = 3  # sections in the text; the page and the JSON have all
 
 
@@ -88,15 +89,13 @@ def block_word(found: Comparison, name: str) -> str:
     if found.blocks[name] is None:
         return f"{said}: " + ("too little of it to tell" if len(there) == 2 else
                               f"needs {'XS or P12' if not there else 'XS' if there == ['P12'] else 'P12'}")
-    flow, force, gain = (found.parts[part] for part in ("flow", "force", "gain"))
+    flow, force = found.parts["flow"], found.parts["force"]
     if name == "servovalve" and "XS" not in there:
         said = WHOLE_VALVE
     if name == "jack" and len(there) == 1:
         said = f"{there[0]} to the ram: {'flow' if there == ['XS'] else 'forces'}"
     elif name == "jack" and flow is not None and force is not None:
         said += f": flow {digits(flow)}, forces {digits(force)}"
-    if name == "jack" and flow is not None and gain is not None and flow > 1.3 and abs(gain) > 0.005:
-        said += f"; the ram moves {abs(100 * gain):.2g} % {'further' if gain > 0 else 'less'} than the flow says"
     return said
 
 
@@ -133,6 +132,10 @@ def lines(found: Comparison) -> list[tuple[str, str]]:
             out.append(("where", text + (f"; {place.condition}" if place.condition else "")))
         if found.condition:
             out.append(("when", found.condition))
+    flow, gain = found.parts["flow"], found.parts["gain"]
+    if flow is not None and gain is not None and flow > BLOCK and abs(gain) > NOTABLE:
+        way = "further" if gain > 0 else "less"
+        out.append(("flow", f"the ram moves {100 * abs(gain):.2g} % {way} than the flow through the edges says"))
     slope = found.drift * 1e6
     if "xj" in found.signals and abs(slope) > 1.0 and not found.cycles.filled.any():
         out.append(("drift", f"a replay not held to the measured position departs by {slope:.3g} um/s"))

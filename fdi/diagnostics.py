@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.special import kolmogi, ndtri
 
 from fdi.cycles import Cycles
-from fdi.discovery.noise import Noise, fitted, white
 from fdi.replay import Columns
 from fdi.where import Motion
 
@@ -25,7 +24,10 @@ REACH = 100  # lags, of the autocorrelation
 AFTER, BEFORE = 60, 20  # lags, of the residual after and before the input
 CONFIDENCE = 0.99
 BINS = 15
-OWN = ("xj", "Cor")
+OWN = {("xj", "Cor"), ("p12", "P12")}  # a signal's own noise or error is in these; that they go together says nothing
+ORDER = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
+WILD = 5.0  # standard deviations; what is larger is an event and has no say in a colour
+WHITE = np.ones(1)  # the filter of what is white already
 LEAST_SHARE = 0.05  # of the residual's variance, that a dependence must hold to be worth a word
 SHAPES = ("proportional to", "steps with the sign of", "even in")
 
@@ -72,31 +74,48 @@ class Diagnosis(NamedTuple):
 def diagnose(c: Cycles, residual: Columns, repeats: Mapping[str, Floats], m: Motion) -> dict[str, Diagnosis]:
     """Each signal's residual (n,); `repeats`: the difference to a repeat's residual over sqrt 2, where there is one."""
     inputs = {"Cor": c.cor, "Com": c.com} | ({"load": c.load} if np.ptp(c.load) > 0.0 else {})
-    colours = {name: _colour(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
-    # the noise of XJ is in the current too, which answers it: nothing follows from XJ following that
-    return {name: _one(c, r, repeats.get(name), {u: (inputs[u], colours[u]) for u in colours if (name, u) != OWN}, m)
-            for name, r in residual.items()}
+    colours = {name: colour(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
+    quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
+    return {name: _one(c, r, repeats.get(name), {u: (inputs[u], colours[u]) for u in colours if (name, u) not in OWN},
+                       {q: x for q, x in quantities.items() if (name, q) not in OWN}) for name, r in residual.items()}
 
 
-def _colour(steps: Floats) -> Noise:
-    """An input's; one that rests most of the time has none."""
-    return fitted(steps) if np.median(np.abs(steps)) > 0.0 else white(float(steps.std()))
+def colour(x: Floats) -> Floats:
+    """The filter, (p + 1,), that makes x (n,) white: its autoregressive model by Yule and Walker. WHITE if it rests.
+
+    Short of what scipy.signal and a choice of order would make of it, but without their second of import.
+    """
+    x = np.nan_to_num(x)
+    level = float(np.median(np.abs(x))) / 0.6745
+    if level == 0.0:
+        return WHITE
+    x = np.clip(x, -WILD * level, WILD * level)
+    covariance = correlate(x, x, 0, ORDER) / len(x)
+    covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
+    k = np.arange(ORDER)
+    weights = np.linalg.solve(covariance[np.abs(k[:, None] - k)], covariance[1:])
+    out: Floats = np.concatenate([WHITE, -weights])
+    return out
 
 
-def _one(c: Cycles, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Noise]],
-         m: Motion) -> Diagnosis:
-    noise = fitted(difference) if difference is not None else white(1.0)
+def whiten(x: Floats, by: Floats) -> Floats:
+    """x (n,) through the filter of a colour; NaN counts as 0."""
+    out: Floats = np.convolve(np.nan_to_num(x), by)[:len(x)]
+    return out
+
+
+def _one(c: Cycles, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Floats]],
+         quantities: Mapping[str, Floats]) -> Diagnosis:
     r = np.nan_to_num(residual)
-    e = noise.whiten(r)
+    e = whiten(r, colour(difference) if difference is not None else WHITE)
     own = autocorrelation(e)
     band = float(ndtri(0.5 + CONFIDENCE / 2)) / math.sqrt(len(e))
     frequencies, power, departs, allowed = cumulative(e, c.period)
     _, plain, _, _ = cumulative(r, c.period)
     half = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
     quiet = autocorrelation(np.nan_to_num(difference)) if difference is not None else np.eye(1, REACH + 1)[0]
-    follows = tuple(follow(name, u, colour, r, c.period) for name, (u, colour) in inputs.items())
-    quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
-    found = [depend(name, q, residual) for name, q in quantities.items() if not np.isnan(q).all()]
+    follows = tuple(follow(name, u, by, r, c.period) for name, (u, by) in inputs.items())
+    found = [depend(name, q, residual) for name, q in quantities.items()]
     depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
     return Diagnosis(_memory(autocorrelation(r)) * c.period, _memory(quiet) * c.period, own, band, frequencies, power,
                      departs, allowed, half, follows, tuple(depends))
@@ -140,17 +159,18 @@ def cumulative(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:
     return frequencies, added, float(np.abs(added - line).max()), allowed
 
 
-def follow(name: str, u: Floats, colour: Noise, residual: Floats, period: float) -> Follows:
-    """Cross-correlation with an input (n,) whose steps have the given colour; both are filtered to make it white."""
-    steps = np.clip(colour.whiten(np.diff(u)), -5.0, 5.0)  # a jump of the command would stand for the whole test
-    left = colour.whiten(np.diff(residual))
-    left = np.clip(left, -5 * left.std(), 5 * left.std()) if left.std() > 0.0 else left
+def follow(name: str, u: Floats, by: Floats, residual: Floats, period: float) -> Follows:
+    """Cross-correlation with an input (n,); both are filtered `by` the colour of its steps to make them white."""
+    steps, left = (whiten(np.diff(x), by) for x in (u, residual))
+    # a jump of the command would stand for the whole test
+    steps, left = (np.clip(x, -WILD * x.std(), WILD * x.std()) for x in (steps, left))
     size = math.sqrt(float(np.sum(left**2)) * float(np.sum(steps**2))) or 1.0
     curve: Floats = correlate(left, steps, -BEFORE, AFTER) / size
     lags: Floats = np.linspace(-BEFORE * period, AFTER * period, AFTER + BEFORE + 1)
     peak = BEFORE + 1 + int(np.abs(curve[BEFORE + 1:]).argmax())  # what comes before its cause is feedback
-    # of all lags the largest is taken, so that all of them share the 1 %
-    bound = float(ndtri(1 - (1 - CONFIDENCE) / 2 / AFTER)) / math.sqrt(len(steps))
+    # Bartlett: what is left of both colours widens the band. Of all lags the largest is taken: they share the 1 %
+    wider = 1.0 + 2.0 * float(np.sum(autocorrelation(left)[1:] * autocorrelation(steps)[1:]))
+    bound = float(ndtri(1 - (1 - CONFIDENCE) / 2 / AFTER)) * math.sqrt(max(wider, 1.0) / len(steps))
     return Follows(name, float(curve[peak]), float(lags[peak]), bound, lags, curve)
 
 

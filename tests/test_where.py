@@ -8,8 +8,7 @@ import pytest
 from recordings import LEVELS, healthy, noise
 
 from fdi.cycles import Cycles, readings
-from fdi.diagnostics import cumulative, depend, diagnose, follow, shape
-from fdi.discovery.noise import white
+from fdi.diagnostics import WHITE, colour, cumulative, depend, diagnose, follow, shape, whiten
 from fdi.where import Motion, condition, derivative, motion, places, whole
 from plant import Model
 
@@ -98,13 +97,20 @@ def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Cycles, m: Mo
     assert d.memory == pytest.approx(d.noise_memory, abs=1.5e-3)
 
 
+def test_a_colour_is_taken_out() -> None:
+    x = noise(1, 13_500, "hum")[:, 0]
+    e = whiten(x, colour(x))
+    assert np.abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03 < np.corrcoef(x[1:], x[:-1])[0, 1]
+    assert (colour(np.zeros(100)) == WHITE).all() and np.isfinite(colour(np.sin(np.arange(500.0)))).all()
+
+
 @pytest.mark.parametrize("lag", [1, 7, 30])
 def test_what_follows_an_input_is_found_with_its_lag(c: Cycles, lag: int) -> None:
     u = np.random.default_rng(0).standard_normal(len(c)).cumsum()
     left = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
-    found = follow("Cor", u, white(1.0), left, 1e-3)
+    found = follow("Cor", u, WHITE, left, 1e-3)
     assert found.lag == pytest.approx(lag * 1e-3) and found.correlation > 4 * found.bound
-    alone = follow("Cor", u, white(1.0), left - 0.5 * np.roll(u, lag), 1e-3)
+    alone = follow("Cor", u, WHITE, left - 0.5 * np.roll(u, lag), 1e-3)
     assert abs(alone.correlation) < 1.5 * alone.bound
 
 
