@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import io
 import json
 import tomllib
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.stats import binomtest
 
 from fdi.trace import Trace
@@ -167,7 +169,7 @@ def record(seed: int, kind: str, effects: Sequence[str], verdict: str, named: Se
     shown = {"xj": floors, "xj_drift": 99.0, "p12": floors, "xs": 0.0, "cor": 0.0}
     each = [{"effect": name, "size": 1.0, "value": 20.0} | ({"ratio": shown} if len(effects) > 1 else {})
             for name in effects]
-    truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12", "base_ratio": shown, "hidden": each}
+    truth = {"kind": kind, "effects": list(effects), "signals": "xj,p12,xs", "base_ratio": shown, "hidden": each}
     answer = {"verdict": verdict, "effects": list(named), "baseline": {"floor": {"xj": 1.0}}} | more
     return {"seed": seed, "truth": truth, "answer": answer, "seconds": 5.0 if seed else 30.0}
 
@@ -201,6 +203,8 @@ def test_rates_count_what_they_say() -> None:
 def test_the_summary_tells_every_failure_and_is_json() -> None:
     figures = json.loads(json.dumps(score.summary(RECORDS)))
     assert [f["seed"] for f in figures["failures"]] == [0, 1, 3, 4, 7, 9]
+    assert figures["rates"][0]["bad"] == [1] and figures["by_signals"]["xj"]["two effects: both named"] == [0, 0]
+    show.summary(figures, Console(file=io.StringIO()))
     assert figures["confusion"]["one: spool_friction"] == {
         "EXPLAINED right": 1, "AMBIGUOUS right": 1, "EXPLAINED wrong": 1}
     assert figures["confusion"]["outside: periodic torque (small)"] == {"EXPLAINED": 1}

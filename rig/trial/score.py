@@ -14,6 +14,8 @@ VISIBLE = 2.0  # floors, from where on an effect has to be found
 ADDED = 1.15  # floors, most that may be left on the hold-out with the right effect
 TIME = 20.0  # s
 CONFIDENCE = 0.95
+JUDGED = "xj,p12,xs"
+"""The signals of the cases that the rates are asked of; with fewer, more effects look alike."""
 
 
 class Rate(NamedTuple):
@@ -187,12 +189,15 @@ def failures(records: Sequence[Record]) -> list[dict[str, Any]]:
 
 
 def summary(records: Sequence[Record]) -> dict[str, Any]:
-    """All figures as JSON values."""
+    """All figures as JSON values: the rates where everything is measured, and their counts by what is measured."""
+    by_signals = {s: [r for r in records if r["truth"]["signals"] == s] for s in (JUDGED, "xj,p12", "xj")}
+    names = names_on_average(by_signals[JUDGED])
     seconds = sorted(r["seconds"] for r in records)
     return {"cases": len(records),
             "rates": [rate._asdict() | {"share": None if not rate.of else rate.share, "met": rate.met}
-                      for rate in rates(records)],
-            "names_on_average": None if math.isnan(names_on_average(records)) else names_on_average(records),
+                      for rate in rates(by_signals[JUDGED])],
+            "by_signals": {s: {rate.name: [rate.good, rate.of] for rate in rates(of)} for s, of in by_signals.items()},
+            "names_on_average": None if math.isnan(names) else names,
             "confusion": {row: dict(count) for row, count in confusion(records).items()},
             "seconds": {"median": seconds[len(seconds) // 2], "most": seconds[-1]} if seconds else {},
             "failures": failures(records)}

@@ -26,6 +26,8 @@ def _time(seconds: float) -> str:
 def summary(figures: Mapping[str, Any], out: Console) -> None:
     """Rates, confusion table and failures of `score.summary`."""
     out.print(_rates(figures["rates"]))
+    out.print()
+    out.print(_by_signals(figures["by_signals"]))
     names = figures["names_on_average"]
     if names is not None:
         out.print(f"names in the set, where the truth is in it: {names:.2f} on average (at most 3 asked for)")
@@ -35,11 +37,13 @@ def summary(figures: Mapping[str, Any], out: Console) -> None:
     out.print(_confusion(figures["confusion"]))
     if figures["failures"]:
         out.print()
-        out.print(_failures(figures["failures"]))
+        out.print("Against a rate:")
+        for failure in figures["failures"]:
+            out.print(_failure(failure), markup=False)
 
 
 def _rates(rates: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table("Blind trial", "good", "share", "95 % interval", "asked", "", box=None, pad_edge=False)
+    table = Table("Blind trial, all signals", "good", "share", "95 % interval", "asked", "", box=None, pad_edge=False)
     for r in rates:
         share = "-" if r["share"] is None else f"{100 * r['share']:.1f} %"
         span = f"{100 * r['low']:.1f} .. {100 * r['high']:.1f}" if r["of"] else ""
@@ -48,18 +52,23 @@ def _rates(rates: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+def _by_signals(counts: Mapping[str, Mapping[str, Sequence[int]]]) -> Table:
+    table = Table("by what is measured", *counts, box=None, pad_edge=False)
+    for name in next(iter(counts.values())):
+        table.add_row(name, *("{}/{}".format(*of[name]) for of in counts.values()))
+    return table
+
+
 def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> Table:
-    columns = sorted({column for row in confusion.values() for column in row})
-    table = Table("truth", *columns, box=None, pad_edge=False)
+    """By truth, because verdicts times right and wrong are too many columns for a terminal."""
+    table = Table("truth", "answers", box=None, pad_edge=False)
     for truth, counts in confusion.items():
-        table.add_row(truth, *(str(counts.get(column, "")) for column in columns))
+        often = sorted(counts.items(), key=lambda item: -item[1])
+        table.add_row(truth, ", ".join(f"{count} {answer}" for answer, count in often))
     return table
 
 
-def _failures(failures: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table("seed", "hidden", "signals", "floors", "answer", "against", box=None, pad_edge=False)
-    for f in failures:
-        hidden = ", ".join(f"{name} {size:.3g}" for name, size in f["hidden"].items()) or "nothing"
-        answer = f"{f['verdict']} {', '.join(f['named'] or [])} {f['error'] or ''}".strip()
-        table.add_row(str(f["seed"]), hidden, f["signals"], f"{f['floors']:.1f}", answer, "; ".join(f["against"]))
-    return table
+def _failure(f: Mapping[str, Any]) -> str:
+    hidden = ", ".join(f"{name} {size:.3g}" for name, size in f["hidden"].items()) or "nothing"
+    answer = " ".join([f["verdict"], ", ".join(f["named"] or []), f["error"] or ""]).strip()
+    return f"seed {f['seed']} ({f['signals']}): {hidden}, {f['floors']:.1f} floors -> {answer} [{'; '.join(f['against'])}]"
