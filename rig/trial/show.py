@@ -71,4 +71,5 @@ def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> Table:
 def _failure(f: Mapping[str, Any]) -> str:
     hidden = ", ".join(f"{name} {size:.3g}" for name, size in f["hidden"].items()) or "nothing"
     answer = " ".join([f["verdict"], ", ".join(f["named"] or []), f["error"] or ""]).strip()
-    return f"seed {f['seed']} ({f['signals']}): {hidden}, {f['floors']:.1f} floors -> {answer} [{'; '.join(f['against'])}]"
+    case = f"seed {f['seed']} ({f['signals']}): {hidden}, {f['floors']:.1f} floors"
+    return f"{case} -> {answer} [{'; '.join(f['against'])}]"
