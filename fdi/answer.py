@@ -101,7 +101,7 @@ def lags(c: Cycles, limit: float) -> tuple[int, int, float]:
     xj = held(c.xj)
     columns = [shift(x, lag)[inside] for x in (c.com, xj) for lag in LAGS]
     whole = np.column_stack([*columns, c.cor[inside]])
-    gram = whole.T @ whole
+    gram = np.einsum("ki,kj->ij", whole, whole)
     n, target = len(LAGS), gram[-1, -1]
     best = (math.inf, 0, 0, math.nan)
     for a in range(n):

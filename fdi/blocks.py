@@ -83,8 +83,8 @@ def balance(c: Cycles, model: Model, replayed: Columns) -> Balance:
     way[_any_within(bad, lag)] = np.nan
     dx = gained(xj, lag)
     there = ~np.isnan(way) & ~np.isnan(dx)
-    power = float(dx[there] @ dx[there])
-    gain = float(dx[there] @ way[there]) / power if power > 0.0 else 0.0
+    power = float(np.sum(dx[there] ** 2))
+    gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
     # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
     known = speed * (1 + max(-0.2, min(gain, 0.2))) if "xs" in c.signals else seen
     force = _force(c, model, p12, xj, known) if "p12" in c.signals else np.full(len(c), np.nan)
@@ -164,7 +164,8 @@ def _left(y: Floats, columns: list[Floats], first: int) -> tuple[float, tuple[fl
     z = np.column_stack([*columns, y])
     size = np.sqrt((z**2).mean(axis=0))
     z = z / np.where(size > 0.0, size, 1.0)
-    gram = np.einsum("ki,kj->ij", z, z) / len(y)  # not z.T @ z: threads that wait for a busy core take 0.9 s for it
+    # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
+    gram = np.einsum("ki,kj->ij", z, z) / len(y)
 
     def left(pick: slice) -> float:
         inverse = np.linalg.pinv(gram[pick, pick], rcond=1e-9, hermitian=True)

@@ -169,9 +169,9 @@ def _phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: fl
     if not len(chosen):
         return np.zeros(len(frequencies), complex)
     level = pieces[chosen] - pieces[chosen].mean(axis=1, keepdims=True)
-    level = level - np.outer(level @ t / (t @ t), t)
+    level = level - np.outer(np.einsum("ij,j->i", level, t) / np.sum(t**2), t)
     turn = -2j * np.pi * period * frequencies
-    inside = level @ np.exp(np.outer(np.arange(WINDOW), turn))
+    inside = np.einsum("ij,jk->ik", level, np.exp(np.outer(np.arange(WINDOW), turn)))
     out: NDArray[np.complex128] = 2.0 / WINDOW * (inside * np.exp(np.outer(chosen * WINDOW, turn))).mean(axis=0)
     return out
 
@@ -183,5 +183,5 @@ def _without(x: Floats, lines: Sequence[tuple[float, float]], period: float) -> 
     frequencies = np.array([f for f, _ in lines])
     rows = np.ones(len(x) // WINDOW, bool)
     wave = np.exp(2j * np.pi * period * np.outer(np.arange(len(x)), frequencies))
-    out: Floats = x - (wave @ _phasors(x, rows, frequencies, period)).real
+    out: Floats = x - np.einsum("ij,j->i", wave, _phasors(x, rows, frequencies, period)).real
     return out

@@ -149,8 +149,8 @@ def drift(c: Cycles, model: Model, steps: int = STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
     free = c.measured("xj") - open_loop(c, model, steps, 0.0)["xj"]
     there = ~np.isnan(free)
-    slope = float(np.polyfit(c.t[there], free[there], 1)[0]) if there.sum() > 2 else 0.0
-    return rms(free), slope
+    t = c.t[there] - c.t[there].mean()
+    return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
 
 
 def closed_loop(c: Cycles, model: Model, steps: int = STEPS) -> Columns:

@@ -65,7 +65,7 @@ def scatter(c: Cycles, model: Model, floor: Mapping[str, float]) -> Scatter:
         slope = (residual(x + STEP * np.eye(len(base))) - now) / STEP
         weight = 1.0 / np.sqrt(1.0 + (now / LARGE) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
-        step = np.linalg.solve(normal, -(slope @ (weight * now)) / ALIKE - x)
+        step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
         tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -FURTHEST, FURTHEST)
         found = residual(tried)
         costs = 2 * LARGE**2 * (np.sqrt(1 + (found / LARGE) ** 2) - 1).sum(axis=1) / ALIKE
