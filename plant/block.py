@@ -14,8 +14,9 @@ from plant.controller import Loop, answer
 from plant.flat import lane_packers
 from plant.model import bare, bindings, initial
 from plant.plants import find
-from plant.replay import SILENCE, moved, pull, rested, sampled, shown
-from plant.solve import demanded, sense
+from plant.ports import at_reading
+from plant.replay import moved, pull, rested, sampled, shown
+from plant.solve import demanded
 from plant.state import Input
 from plant.step import coefficients, step
 
@@ -110,11 +111,12 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
 
 
 def sample(a: Any, lane: int, t: float) -> tuple[float, float, float]:
-    """What one lane's transducers read at `t`: XJ m, P12 Pa, XS m."""
+    """What one lane's transducers read at `t`: XJ m, P12 Pa, XS m; as `plant.solve.sense`, but for the noise."""
     s = state_at(a, lane)
-    xj, p12, xs, m_reading = sense(s, s.memory.reading, SILENCE, t, parameters_at(a, lane))
+    p = parameters_at(a, lane)
+    xj, m_reading = at_reading(s.sensed, s.memory.reading, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
     keep_state(sampled(s, s.memory.command, m_reading), a, lane)
-    return xj, p12, xs
+    return xj, s.pressure, s.spool_position
 
 
 def control(a: Any, lane: int, t: float, com: float, xj: float) -> float:

@@ -82,7 +82,7 @@ class Lanes:
         work = [(run, buffer, rows) for rung, members in self._shared_out(values)
                 for run, buffer, rows in rung.blocks(self.names, values, members)]
 
-        def do(task: tuple[Function, Array, NDArray[np.int64]]) -> None:
+        def do(task: tuple[Function, Array, NDArray[np.uint64]]) -> None:
             run, buffer, rows = task
             run(buffer, *inputs, rows, out)
 
@@ -125,9 +125,11 @@ class Rung:
         own = set(bare(model.plant).having(effects).values)
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
         self._names, self._laws = self.model.names(), laws(effects)
+        self._state: Array | None = None
+        self._parameters = self.model.record().view(np.float64)[:, None]
 
     def blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
-               ) -> Iterator[tuple[Function, Array, NDArray[np.int64]]]:
+               ) -> Iterator[tuple[Function, Array, NDArray[np.uint64]]]:
         """The runs `members` in blocks: the kernel, the buffer at the start, and where the rows go.
 
         Idle lanes repeat the last run; their rows go behind all others.
@@ -135,10 +137,11 @@ class Rung:
         model = self.model
         width = block.WIDE if len(members) >= 2 * block.WIDE and not model.effects else block.NARROW
         plan, run = _compiled(model.effects, self._laws, model.plant, width)
+        if self._state is None:  # not sooner: it asks laws, which may be wrong
+            self._state = np.array(flat.values(model.state()))
         start = np.zeros((plan.numbers, width))
-        state = np.array(flat.values(model.state()))
-        start[:len(state)] = state[:, None]
-        start[plan.parameters:] = model.record().view(np.float64)[:, None]
+        start[:len(self._state)] = self._state[:, None]
+        start[plan.parameters:] = self._parameters
         for first in range(0, len(members), width):
             lanes = members[first:first + width]
             buffer = start.copy()
@@ -146,7 +149,8 @@ class Rung:
                 if name in self._names:
                     place = buffer[plan.parameters + self._names.index(name)]
                     place[:len(lanes)], place[len(lanes):] = values[lanes, column], values[lanes[-1], column]
-            yield run, buffer.reshape(-1), np.r_[lanes, np.full(width - len(lanes), len(values))]
+            rows = np.r_[lanes, np.full(width - len(lanes), len(values))]
+            yield run, buffer.reshape(-1), rows.astype(np.uint64)  # unsigned: no test for counting from the end
 
 
 def ladder(model: Model) -> list[Rung]:

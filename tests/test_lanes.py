@@ -173,7 +173,7 @@ def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     plan = block.layout((), "eha")
     run = block.kernel(plan)
     run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
-        np.arange(plan.width), np.empty((plan.width, 3, len(CURRENT))))
+        np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
     step = max((body for _, body in loops), key=len)
