@@ -5,11 +5,9 @@ Costs are medians of rounds that alternate between the rivals, all in one proces
 from __future__ import annotations
 
 import ctypes
-import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
-from importlib.resources import files
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,14 +17,12 @@ from numpy.typing import NDArray
 from plant import Actuator, Model, simulate
 from plant.model import STEPS, kernel
 from plant.run import noise
-from rig.clock import WallClock
+from rig.many import many
+from rig.rivals import FLAGS, SAME_ROUNDING, built, gcc
+from rig.stopwatch import Run, duration, durations
 
 Array = NDArray[np.float64]
-Run = Callable[[], object]
 
-FLAGS = ("-O3", "-march=native")
-SAME_ROUNDING = (*FLAGS, "-ffp-contract=off")  # no fused multiply-add: the rounding of Python
-GET_GCC = "apt-get install gcc"
 FRICTIONLESS = {f"{body}.{kind}_friction": 0.0 for body in ("spool", "jack") for kind in ("static", "dynamic")}
 QUIET = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
 FINEST = 5000  # steps a cycle that stand for the truth, 0.2 us
@@ -56,40 +52,21 @@ class Accuracy(NamedTuple):
     largest_friction: float
 
 
-def durations(runs: Mapping[str, Run], rounds: int) -> dict[str, Array]:
-    """Durations of each run, (rounds,) s, after one to warm up; the rounds alternate."""
-    clock = WallClock()
-    taken: dict[str, list[int]] = {name: [] for name in runs}
-    for turn in range(rounds + 1):
-        for name, run in runs.items():
-            start = clock.now()
-            run()
-            if turn:
-                taken[name].append(clock.now() - start)
-    return {name: np.array(times) * 1e-9 for name, times in taken.items()}
-
-
-def duration(run: Run, rounds: int) -> float:
-    """Median duration of a run, s."""
-    return float(np.median(durations({"": run}, rounds)[""]))
-
-
 def step_vs_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
     """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
-    gcc = shutil.which("gcc")
-    if gcc is None:
+    if not gcc():
         return None
     model, draws = Model(), noise(0, len(command))
     with tempfile.TemporaryDirectory() as folder:
         runs, outs = {}, {}
         runs["python"], outs["python"] = _python_run(model, command, draws, steps)
         for name, flags in (("c", FLAGS), ("c_same_rounding", SAME_ROUNDING)):
-            library = _built(gcc, flags, Path(folder) / f"{name}.so")
+            library = built("step.c", flags, Path(folder) / f"{name}.so")
             runs[name], outs[name] = _c_run(library, model, command, draws, steps)
         seconds = durations(runs, rounds)
     each = {name: float(np.median(t)) / (len(command) * steps) * 1e9 for name, t in seconds.items()}
     ratios = {name: float(np.median(seconds["python"] / t)) for name, t in seconds.items()}  # round by round
-    version = subprocess.run([gcc, "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
+    version = subprocess.run([gcc(), "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
     return StepCost(each["python"], each["c"], each["c_same_rounding"], ratios["c"], ratios["c_same_rounding"],
                     float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
                     bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version}")
@@ -99,14 +76,6 @@ def _python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
     run, state, record = kernel("closed_loop", model.effects), model.state(), model.record()
     return lambda: run(state, command, load, draws, record, steps, out), out
-
-
-def _built(gcc: str, flags: tuple[str, ...], target: Path) -> ctypes.CDLL:
-    # no -std=c..: that would forbid the fused multiply-add without saying so
-    source = files("rig") / "bench_c" / "step.c"
-    line = [gcc, *flags, "-shared", "-fPIC", "-x", "c", "-", "-o", str(target), "-lm"]
-    subprocess.run(line, input=source.read_bytes(), check=True)
-    return ctypes.CDLL(str(target))
 
 
 def _c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, steps: int) -> tuple[Run, Array]:
@@ -165,8 +134,10 @@ def lockstep() -> float:
     return max(speeds)
 
 
-def report(command: Array) -> dict[str, Any]:
-    """Everything about cost as one JSON object; `step` is None without gcc."""
+def report(command: Array, tell: Callable[[str], None] = lambda what: None) -> dict[str, Any]:
+    """Everything about cost as one JSON object; `step` is None without gcc. `tell` gets what is under way."""
+    tell("one run, and a run on the embedded bus")
     cost = step_vs_c(command)
-    return {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
-            "lockstep": lockstep()}
+    one = {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
+           "lockstep": lockstep()}
+    return one | {"many": [rival._asdict() for rival in many(command, tell)]}

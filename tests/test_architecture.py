@@ -34,6 +34,8 @@ ONLY_IN = {
     "rich": ("rig/",),
     "mcap": ("rig/", "fdi/"),
     "matplotlib": ("fdi/", "rig/"),
+    "jax": ("rig/rivals.py",),
+    "progpy": ("rig/rivals.py",),
     "socket": ("rig/",),
     "threading": ("rig/",),
     "asyncio": (),

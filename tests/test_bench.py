@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from physics_cases import PREFLIGHT
 
-from rig import bench, cli
+from rig import bench, cli, many, rivals
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {bench.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {rivals.GET_GCC}")
 
 
 @needs_gcc
@@ -23,24 +23,33 @@ def test_c_and_python_take_the_same_step() -> None:
 
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(bench.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rivals.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(bench, "cycle_cost", lambda: 4e-6)
+    monkeypatch.setattr(bench, "lockstep", lambda: 10.0)
     assert cli.main(["bench"]) == 0
-    assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in capsys.readouterr().out
+    words = " ".join(capsys.readouterr().out.split())
+    assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in words
+    assert "C, one run after the other: skipped, there is no gcc" in words
+    assert "jax, vmap: skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
+    assert "ProgPy, vectorised: skipped, progpy is not installed" in words
 
 
 def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     monkeypatch.setattr(bench, "step_vs_c", lambda command: None)
+    monkeypatch.setattr(bench, "lockstep", lambda: 10.0)
+    monkeypatch.setattr(bench, "many", lambda command, tell: [many.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")])
     assert cli.main(["bench", "--json", "--out", str(tmp_path / "b.json")]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads((tmp_path / "b.json").read_text())
     assert answer["times_real_time"] > 20
     assert 0 < answer["cycle"] < 1e-3
+    assert answer["many"] == [{"name": "jax, vmap", "speed": 5e7, "ratio": 7.0, "difference": 1e-12, "note": ""}]
 
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(bench, "report", lambda command: {"step": None})
+    monkeypatch.setattr(bench, "report", lambda command, tell: {"step": None})
     assert cli.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
@@ -48,3 +57,21 @@ def test_a_path_that_cannot_be_written_is_told_in_one_line(
 
 def test_a_cycle_from_python_costs_far_less_than_a_cycle() -> None:
     assert bench.cycle_cost(2000, 3) < 200e-6
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_runs() -> None:
+    """Those of the `bench` extra where it is installed; without fused multiply-add C even to the last bit."""
+    told: list[str] = []
+    found = {rival.name: rival for rival in many.many(PREFLIGHT, told.append, rounds=2, cycles=300)}
+    assert len(found) == 8 and told
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        else:
+            assert rival.speed > 0.0 and rival.ratio is not None and rival.difference is not None
+            assert rival.difference < 1e-12
+    for name in (many.OURS, "ours, a thread a core", "C, 16 runs, -ffp-contract=off"):
+        assert found[name].difference == 0.0
+    slowest = found["C, one run after the other"].ratio
+    assert slowest is not None and slowest > 1.2  # 5 on a quiet machine with AVX-512

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from rig.bench import Accuracy
 
 HELP = "the project's own benchmarks"
@@ -14,18 +16,31 @@ HELP = "the project's own benchmarks"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
+    parser.add_argument("what", nargs="?", choices=("plant", "explain"), default="plant",
+                        help="what to measure: the speed of the plant (default), or how often rig explain is right")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step and of others, against 0.2 us (half a minute)")
+    add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
+    add("--cases", type=int, default=200, metavar="N", help="how many (default: 200)")
+    add("--seed", type=int, default=0, help="of the first case; the next has the next (default: 0)")
+    add("--jobs", type=int, default=2, metavar="N", help="cases at a time; one for honest times (default: 2)")
+    add("--folder", metavar="DIR", help="keeps cases and answers; a trial that was stopped goes on there")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure the plant: ns a step beside the same step in C, speed of a run, cost of a cycle from Python."""
+    """Measure the plant: a step, a run, a cycle from Python, and many runs at once, beside C and other libraries."""
+    if args.what == "explain":
+        from rig.trial.bench import trial
+
+        return trial(args)
     from fdi.output import write_text
     from rig import bench
     from rig.sequences import load_sequence
+    from rig.waiting import waiting
 
     command = load_sequence("preflight").main_profile().command
-    answer = bench.report(command)
+    with waiting(args.quiet) as update:
+        answer = bench.report(command, lambda what: update(what, 0, 0))
     rows = bench.accuracy(command) if args.accuracy else []
     if rows:
         answer["accuracy"] = [row._asdict() for row in rows]
@@ -41,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
 def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
     from rich.table import Table
 
-    from rig.bench import GET_GCC
     from rig.console import console
+    from rig.rivals import GET_GCC
 
     out = console()
     table = Table("The plant", "", "Python / C", "against Python", box=None, pad_edge=False)
@@ -51,6 +66,7 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
     out.print(table)
     if answer["step"] is None:
         out.print(f"step beside C: skipped, there is no gcc; to get it: {GET_GCC}")
+    _show_many(out, answer["many"])
     if rows:
         out.print()
         out.print("Error of XJ over the preflight, closed loop, against steps of 0.2 us, um")
@@ -59,6 +75,21 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
             table.add_row(f"{1000 / r.steps:g}", f"{r.rms:.4f}", f"{r.largest:.4f}", f"{r.rms_friction:.2f}",
                           f"{r.largest_friction:.2f}")
         out.print(table)
+
+
+def _show_many(out: Console, rivals: Sequence[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table("Many runs at once", "steps/s", "ours / its", "XJ apart by", box=None, pad_edge=False)
+    for rival in rivals:
+        if rival["speed"] is not None:
+            apart = f"{rival['difference'] * 1e6:.0e} um" if rival["difference"] else "no bit"
+            table.add_row(rival["name"], f"{rival['speed'] / 1e6:.3g} M", f"{rival['ratio']:.3g}", apart)
+    out.print()
+    out.print(table)
+    for rival in rivals:
+        if rival["note"]:
+            out.print(f"{rival['name']}: {rival['note']}", markup=False, soft_wrap=True)
 
 
 def _costs(answer: dict[str, Any]) -> list[tuple[str, ...]]:
