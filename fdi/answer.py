@@ -41,7 +41,9 @@ class Answer(NamedTuple):
 
 
 def controller(c: Cycles, model: Model) -> Answer:
-    """Compare; where it does not fit, look for the cycles that Com and XJ are late."""
+    """Compare; where it does not fit, look for the cycles that Com and XJ are late. NaN where firmware is unknown."""
+    if not model.kind.controller:
+        return Answer(np.full(len(c), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
     found = _compared(c, model, 0, 0)
     if found.ratio <= DISAGREES:
         return found

@@ -250,7 +250,7 @@ def noisier(c: Cycles, level: Mapping[str, float]) -> Cycles:
 
 
 def ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
-           controller: float, spool: bool = True) -> dict[str, float | None]:
+           controller: float | None, spool: bool = True) -> dict[str, float | None]:
     """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
 
     Where the spool is as the model says, an error of P12 in the replay is the jack's too: it sees standstill and

@@ -33,6 +33,7 @@ TOO_COARSE = 0.5  # of the floor: a solver's error as large as that leaves nothi
 UNDECIDED = 0.4  # of all rows, that may hang on a knife's edge and be left out
 LAGGED = 0.5  # of the misfit, that moving the current by some cycles must leave for the columns to be out of step
 UNLIKE = 1.5  # floors, by which residuals of repeats may differ before that is told
+BALANCED = "eha"  # the plant whose metering edges and ram the balances of `plant.forced` are
 STAGES = 7
 
 
@@ -198,10 +199,12 @@ def _blocks(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Repea
     signal = {name: s.ratio for name, s in table.items()}
     pairs = [(other.cycles, other.late, theirs) for other, theirs in repeats]
     level = {"xj": read_noise(model, c.xj)} | {name: f.value for name, f in noise.items()}
-    j = blocks.jack(c, model, run, pairs, level) if {"p12", "xs"} & set(c.signals) else None
+    told = model.plant == BALANCED and {"p12", "xs"} & set(c.signals)
+    j = blocks.jack(c, model, run, pairs, level) if told else None
+    answered = found.ratio if model.kind.controller else None
     if j is None:
-        return blocks.ratios(signal, None, None, None, found.ratio), {"flow": None, "force": None, "gain": None}
-    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, found.ratio, "xs" in c.signals)
+        return blocks.ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
+    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in c.signals)
     return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdi.answer import DISAGREES
-from fdi.compare import BLOCK, Comparison, Signal
+from fdi.compare import BALANCED, BLOCK, Comparison, Signal
 from fdi.diagnostics import LEAST_SHARE, Diagnosis
 
 SHOWN = {"xj": ("XJ", "um", 1e6), "p12": ("P12", "bar", 1e-5), "xs": ("XS", "um", 1e6)}
@@ -57,14 +57,13 @@ def sentence(found: Comparison) -> str:
         return "The plant fits, but the controller answers otherwise than the model's."
     said = (f"The model leaves {amount(worst.error, worst.name)} in {SHOWN[worst.name][0]} where noise explains "
             f"{amount(worst.floor.value, worst.name)}")
-    return f"{said}; {_blame(found)}."
+    return f"{said}; {_blame(found)}." if found.model.plant == BALANCED else f"{said}."
 
 
 def _blame(found: Comparison) -> str:
     fits = [name for name, ratio in found.blocks.items() if ratio is not None and name not in found.named]
     if not found.named:
-        unknown = all(found.blocks[name] is None for name in ("servovalve", "jack", "sensor"))
-        return "P12 or XS would show in which block" if unknown else "no block stands out"
+        return "P12 or XS would show in which block" if set(found.signals) == {"xj"} else "no block stands out"
     names = list(found.named)
     if found.blocks["jack"] is not None and found.blocks["jack"] == found.blocks["sensor"] and "jack" in names:
         names[names.index("jack")] = "jack or the sensor"
@@ -83,7 +82,7 @@ def listed(words: list[str]) -> str:
 def block_word(found: Comparison, name: str) -> str:
     """What a block's ratio was made of."""
     if name == "controller":
-        return _controller(found)
+        return _controller(found) if found.blocks[name] is not None else f"{BLOCKS[name]}: the firmware is not known"
     there = [SHOWN[s][0] for s in ("xs", "p12") if s in found.signals]
     said = BLOCKS[name]
     if found.blocks[name] is None:

@@ -4,6 +4,7 @@ What a replay cannot use is refused here in one line: no current, a dead sensor,
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,6 +28,7 @@ STEP = 2e-4  # m between recorded rows: a step of the demand
 STILL = 5e-5  # m; a ram that goes further than that moves every sensor
 FIRST = 16  # rows, whose parabola tells the speed in the first
 FAST = 2e-3  # m/s in the first row: a test that does not start at rest
+GONE, JUMP = 1e-3, 5.0  # m that the ram is to go under a sensor that stays dead; usual steps that a live one is off by
 FROZEN = 200  # equal samples in a row, while the ram moves
 RANGES = (("xj", "m", 3.0, "jack.travel"), ("com", "m", 5.0, "jack.travel"), ("xs", "m", 3.0, "spool.travel"),
           ("p12", "Pa", 3.0, "supply.pressure"), ("cor", "A", 20.0, "controller.current_limit"))
@@ -121,7 +123,7 @@ def _believable(trace: Trace, model: Model, chosen: Sequence[str], where: object
         raise InputError(where, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for name, unit, factor, limit in RANGES:
         largest = float(np.nanmax(np.abs(trace.column(name)))) if name in trace.signals else 0.0
-        if largest > factor * model[limit]:
+        if largest > factor * model.values.get(limit, math.inf):
             times = largest / model[limit]
             raise InputError(where, name, f"values in {unit}; the largest, {largest:g}, is {times:.0f} times {limit}")
     moves = float(np.nanmax(trace.com) - np.nanmin(trace.com)) > STILL
@@ -189,8 +191,9 @@ def _ready(c: Cycles, trace: Trace, where: object) -> Cycles:
     for name in c.signals:
         frozen = _frozen(getattr(c, name), c.com if name == "xj" else c.xj)
         if frozen.any():
-            at = np.flatnonzero(frozen)
-            notes.append(f"{name} is frozen from {c.t[at[0]]:.2f} to {c.t[at[-1]]:.2f} s: left out there")
+            first = float(c.t[int(np.argmax(frozen))])
+            seconds = float(frozen.sum()) * c.period
+            notes.append(f"{name} is frozen for {seconds:.2f} s, first at {first:.2f} s: left out there")
             usable &= ~frozen
     start = _start(c)
     if start:
@@ -259,12 +262,19 @@ def _after(marked: Flags, rows: int) -> Flags:
 
 
 def _frozen(x: Floats, mover: Floats) -> Flags:
-    """Rows in which x repeats one value for long while `mover` goes on."""
+    """Rows in which x repeats one value for long while `mover` goes on, and then jumps, or never comes back.
+
+    A ram that stands still behind a coarse converter goes on from its value by the converter's steps.
+    """
     out = np.zeros(len(x), bool)
+    steps = np.abs(np.diff(x))
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     starts = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0.0]))
     for a, b in zip(starts, [*starts[1:], len(x)], strict=True):
-        if b - a >= FROZEN and not np.isnan(mover[a:b]).all() and np.nanmax(mover[a:b]) - np.nanmin(mover[a:b]) > STILL:
-            out[a:b] = True
+        if b - a < FROZEN or np.isnan(mover[a:b]).all():
+            continue
+        way = float(np.nanmax(mover[a:b]) - np.nanmin(mover[a:b]))
+        out[a:b] = way > GONE if b == len(x) else way > STILL and steps[b - 1] > JUMP * usual
     return out
 
 

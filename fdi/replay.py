@@ -48,8 +48,8 @@ class Replay(NamedTuple):
 
 def open_loop(c: Cycles, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
-    lanes = Lanes(model.replace(QUIET), FRICTIONS[:1], steps)
-    out = lanes.replay(np.array([[model[FRICTIONS[0]]]]), c.cor, c.load, c.xj if known_start(c) else None, anchor)
+    lanes = Lanes(model.replace(QUIET), (), steps)
+    out = lanes.replay(np.empty((1, 0)), c.cor, c.load, c.xj if known_start(c) else None, anchor)
     return {name: out[0, :, i] for i, name in enumerate(SIGNALS)}
 
 
@@ -61,7 +61,7 @@ def known_start(c: Cycles) -> bool:
 def checked(c: Cycles, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     values = edges(model)
-    lanes = Lanes(model.replace(QUIET), FRICTIONS, STEPS)
+    lanes = Lanes(model.replace(QUIET), frictions(model), STEPS)
     position = c.xj if known_start(c) else None
     runs = lanes.replay(values, c.cor, c.load, position, ANCHOR)
     others = [lanes.replay(values[:1], cor, c.load, position, ANCHOR) for cor in guesses(c)]
@@ -73,7 +73,8 @@ def checked(c: Cycles, model: Model, floor: Mapping[str, float]) -> Replay:
             undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(c.measured(name))
     coarse, steps = runs[0], STEPS
     while True:
-        fine = Lanes(model.replace(QUIET), FRICTIONS, 2 * steps).replay(values[:1], c.cor, c.load, position, ANCHOR)[0]
+        finer = Lanes(model.replace(QUIET), frictions(model), 2 * steps)
+        fine = finer.replay(values[:1], c.cor, c.load, position, ANCHOR)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(SIGNALS) if name in floor}
         small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
         coarse, steps = fine, 2 * steps
@@ -126,12 +127,21 @@ def residuals(c: Cycles, model: Columns) -> Columns:
     return {name: c.measured(name) - model[name] for name in c.signals}
 
 
+def frictions(model: Model) -> tuple[str, ...]:
+    """The friction levels that the model's plant has."""
+    return tuple(name for name in FRICTIONS if name in model.values)
+
+
 def edges(model: Model) -> Floats:
-    """(9, 4) values of FRICTIONS: the model's, and each of them a little higher and lower."""
-    base = np.array([model[name] for name in FRICTIONS])
-    values = np.concatenate([base[None], base * (1 + KNIFE * np.eye(4)), base * (1 - KNIFE * np.eye(4))])
-    values[:, 1] = np.minimum(values[:, 0], values[:, 1])
-    values[:, 3] = np.minimum(values[:, 2], values[:, 3])
+    """(m, frictions) values: the model's, and each level a little higher and lower; dynamic stays below static."""
+    names = frictions(model)
+    base = np.array([model[name] for name in names])
+    shifts = KNIFE * np.eye(len(names))
+    values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
+    for static, dynamic in (FRICTIONS[:2], FRICTIONS[2:]):
+        if static in names and dynamic in names:
+            a, b = names.index(static), names.index(dynamic)
+            values[:, b] = np.minimum(values[:, a], values[:, b])
     return values
 
 
@@ -158,8 +168,8 @@ def closed_loop(c: Cycles, model: Model, steps: int = STEPS) -> Columns:
     before = round(SETTLED / c.period)
     com = np.concatenate([np.full(before, c.com[0]), c.com])
     load = np.concatenate([np.full(before, c.load[0]), c.load])
-    lanes = Lanes(model.replace(QUIET), FRICTIONS[:1], steps)
-    out = lanes.closed_loop(np.array([[model[FRICTIONS[0]]]]), com, load)[0, before:]
+    lanes = Lanes(model.replace(QUIET), (), steps)
+    out = lanes.closed_loop(np.empty((1, 0)), com, load)[0, before:]
     whole = {"xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3]}
     left = {name: c.measured(name) - whole[name] for name in c.signals}
     return left | {"cor": c.measured("cor") - whole["cor"]}

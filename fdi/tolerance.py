@@ -38,7 +38,8 @@ class Scatter(NamedTuple):
 
 def tolerances(model: Model) -> dict[str, float]:
     """The parameters that scatter from unit to unit, with one tolerance in SI units."""
-    known = {name: meaning(name).tolerance * abs(model[name]) for name in model.names()}
+    known = {name: model.kind.tolerance(name, meaning(name, plant=model.plant)) * abs(model[name])
+             for name in model.names()}
     return {name: size for name, size in known.items() if size > 0.0}
 
 

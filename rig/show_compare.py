@@ -21,8 +21,9 @@ def comparison(found: Comparison, then: str, page: Path | None) -> None:
     out.print()
     out.print(signals(found))
     out.print()
-    out.print(blocks(found))
-    out.print()
+    if any(value is not None for value in found.blocks.values()):
+        out.print(blocks(found))
+        out.print()
     for label, text in lines(found):
         out.print(f"[dim]{label:<10}[/]{escape(text)}", soft_wrap=True)
     if page is not None:

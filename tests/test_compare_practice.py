@@ -9,9 +9,10 @@ import pytest
 from fdi.compare import Comparison, compare
 from fdi.compare_text import sentence
 from fdi.trace import Trace
-from plant import Model
+from plant import Model, load_model
 
 FOLDER = Path(__file__).parents[2] / "shared/practice"
+RIG = FOLDER.parent / "data/electrohydrostatic_rig"
 pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
 
 LIMIT = Model()["controller.current_limit"]
@@ -74,3 +75,12 @@ def test_plant_scatter_alone_is_said_to_be_possible() -> None:
                                              ("07", "accelerates by more than")])
 def test_conditions_in_words(case: str, words: str) -> None:
     assert words in nominal(case).condition
+
+
+@pytest.mark.skipif(not RIG.exists(), reason="no ../shared/data: no measurements of another actuator")
+def test_measurements_of_another_plant() -> None:
+    """No valve and no known firmware there: signals, places and drift are told, blocks are not."""
+    found = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
+    assert found.verdict == "MODEL_INCOMPLETE" and set(found.blocks.values()) == {None} and not found.named
+    assert found.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
+    assert "the model leaves" in sentence(found).lower() and len(found.where) > 3

@@ -97,7 +97,12 @@ def test_a_sensor_that_hangs_is_left_out_while_it_does() -> None:
     p12[9000:10_000] = p12[9000]
     (c,) = readings(made(p12=p12), MODEL)
     assert not c.usable[9000:10_000].any() and c.usable.sum() == 12_500
-    assert "p12 is frozen from 9.00 to 10.00 s" in c.notes[0]
+    assert "p12 is frozen for 1.00 s, first at 9.00 s" in c.notes[0]
+    coarse = np.round(healthy().xj / 2e-3) * 2e-3  # a converter of a few bits rests for long, and is alive
+    assert readings(made(xj=coarse), MODEL)[0].usable.all()
+    dead = healthy().xs.copy()
+    dead[11_000:] = dead[11_000]
+    assert not readings(made(xs=dead), MODEL)[0].usable[11_000:].any()
 
 
 def test_a_trace_that_starts_in_motion() -> None:
