@@ -29,5 +29,6 @@ def free_of(model: Model) -> tuple[Free, ...]:
 
 def _off_nominal(e: Effect, model: Model) -> bool:
     usual = model.kind.nominal
-    return any(abs(model[name] - usual[name]) > (FURTHEST * e.parameters[name].tolerance + 1e-12) * abs(usual[name])
-               for name in e.fitted)
+    tolerance = model.kind.tolerance
+    return any(abs(model[name] - usual[name]) > (FURTHEST * tolerance(name, q) + 1e-12) * abs(usual[name])
+               for name, q in e.parameters.items())

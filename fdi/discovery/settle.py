@@ -1,10 +1,13 @@
-"""The last rounds of a fit, with differences along principal directions: they find the floor of a valley and its length.
+"""The last rounds of a fit, with differences along principal directions: they find a valley's floor and its length.
 
 Stick-slip makes residuals rough: a step of a parameter shifts a hundred small events, some more, some less. Parameters
 that make up for each other, such as pressure and friction of the spool, are each known to a thousandth when the other
 is held; differences that narrow drown in the roughness, the valley along which both move together is not seen, fits end
 in it anywhere and their intervals are far too narrow. Differences along the principal directions of the covariance are
 as wide as each direction is open, and what they show is the next round's covariance.
+
+The solver's step has its own part in where a valley is lowest. Steps ten times finer are needed for what a fit is led
+by, the residuals, and not for their slopes: so the differences may be taken with a coarser problem than the rest.
 """
 from __future__ import annotations
 
@@ -25,11 +28,14 @@ WIDTH = 3.0  # of a difference, standard deviations
 WIDEST, NARROWEST = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
-def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS) -> Fit:
-    """A fit taken to the end, with a covariance that holds at the width of its own intervals."""
+def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | None = None) -> Fit:
+    """A fit taken to the end, with a covariance that holds at the width of its own intervals.
+
+    `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.
+    """
     now, idle = fit, 0
     for _ in range(rounds):
-        here = along(problem, now.free, now.x, now.covariance)
+        here = along(problem, now.free, now.x, now.covariance, slopes or problem)
         there = _better(problem, here)
         idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
         now = there
@@ -38,18 +44,19 @@ def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS) -> Fit:
     return replace(now, converged=True)
 
 
-def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats) -> Fit:
+def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem) -> Fit:
     """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p)."""
     directions = _principal(covariance)
     moves = np.array([_inside(free, x, d) for d in directions.T])
-    residuals = problem.residuals(free, np.vstack([x, x + moves]))
+    near = slopes.whitened(slopes.residuals(free, np.vstack([x, x + moves])))
+    residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
-    slopes = np.linalg.lstsq(moves, (white[1:] - white[0]).reshape(len(x), -1), rcond=None)[0]
+    flat = np.linalg.lstsq(moves, (near[1:] - near[0]).reshape(len(x), -1), rcond=None)[0]
     prior = np.diag([f.prior**-2 for f in free])
-    heavy = (slopes.reshape(len(x), *white[0].shape) * weights(white[0])).reshape(len(x), -1)
-    held = float(misfit(white[:1])[0])
-    return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ slopes.T + prior), residuals[0],
-               white[0], slopes.reshape(len(x), *white[0].shape))
+    heavy = (flat.reshape(len(x), *white[0].shape) * weights(white[0])).reshape(len(x), -1)
+    held = float(misfit(white)[0])
+    return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ flat.T + prior), residuals[0],
+               white[0], flat.reshape(len(x), *white[0].shape))
 
 
 def _principal(covariance: Floats) -> Floats:
@@ -79,4 +86,5 @@ def _better(problem: Problem, fit: Fit) -> Fit:
     k = int(np.argmin(costs))
     if costs[k] >= fit.cost:
         return fit
-    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k], white=white[k])
+    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k],
+                   white=white[k])

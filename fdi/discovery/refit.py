@@ -1,0 +1,214 @@
+"""Effects put into a model one after the other: everything fitted anew each time, and the error after each step."""
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.answer import friction_sorted
+from fdi.discovery.explain import gain, held_out
+from fdi.discovery.fingerprints import comb, firmware
+from fdi.discovery.fit import Fit, improved, linearised
+from fdi.discovery.known import UNREPLAYED, effects_of, free_of
+from fdi.discovery.problem import Free, quiet, unknowns
+from fdi.discovery.record import Record
+from fdi.discovery.scan import Prospect, scan
+from fdi.discovery.search import Hypothesis, Search
+from fdi.discovery.settle import settled
+from plant.effects import CATALOGUE
+from plant.errors import InputError
+from plant.lanes import ladder
+from plant.model import Model, offered
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
+LAST, BEFORE = 8, 2  # of the last fit, and of those before it in the ledger
+STEPS = 50  # a cycle, of the last fits' residuals; their slopes make do with those of the first
+HELPS = 30.0  # gain in -2 log likelihood below which an effect takes away nothing but noise
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The model after one more effect: RMS error on the fit's run and on the held-out one, by signal, SI."""
+
+    effect: str | None
+    hypothesis: Hypothesis
+    error: Mapping[str, float]
+    holdout: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A model with all its effects fitted together, and how it came about."""
+
+    original: Model  # before any effect, tolerances at their centres
+    steps: tuple[Step, ...]  # the original's own, then one for each effect
+    marks: Mapping[str, tuple[float, float, float]]  # parameters read off without noise: value, low, high
+    floor: Mapping[str, float]
+    search: Search
+
+    @property
+    def last(self) -> Step:
+        """With all effects."""
+        return self.steps[-1]
+
+    @property
+    def helps(self) -> bool:
+        """Whether the effect that came last takes away more than noise."""
+        if len(self.steps) < 2:
+            return True
+        before, after = self.steps[-2:]
+        name = str(after.effect)
+        if CATALOGUE[name].port in UNREPLAYED:
+            return True  # it was found without noise, or it would not be here
+        worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
+        return gain(before.hypothesis, after.hypothesis) > HELPS and not worse
+
+
+def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequence[Record] = (),
+          holdout: Record | None = None, progress: Progress = lambda what, part: None,
+          begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
+    """Add effects to a model in this order.
+
+    Args:
+        original: the model without them.
+        effects: names of the catalogue.
+        est: the run to fit.
+        repeats: further runs of its command, which tell noise from physics and are fitted as well.
+        holdout: a run that no fit sees.
+        progress: called with what is being done and the part done, 0..1.
+        begin: parameters of an earlier fit with the first `done` effects: these come in together, from there.
+        done: how many.
+        workers: threads; default one a core.
+
+    Raises:
+        InputError: an effect that cannot be added to this model or be fitted to these runs.
+    """
+    for number, name in enumerate(effects):
+        addable(original, effects[:number], name)
+    marks = _marks(original, effects, [est, *repeats])
+    replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
+    first = [e for e in effects[:done] if e in replayed]
+    search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed)
+    model = _lean(search, replayed)
+    search.problem = replace(search.problem, model=model, workers=workers or os.cpu_count() or 1)
+    search.repeats = [replace(p, model=model) for p in search.repeats]
+    progress("fitting the model as it is", 0.1)
+    chain = [search.judged(tuple(first), _started(search, first, begin or {}))]
+    for number, name in enumerate(replayed[len(first):]):
+        progress(f"adding {name}", 0.25 + 0.4 * number / (len(replayed) - len(first)))
+        chain.append(_with(search, chain[-1], name))
+    progress("last fits, with finer steps", 0.65)
+    search.learn_noise(chain[-1])
+    coarse = search.problem.steps
+    search.refine(STEPS)
+    slopes = replace(search.problem, steps=coarse, _lanes={})
+    for i, h in enumerate(chain):
+        rounds = LAST if i == len(chain) - 1 else BEFORE
+        chain[i] = search.judged(h.effects, settled(search.problem, h.fit, rounds, slopes))
+    return Refit(original, _steps(search, effects, done, chain, holdout), marks, search.floor(chain[-1]), search)
+
+
+def _lean(search: Search, effects: Sequence[str]) -> Model:
+    """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
+    quick = {e for rung in ladder(search.problem.model)[:-1] for e in rung.model.effects}
+    own = quiet(search.model.having(effects))
+    return search.problem.model if set(own.effects) <= quick else own
+
+
+def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
+    """The model's own unknowns and those of `effects` fitted, from where they were left."""
+    own = [u for name in effects for u in unknowns(CATALOGUE[name], search.model)]
+    taken = {u.name for u in own}
+    free = (*(f for f in free_of(search.model) if f.name not in taken), *own)
+    x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
+    return improved(search.problem, linearised(search.problem, free, x), FIRST)
+
+
+def addable(model: Model, before: Sequence[str], name: str) -> None:
+    """Refuse an effect that cannot join a model with the effects `before`.
+
+    Raises:
+        InputError: it is in it already, excludes one that is, or nobody can fit it.
+    """
+    entry = CATALOGUE[name]
+    if name not in [e.name for e in offered(model.plant)]:
+        raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
+    present = [*effects_of(model), *before]
+    if name in present:
+        raise InputError("effect", name, f"an effect that is not in the model already (rig remove {name} takes it out)")
+    if not entry.fitted:
+        raise InputError("effect", name, "an effect with parameters to fit; this is noise of the bench")
+    for other in present:
+        if name in CATALOGUE[other].excludes or other in entry.excludes:
+            raise InputError("effect", name, f"{name} or {other} in a model, not both")
+
+
+def _with(search: Search, before: Hypothesis, name: str) -> Hypothesis:
+    """The best fit with one more effect, from the starts that a scan finds; all else is free as well."""
+    fit = before.fit
+    healthy = linearised(search.problem, fit.free, np.where(_healthy(fit.free), 0.0, fit.x))
+    found = [*scan(search.problem, fit, [name]), *scan(search.problem, healthy, [name])]
+    alone = replace(search.problem, workers=1, _lanes={})
+    with ThreadPoolExecutor(search.problem.workers) as pool:
+        fits = pool.map(lambda begun: settled(alone, improved(alone, begun, FIRST), THEN), _begun(search, found))
+        return search.judged((*before.effects, name), min(fits, key=lambda f: f.cost))
+
+
+def _begun(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
+    """Where a scan points to, and the effects of these sizes in a healthy unit.
+
+    A fit that had to do without a large effect has put it into the tolerances: that may be a wrong basin.
+    """
+    starts = [x for p in prospects for x in (p.x, np.where(_healthy(p.free), 0.0, p.x))]
+    fits = [linearised(search.problem, prospects[0].free, x) for x in starts]
+    return sorted(fits, key=lambda f: f.cost)[:2]
+
+
+def _healthy(free: Sequence[Free]) -> NDArray[np.bool_]:
+    """Of which unknowns it is known where a healthy unit has them."""
+    return np.array([np.isfinite(f.prior) for f in free])
+
+
+def _marks(model: Model, effects: Sequence[str], records: Sequence[Record]) -> dict[str, tuple[float, float, float]]:
+    """Parameters of effects that a replay does not show: they are read off the firmware's answers and the positions."""
+    found: dict[str, tuple[float, float, float]] = {}
+    for name in effects:
+        if CATALOGUE[name].port not in UNREPLAYED:
+            continue
+        tooth = comb(records[0]) if name == "quantisation" else None
+        prints = [tooth] if tooth else [p for p in firmware(model, records)[1] if p.effect == name]
+        if not prints:
+            where = "steps in the measured positions" if CATALOGUE[name].port == "reading" else \
+                "a difference between Cor and the model's firmware that it explains"
+            raise InputError("effect", name, f"{where}; this trace has none")
+        found |= prints[0].parameters
+    return found
+
+
+def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Record | None
+           ) -> tuple[Step, ...]:
+    """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
+    held = [held_out(search, h, holdout) if holdout else {} for h in chain]
+    steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
+    for name in effects[done:]:
+        at += CATALOGUE[name].port not in UNREPLAYED
+        steps.append(Step(name, chain[at], chain[at].errors, held[at]))
+    return tuple(steps)
+
+
+def values_of(r: Refit) -> dict[str, float]:
+    """What was fitted, "group.field" to SI value, to six digits."""
+    values = {name: float(f"{v:.6g}") for name, v in r.last.hypothesis.fit.values.items()}
+    return friction_sorted(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
+
+
+def model_of(r: Refit) -> Model:
+    """The model with what was fitted."""
+    return r.original.replace(values_of(r), "fit")
