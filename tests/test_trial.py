@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import rig
 from rich.console import Console
 from scipy.stats import binomtest
 
@@ -245,6 +246,11 @@ def test_an_explanation_that_is_not_there_is_said_in_one_line() -> None:
     assert callable(load_explain(NAME))
     with pytest.raises(InputError, match="module:function"):
         load_explain("rig.trial.nowhere:explain")
+
+
+def test_the_command_refuses_no_cases_in_one_line() -> None:
+    said = rig("bench", "explain", "--cases", 0)
+    assert said.status == 2 and said.err == "rig bench: --cases: 0: expected 1 or more\n"
 
 
 @pytest.mark.slow
