@@ -84,10 +84,7 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
     """
     h, columns = period / steps, out.shape[1]
     for lane in range(WIDTH):
-        p = parameters_at(a, lane)
-        keep_coefficients(coefficients(p, h), a, lane)
-        s = state_at(a, lane)
-        keep_state(rested(s, position[0], p, steps) if len(position) else shown(s, p), a, lane)
+        begin(a, lane, position, steps, h)
     for k in range(len(com)):
         t = k * period
         for lane in range(WIDTH):
@@ -108,6 +105,13 @@ def run(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool,
             for lane in range(WIDTH):
                 u = Input(drive_at(a, lane).now, load[k], 0.0, t + i * h, i * h, h)
                 keep_state(step(state_at(a, lane), u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
+
+
+def begin(a: Any, lane: int, position: Any, steps: int, h: float) -> None:
+    """One lane at rest, where the transducer shows position[0] or at zero; and its coefficients."""
+    s, p = state_at(a, lane), parameters_at(a, lane)
+    keep_coefficients(coefficients(p, h), a, lane)
+    keep_state(rested(s, position[0], p, steps) if len(position) else shown(s, p), a, lane)
 
 
 def sample(a: Any, lane: int, t: float) -> tuple[float, float, float]:

@@ -117,31 +117,8 @@ def in_jax(task: Task) -> Replay:
 
 def in_progpy(task: Task) -> Replay:
     """NASA ProgPy: the step as a model of its own kind, vectorised over the runs, simulated by its `simulate_to`."""
-    from progpy import PrognosticsModel
-
-    p, h, period = _dotted(task.parameters), task.h, float(task.model["controller.period"])
-    k = coefficients(p, h)
-    states = ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
-
-    class Plant(PrognosticsModel):  # type: ignore[misc]
-        """The reference model without its controller."""
-
-        is_vectorized = True
-        inputs, outputs, events = ["current", "load"], ["xj", "p12", "xs"], []
-
-        def initialize(self, u: Any = None, z: Any = None) -> Any:
-            return self.StateContainer({name: np.zeros(len(task.values)) for name in states})
-
-        def next_state(self, x: Any, u: Any, dt: float) -> Any:
-            after = step(np, [x[name] for name in states], u["current"], u["load"], p, k, h)
-            return self.StateContainer(dict(zip(states, after, strict=True)))
-
-        def output(self, x: Any) -> Any:
-            return self.OutputContainer({name: x[name] for name in self.outputs})
-
-    Plant.states = states
-    plant = Plant(process_noise=0, measurement_noise=0)
-    acting = np.r_[0.0, task.current[:-1]]
+    period = float(task.model["controller.period"])
+    plant, acting = _progpy_plant(task), np.r_[0.0, task.current[:-1]]
 
     def inputs(t: float, x: Any = None) -> Any:
         row = min(int(t / period), len(acting) - 1)
@@ -151,11 +128,36 @@ def in_progpy(task: Task) -> Replay:
     times = [(row - 0.5 / task.steps) * period for row in range(1, len(acting))]
 
     def run() -> Array:
-        rows = plant.simulate_to(times[-1], inputs, dt=h, save_pts=times).outputs
+        rows = plant.simulate_to(times[-1], inputs, dt=task.h, save_pts=times).outputs
         columns = [[np.ravel(rows[k][name]) for k in range(len(acting))] for name in plant.outputs]
         return np.array(columns).transpose(2, 1, 0)
 
     return run
+
+
+def _progpy_plant(task: Task) -> Any:
+    from progpy import PrognosticsModel
+
+    p, h, names = _dotted(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
+    k = coefficients(p, h)
+
+    class Plant(PrognosticsModel):  # type: ignore[misc]
+        """The reference model without its controller."""
+
+        is_vectorized = True
+        inputs, states, outputs, events = ["current", "load"], names, ["xj", "p12", "xs"], []
+
+        def initialize(self, u: Any = None, z: Any = None) -> Any:
+            return self.StateContainer({name: np.zeros(len(task.values)) for name in names})
+
+        def next_state(self, x: Any, u: Any, dt: float) -> Any:
+            after = step(np, [x[name] for name in names], u["current"], u["load"], p, k, h)
+            return self.StateContainer(dict(zip(names, after, strict=True)))
+
+        def output(self, x: Any) -> Any:
+            return self.OutputContainer({name: x[name] for name in self.outputs})
+
+    return Plant(process_noise=0, measurement_noise=0)
 
 
 def _dotted(groups: Mapping[str, Mapping[str, Any]]) -> Any:
