@@ -26,6 +26,7 @@ MOST = 3  # effects looked for one after the other
 EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
 CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
 BETTER = 0.8  # times the error before: what counts as a part of the explanation
+FAIR = 0.1  # of the excess cost that an effect has to take away if another one is to be looked for on top of it
 HELD_OUT = 1.2  # times the floor, in the typical block of a run with another command
 TYPICAL = 0.85  # of the blocks
 
@@ -71,12 +72,12 @@ def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: 
     if base.reached:
         search.learn_noise(base)
         base = search.again(base)
-    levels = _levels(search, base, progress)
+    levels = _levels(search, base, holdout, progress)
     progress("last fits, with finer steps", 0.8)
     return _concluded(search, levels, found, controller, holdout)
 
 
-def _levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[Hypothesis]]:
+def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: Progress) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
     for count in range(1, MOST + 1):
@@ -90,10 +91,28 @@ def _levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[H
             tried = sorted((search.again(h) for h in tried[:4]), key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.without(search.again(base), tried[:1])]
         levels.append(tried)
-        if tried[0].reached or not _significant(levels[-2][0], tried[0]):
+        if tried[0].reached or not _significant(levels[-2][0], tried[0]) or not _way(search, levels, holdout):
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
+
+
+def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Record | None) -> bool:
+    """Whether the last effect is a way to go on: it takes a fair part of what was left, on the held-out run as well."""
+    before, after = levels[-2][0], levels[-1][0]
+    noise = float(np.isfinite(search.problem.record.measured).sum())
+    if before.cost - after.cost < FAIR * (before.cost - noise):
+        return False
+    return holdout is None or _improves(search, before, after, holdout)
+
+
+def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Record) -> bool:
+    """Whether a hypothesis leaves less of a held-out run than another, in the typical block, all signals together."""
+    floor = search.floor(after)
+    left = [np.array([e / floor[s] for s, e in zip(holdout.signals, typical(_unseen(search, h, holdout)), strict=True)])
+            for h in (before, after)]
+    excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
+    return excess[1] < BETTER * excess[0]
 
 
 def _distinct(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -131,7 +150,8 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
         base, close = search.again(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
-    verdict, named = _verdict(base, close, holding, depth, found, controller, floor)
+    part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
+    verdict, named = _verdict(base, close, holding, part, found, controller, floor)
     blind = sensitivity(search.problem, (close[0] if close and verdict == "EXPLAINED" else base).fit, search.effects)
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
                        blind, search)
@@ -141,13 +161,15 @@ def _parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypoth
     return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
 
 
-def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], depth: int,
+def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
              found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
              ) -> tuple[str, tuple[str, ...]]:
-    """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run."""
+    """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run,
+    `part` says that the best one leaves less of it than the base does.
+    """
     prints = tuple(f.effect for f in found)
     firmware_left = controller > 3.0 and not any(CATALOGUE[f.effect].firmware for f in found)
-    if not depth:
+    if not close:
         if not base.reached:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints
         if firmware_left:
@@ -164,7 +186,7 @@ def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hy
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
         return "EXPLAINED", (*prints, *there[0].effects)
     better = min(_error(best, floor), 1e9) < BETTER * _error(base, floor)
-    return ("PARTLY", (*prints, *best.effects)) if better or prints else ("UNEXPLAINED", prints)
+    return ("PARTLY", (*prints, *best.effects)) if better and part else ("PARTLY" if prints else "UNEXPLAINED", prints)
 
 
 def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
