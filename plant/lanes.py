@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -164,6 +164,20 @@ def ladder(model: Model) -> list[Rung]:
         return [Rung(model, model.effects)]
     cheap = tuple(name for name in model.effects if _cheap(CATALOGUE[name]))
     return [Rung(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
+
+
+def warm(model: Model, tell: Callable[[str, int, int], None] = lambda what, done, total: None) -> None:
+    """Compile now what runs of the model may need, or load it where it was kept; `tell` gets what and how far.
+
+    The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
+    """
+    rungs = ladder(model)
+    for done, rung in enumerate(rungs):
+        tell(f"compiling the plant with {len(rung.model.effects)} effects, once", done, len(rungs))
+        for run, buffer, rows in rung.blocks((), np.zeros((1, 0)), np.arange(1)):
+            none = np.empty(0)
+            run(buffer, none, none, none, 0.0, False, 1.0, 1, rows, np.empty((2, 3, 0)))
+    tell("", len(rungs), len(rungs))
 
 
 def _cheap(effect: Effect) -> bool:

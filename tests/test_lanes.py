@@ -13,7 +13,7 @@ from plant import Actuator, InputError, Model, block, simulate
 from plant import lanes as lanes_module
 from plant.compile import interpreted
 from plant.effects import CATALOGUE, load_effects
-from plant.lanes import Lanes, ladder
+from plant.lanes import Lanes, ladder, warm
 from plant.model import bindings
 from plant.replay import replay
 
@@ -146,6 +146,12 @@ def test_threads_do_not_matter() -> None:
     alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
                      for workers in (1, 3))
     assert (alone == shared).all() and len(np.unique(alone[:, -1, 0])) > 50
+
+
+def test_warming_tells_how_far_it_is() -> None:
+    told: list[tuple[str, int, int]] = []
+    warm(QUIET.having(EFFECTS), lambda *how: told.append(how))
+    assert [done for _, done, _ in told] == [0, 1, 2, 3] and "0 effects" in told[0][0]
 
 
 def test_what_does_not_fit_is_refused() -> None:
