@@ -22,6 +22,7 @@ Progress = Callable[[str, float], None]
 FINE = 20  # steps a cycle of the last fits
 FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
 COARSE = 0.2  # times the floor; a solver's error beyond it is not hidden by the noise
+LONG = 10  # rounds of a last fit on which a verdict hangs alone
 MOST = 3  # effects looked for one after the other
 EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
 CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
@@ -139,6 +140,8 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
         depth = 1
     base = search.again(levels[0][0], 4)
+    if not depth and not base.reached:  # nothing helps: then the base's own fit had better be beyond doubt
+        base = search.settle(base, LONG)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
     close = sorted((search.settle(h) for h in close), key=lambda h: h.cost + h.repeat_cost)
     others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])

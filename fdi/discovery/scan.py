@@ -15,8 +15,10 @@ from plant.effects import CATALOGUE
 Floats = NDArray[np.float64]
 Start = Mapping[str, float]
 
-ZOOM = ((0.4, 0.6, 0.8, 1.3, 1.7, 2.5), (0.88, 0.94, 1.06, 1.13), (0.96, 0.98, 1.02, 1.04), (0.99, 1.01))  # on the size
-LOOKED_AT = (20, 12, 8, 6)  # effects in each of these passes
+ZOOM = (  # factors on the size, pass by pass; the first reaches down to sizes that only just show
+    (0.015, 0.05, 0.15, 0.4, 0.65, 1.5, 2.5), (0.6, 0.8, 1.25, 1.7), (0.88, 0.94, 1.06, 1.13),
+    (0.97, 0.985, 1.015, 1.03))
+LOOKED_AT = (40, 14, 10, 8)  # effects in each of these passes
 TOGETHER = 64  # runs at a time
 THINNED = 5  # every so many samples, for the linear shift alone
 

@@ -14,7 +14,7 @@ from fdi.discovery import noise as noises
 from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
 from fdi.discovery.known import free_of
 from fdi.discovery.noise import Noise
-from fdi.discovery.problem import Problem, quiet, whole
+from fdi.discovery.problem import Free, Problem, quiet, whole
 from fdi.discovery.record import NOISE, Record
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.settle import settled
@@ -27,6 +27,7 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 WORTH = 20.0  # expected gain in cost that makes a full fit worth its time
 BEAM = 3  # hypotheses from which the next missing effect is looked for
+EASED = (30.0, 6.0)  # times the noise, stage by stage
 SETTLING = 5  # rounds of the last fit
 REACHED = 1.08  # times the floor; what is left above it is physics
 
@@ -72,8 +73,18 @@ class Search:
 
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
-        first = self.judged((), fit(self.problem, free_of(self.model)))
+        free = free_of(self.model)
+        fits = [fit(self.problem, free, x) for x in (None, self.eased(free))]
+        first = self.judged((), min(fits, key=lambda f: f.cost))
         return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
+
+    def eased(self, free: Sequence[Free]) -> Floats:
+        """Where a fit gets to, (p,), that takes the noise for larger at first: priors hold it, small events vanish."""
+        x = np.zeros(len(free))
+        for factor in EASED:
+            noise = tuple(n._replace(innovation=factor * n.innovation) for n in self.noise)
+            x = fit(replace(self.problem, noise=noise), free, x, 4).x
+        return x
 
     def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
