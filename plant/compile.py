@@ -99,7 +99,7 @@ def record_at(kind: np.dtype[Any], first: int, apart: int) -> Function:
             data = context.make_array(signature.args[0])(context, builder, values[0]).data
             number = data.type.pointee
             count = context.get_constant(signature.args[1], kind.itemsize // np.dtype(float).itemsize)
-            copy = numba.core.cgutils.alloca_once(builder, number, count)
+            copy = numba.core.cgutils.alloca_once(builder, number, count)  # type: ignore[no-untyped-call]
             for i in range(count.constant):
                 there = builder.add(values[1], context.get_constant(signature.args[1], first + i * apart))
                 builder.store(builder.load(builder.gep(data, [there])),
@@ -133,7 +133,7 @@ def called(function: Function) -> set[str]:
 
 def costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
-    plain = getattr(function, "py_func", function)
+    plain: Any = getattr(function, "py_func", function)
     divides = any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(plain))
     elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
     return divides or not elementary.isdisjoint(plain.__code__.co_names) or any(map(costly, _calls(plain).values()))

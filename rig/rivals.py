@@ -105,7 +105,7 @@ def in_jax(task: Task) -> Replay:
         k = coefficients(p, h)
 
         def cycle(s: Any, held: Any) -> Any:
-            after, _ = jax.lax.scan(lambda s, _: (step(numbers, s, *held, p, k, h), None), s, None, task.steps)
+            after, _ = jax.lax.scan(lambda s, _: (step(numbers, s, held[0], held[1], p, k, h), None), s, None, task.steps)
             return after, numbers.stack([s[4], s[6], s[2]])
 
         return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]
@@ -145,7 +145,8 @@ def _progpy_plant(task: Task) -> Any:
         """The reference model without its controller."""
 
         is_vectorized = True
-        inputs, states, outputs, events = ["current", "load"], names, ["xj", "p12", "xs"], []
+        inputs, states, outputs = ["current", "load"], names, ["xj", "p12", "xs"]
+        events: list[str] = []  # noqa: RUF012  (the library's own way)
 
         def initialize(self, u: Any = None, z: Any = None) -> Any:
             return self.StateContainer({name: np.zeros(len(task.values)) for name in names})
