@@ -105,7 +105,10 @@ def in_jax(task: Task) -> Replay:
         k = coefficients(p, h)
 
         def cycle(s: Any, held: Any) -> Any:
-            after, _ = jax.lax.scan(lambda s, _: (step(numbers, s, held[0], held[1], p, k, h), None), s, None, task.steps)
+            def forward(s: Any, _: None) -> tuple[Any, None]:
+                return step(numbers, s, held[0], held[1], p, k, h), None
+
+            after, _ = jax.lax.scan(forward, s, None, task.steps)
             return after, numbers.stack([s[4], s[6], s[2]])
 
         return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]

@@ -128,14 +128,13 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
-        name = function.__name__
-        known = CATALOGUE.whole().get(name)
+        known = CATALOGUE.whole().get(name := function.__name__)
         if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
         if set(group._fields) - set(group._field_defaults):
             raise ValueError(f"{name}: every parameter needs a default, its off value")
         meaning = {f"{name}.{field}": q for field, q in quantities(group).items()}
-        off = {f"{name}.{field}": float(value) for field, value in group._field_defaults.items()}
+        off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
         names = tuple(f"{name}.{field}" for field in free)
         CATALOGUE.enter(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
                                names, _starts(names, starts), **more))
