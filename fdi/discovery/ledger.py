@@ -67,10 +67,10 @@ def read_provenance(path: Path) -> Provenance:
         runs = [Source(*pair) for pair in zip(said.get("repeats", []), said.get("repeats_sha256", []), strict=True)]
         rows = [Row(r.get("effect"), r["error"], r.get("holdout", {}), r.get("removed", False))
                 for r in said.get("ledger", [])]
-        return Provenance(said.get("software", ""), *(tuple(said.get(name, ())) for name in
-                                                      ("history", "effects", "effect_files", "signals")),
-                          _source(said, "trace"), tuple(runs), _source(said, "holdout"), said.get("floor"),
-                          said.get("before"), tuple(rows))
+        history, effects, files, signals = (tuple(said.get(name, ())) for name in
+                                            ("history", "effects", "effect_files", "signals"))
+        return Provenance(said.get("software", ""), history, effects, files, signals, _source(said, "trace"),
+                          tuple(runs), _source(said, "holdout"), said.get("floor"), said.get("before"), tuple(rows))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(path, "provenance", f"what rig add writes there ({error})") from error
 
@@ -88,7 +88,7 @@ def load(path: Path) -> tuple[Model, Provenance]:
     found = read_provenance(path)
     tables = read_toml(path)
     named = tables.get("effects", [])
-    gone = [e for e in named if e not in CATALOGUE] if isinstance(named, list) else []
+    gone = [e for e in named if e not in CATALOGUE.whole()] if isinstance(named, list) else []
     if gone and found.effect_files:
         files = " ".join(f"--effects {file}" for file in found.effect_files)
         raise InputError(path, "effects", f"{files} with it, where {gone[0]} is defined")

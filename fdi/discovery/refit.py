@@ -14,7 +14,7 @@ from fdi.discovery.explain import gain, held_out
 from fdi.discovery.fingerprints import comb, firmware
 from fdi.discovery.fit import Fit, improved, linearised
 from fdi.discovery.known import UNREPLAYED, effects_of, free_of
-from fdi.discovery.problem import Free, quiet, unknowns
+from fdi.discovery.problem import Free, quiet, unknowns, whole
 from fdi.discovery.record import Record
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.search import Hypothesis, Search
@@ -90,13 +90,12 @@ def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequenc
     Raises:
         InputError: an effect that cannot be added to this model or be fitted to these runs.
     """
-    for number, name in enumerate(effects):
-        addable(original, effects[:number], name)
+    addable(original, effects)
     marks = _marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed)
-    model = _lean(search, replayed)
+    model = lean(search.model, replayed)
     search.problem = replace(search.problem, model=model, workers=workers or os.cpu_count() or 1)
     search.repeats = [replace(p, model=model) for p in search.repeats]
     progress("fitting the model as it is", 0.1)
@@ -105,21 +104,26 @@ def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequenc
         progress(f"adding {name}", 0.25 + 0.4 * number / (len(replayed) - len(first)))
         chain.append(_with(search, chain[-1], name))
     progress("last fits, with finer steps", 0.65)
+    chain = _last_fits(search, chain)
+    return Refit(original, _steps(search, effects, done, chain, holdout), marks, search.floor(chain[-1]), search)
+
+
+def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """All of them with the noise that the last one leaves, with the repeats and with finer steps."""
     search.learn_noise(chain[-1])
     coarse = search.problem.steps
     search.refine(STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
-    for i, h in enumerate(chain):
-        rounds = LAST if i == len(chain) - 1 else BEFORE
-        chain[i] = search.judged(h.effects, settled(search.problem, h.fit, rounds, slopes))
-    return Refit(original, _steps(search, effects, done, chain, holdout), marks, search.floor(chain[-1]), search)
+    rounds = [*[BEFORE] * (len(chain) - 1), LAST]
+    return [search.judged(h.effects, settled(search.problem, h.fit, n, slopes))
+            for h, n in zip(chain, rounds, strict=True)]
 
 
-def _lean(search: Search, effects: Sequence[str]) -> Model:
+def lean(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
-    quick = {e for rung in ladder(search.problem.model)[:-1] for e in rung.model.effects}
-    own = quiet(search.model.having(effects))
-    return search.problem.model if set(own.effects) <= quick else own
+    every, own = whole(model), quiet(model.having(effects))
+    quick = {e for rung in ladder(every)[:-1] for e in rung.model.effects}
+    return every if set(own.effects) <= quick else own
 
 
 def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
@@ -131,23 +135,25 @@ def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float])
     return improved(search.problem, linearised(search.problem, free, x), FIRST)
 
 
-def addable(model: Model, before: Sequence[str], name: str) -> None:
-    """Refuse an effect that cannot join a model with the effects `before`.
+def addable(model: Model, effects: Sequence[str]) -> None:
+    """Refuse effects that cannot all join a model.
 
     Raises:
-        InputError: it is in it already, excludes one that is, or nobody can fit it.
+        InputError: one is in it already, excludes another, or nobody can fit it.
     """
-    entry = CATALOGUE[name]
-    if name not in [e.name for e in offered(model.plant)]:
-        raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
-    present = [*effects_of(model), *before]
-    if name in present:
-        raise InputError("effect", name, f"an effect that is not in the model already (rig remove {name} takes it out)")
-    if not entry.fitted:
-        raise InputError("effect", name, "an effect with parameters to fit; this is noise of the bench")
-    for other in present:
-        if name in CATALOGUE[other].excludes or other in entry.excludes:
-            raise InputError("effect", name, f"{name} or {other} in a model, not both")
+    present = list(effects_of(model))
+    for name in effects:
+        entry = CATALOGUE[name]
+        if name not in [e.name for e in offered(model.plant)]:
+            raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
+        if name in present:
+            raise InputError("effect", name, f"one that is not in the model already (rig remove {name} takes it out)")
+        if not entry.fitted:
+            raise InputError("effect", name, "an effect with parameters to fit; this is noise of the bench")
+        for other in present:
+            if name in CATALOGUE[other].excludes or other in entry.excludes:
+                raise InputError("effect", name, f"{name} or {other} in a model, not both")
+        present.append(name)
 
 
 def _with(search: Search, before: Hypothesis, name: str) -> Hypothesis:

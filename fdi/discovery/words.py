@@ -29,12 +29,12 @@ def amount(value: float, unit: str) -> str:
 def interval(value: float, low: float, high: float, unit: str) -> str:
     """An SI value between two limits, with as many digits as the limits are worth.
 
-    >>> interval(45.01, 44.6, 45.4, "N"), interval(2.2e-5, 2.19e-5, 2.21e-5, "m")
-    ('45.0 N (44.6 .. 45.4)', '22.0 um (21.9 .. 22.1)')
+    >>> interval(45.01, 44.6, 45.4, "N"), interval(2.2e-5, 2.18e-5, 2.22e-5, "m")
+    ('45.0 N (44.6 .. 45.4)', '22.0 um (21.8 .. 22.2)')
     """
     scale, name = _scale(unit, max(abs(value), abs(low), abs(high)))
     half, size = 0.5 * abs(high - low) / scale, max(abs(value), abs(low), abs(high)) / scale
-    wanted = MOST if half == 0.0 else 2 + math.floor(math.log10(size)) - math.floor(math.log10(half)) if size else 1
+    wanted = MOST if half == 0.0 else 1 + math.floor(math.log10(size)) - math.floor(math.log10(half)) if size else 1
     count = min(max(wanted, 2), MOST)
     shown = [_digits(x / scale, count, size) for x in (value, low, high)]
     return f"{shown[0]} {name}".rstrip() + f" ({shown[1]} .. {shown[2]})"
@@ -55,9 +55,8 @@ def _digits(x: float, count: int, size: float | None = None) -> str:
     if x == 0.0 or whole == 0.0:
         return "0"
     place = math.floor(math.log10(whole))
-    if not -4 <= place <= 6:
-        return f"{x:.{count - 1}e}"
-    return f"{x:.{max(0, count - 1 - place)}f}"
+    shown = f"{x:.{max(0, count - 1 - place)}f}" if -4 <= place <= 6 else f"{x:.{count - 1}e}"
+    return shown if float(shown) else shown.lstrip("-")
 
 
 def listed(words: Iterable[str], joined: str = "and") -> str:
@@ -96,7 +95,7 @@ def ratio(value: float) -> str:
 def chance(p: float) -> str:
     """A p-value.
 
-    >>> chance(0.0312), chance(2e-30)
-    ('0.031', '2e-30')
+    >>> chance(0.0312), chance(2e-30), chance(1e-300)
+    ('0.031', '2e-30', '<1e-99')
     """
-    return f"{p:.2g}" if p >= 1e-3 else f"{p:.0e}"
+    return f"{p:.2g}" if p >= 1e-3 else f"{p:.0e}" if p >= 1e-99 else "<1e-99"
