@@ -1,8 +1,10 @@
 """What the documentation says is there, is there; what it shows, works."""
 from __future__ import annotations
 
+import argparse
 import inspect
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -102,3 +104,27 @@ def test_every_link_leads_somewhere() -> None:
     for page in [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+TUTORIAL = ROOT / "docs" / "tutorial.md"
+TYPED = [line for block in blocks(TUTORIAL.read_text()) for line in block.splitlines() if line.startswith("rig ")]
+
+
+def values(args: argparse.Namespace, *names: str) -> list[str]:
+    found = [getattr(args, name, None) for name in names]
+    return [str(word) for value in found for word in (value if isinstance(value, list) else [value] if value else [])]
+
+
+@pytest.mark.parametrize("line", TYPED)
+def test_the_commands_of_the_tutorial_are_accepted(line: str) -> None:
+    cli.parser().parse_args(shlex.split(line)[1:])
+
+
+def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
+    there = {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
+    effects = {"null_bias", "jack_friction", "discovered"}
+    for line in TYPED:
+        args = cli.parser().parse_args(shlex.split(line)[1:])
+        used = values(args, "trace", "words", "repeat", "holdout", "effects", "model", "command_file")
+        assert set(used) - effects - {"eha"} <= there, line
+        there |= set(values(args, "out", "write_effect"))

@@ -1,0 +1,16 @@
+"""What the bench of the tutorial has and no catalogue knows; it makes the data and is used nowhere else."""
+from math import pi, sin
+from typing import Annotated, NamedTuple
+
+from plant.effects import effect
+from plant.quantity import Quantity
+
+
+class Cogging(NamedTuple):
+    force: Annotated[float, Quantity("N", low=0)] = 0.0
+    pitch: Annotated[float, Quantity("m", low=1e-5)] = 0.002
+
+
+@effect("load", Cogging, law="FR = FR + force sin(2 pi XJ / pitch)")
+def cogging(x, s, u, p):
+    return x + p.cogging.force * sin(2 * pi * s.jack_position / p.cogging.pitch)

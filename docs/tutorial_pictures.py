@@ -1,0 +1,77 @@
+"""Make the pictures of the tutorial anew, in the folder where its runs are: python docs/tutorial_pictures.py FOLDER."""
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from fdi import Trace
+from fdi.compare import compare
+from fdi.cycles import readings
+from fdi.discovery import explain, pictures
+from fdi.discovery.ledger import load
+from fdi.discovery.pattern import pattern
+from fdi.discovery.runs import read
+from fdi.figures import STYLE, svg
+from fdi.replay import open_loop, residuals
+from plant import Model
+from plant.effects import load_effects
+
+BLOCK = 36  # rows between two points of a drawing: a page has no more dots
+HERE = Path(__file__).parent / "tutorial"
+SIGNALS = (("xj", "XJ [µm]", 1e6), ("p12", "P12 [bar]", 1e-5), ("xs", "XS [µm]", 1e6))
+
+
+def left_over(run: str, repeat: str, model: Model) -> str:
+    """What the nominal model and `model` leave of each signal of a run, as rig compare replays it."""
+    trace = Trace.read(run)
+    floor = compare(trace, model, [Trace.read(repeat)]).signals
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        axes = figure.subplots(3, 1, sharex=True)
+        models = ((Model(), pictures.BEFORE, "nominal model"), (model, pictures.AFTER, "after rig add"))
+        for which, colour, label in models:
+            cycles = readings(trace, which)[0]
+            rest = residuals(cycles, open_loop(cycles, which))
+            whole = len(cycles) // BLOCK * BLOCK
+            t = np.arange(0, whole, BLOCK) * trace.period
+            for ax, (name, title, scale) in zip(axes, SIGNALS, strict=True):
+                blocks = scale * rest[name][:whole].reshape(-1, BLOCK)
+                ax.fill_between(t, blocks.min(1), blocks.max(1), color=colour, lw=0.4, label=label)
+                ax.set_ylabel(title)
+        for ax, (name, _, scale) in zip(axes, SIGNALS, strict=True):
+            for side in (-2, 2):
+                ax.axhline(side * floor[name].floor.value * scale, color=pictures.FLOOR, lw=0.8, ls=":")
+        axes[0].legend(loc="upper right", ncols=2, frameon=False)
+        axes[-1].set_xlabel("time [s]; dotted: twice the floor")
+        return svg(figure, run)
+
+
+def smaller(text: str) -> str:
+    """The same drawing with one decimal of a point."""
+    return re.sub(r"(\d+\.\d)\d+", r"\1", text)
+
+
+def main(folder: str) -> None:
+    """Residuals and ledgers of both stories, the shape of what the catalogue did not know."""
+    os.chdir(folder)
+    runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
+    found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
+    shape = pictures.shape(pattern(found.search, found.ledger[-1]), runs.est.trace.t)
+    (HERE / "shape.svg").write_text(smaller(shape), encoding="utf-8")
+    load_effects(Path("found.py"))
+    for story, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
+                                     ("second", "cog.csv", "cog2.csv", "cogged.toml")):
+        model, known = load(Path(file))
+        (HERE / f"{story}_left.svg").write_text(smaller(left_over(run, repeat, model)), encoding="utf-8")
+        drawn = pictures.ledger(known.ledger, known.floor or {})
+        (HERE / f"{story}_ledger.svg").write_text(smaller(drawn), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
