@@ -101,10 +101,15 @@ def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: 
 def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Record | None) -> bool:
     """Whether the last effect is a way to go on: it takes a fair part of what was left, on the held-out run as well."""
     before, after = levels[-2][0], levels[-1][0]
-    noise = float(np.isfinite(search.problem.record.measured).sum())
-    if before.cost - after.cost < FAIR * (before.cost - noise):
+    if not _fair(search, before, after):
         return False
     return holdout is None or _improves(search, before, after, holdout)
+
+
+def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
+    """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
+    noise = float(np.isfinite(search.problem.record.measured).sum())
+    return before.cost - after.cost >= FAIR * (before.cost - noise)
 
 
 def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Record) -> bool:
@@ -136,7 +141,9 @@ def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
                holdout: Record | None) -> Explanation:
     search.refine(FINE)
-    depth = max((i for i in range(1, len(levels)) if _significant(levels[i - 1][0], levels[i][0])), default=0)
+    firsts = [level[0] for level in levels]
+    depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
+                 and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
         depth = 1
     base = search.again(levels[0][0], 4)
