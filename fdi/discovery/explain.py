@@ -92,7 +92,9 @@ def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: 
             tried = sorted((search.again(h) for h in tried[:4]), key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.without(search.again(base), tried[:1])]
         levels.append(tried)
-        if tried[0].reached or not _significant(levels[-2][0], tried[0]) or not _way(search, levels, holdout):
+        if tried[0].reached or not _significant(levels[-2][0], tried[0]):
+            break
+        if count > 1 and not _way(search, levels, holdout):  # two large effects each help little alone
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
