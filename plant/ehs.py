@@ -1,8 +1,7 @@
 """An electro-hydrostatic position servo: a motor turns a pump, the pump moves a ram that presses against a load.
 
-Nominal is the bare integrator, a ram as fast as the pump delivers; what else there is, `rig explain` has to find.
-Rig and data: github.com/ivliev123/Electro-Hydraulic-Actuator, 4_ANALIZE_DATA/DATA_Experiment_Processed, 1 kHz. "raw" is
-the unit of its motor speed, which its authors do not state.
+Nominal is the bare integrator, a ram as fast as the pump delivers; what else there is, `rig explain` has to find. Rig
+and data: github.com/ivliev123/Electro-Hydraulic-Actuator; "raw" is the unit of its motor speed, not stated there.
 """
 from collections import namedtuple
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ SEALED = 1e-16  # m3/s/Pa, no leak to speak of: so pressure has an answer even w
 class Pump(NamedTuple):
     """The pump, and the valve that gives its flow to one chamber and the other chamber to the tank."""
 
-    displacement: Annotated[float, Quantity("m3/s/raw", "D", low=1e-10, high=1e-6, tolerance=0.1)]
+    displacement: Annotated[float, Quantity("m3/s/raw", "D", low=1e-10, high=1e-6)]
     area_ratio: Annotated[float, Quantity("1", low=0.1, high=2)]  # that the flow meets, backwards over forwards
     drain: Annotated[float, Quantity("s", low=1e-3, high=10)]  # time constant of a chamber that is given to the tank
 
@@ -49,7 +48,7 @@ def step(s: State, u: Input, p: Any, k: Any) -> State:
     before = State(0.0, 0.0, 0.0, 0.0, s.jack_position, s.jack_speed, held, s.sensed, m)
     pump = Line(r * k.gain * w, r * r * k.valve_slope, p.supply.pressure, 0.0)
     line, m_valve = at_valve(pump, m.valve, before, u, p)
-    x, v, p12, m_load, m_drag = jack(s, u, p, k, line)
+    x, v, p12, m_load, m_drag = jack(s, u, p, k, line, 0.0)
     sensed, m_position = at_position(x, m.position, State(0.0, 0.0, 0.0, 0.0, x, v, p12, s.sensed, m), u, p)
     return State(0.0, 0.0, 0.0, 0.0, x, v, p12, sensed, Ports(
         m.command, m_current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m_valve, m_load,
@@ -72,9 +71,10 @@ PLANT = Plant(
     {"controller.proportional_gain": 4e5, "controller.current_limit": 3e3, "controller.period": 1e-3,
      "pump.displacement": 2.3e-8, "pump.area_ratio": 1.0, "pump.drain": 0.05, "supply.pressure": 1e7,
      "jack.area": AREA, "jack.mass": 20.0, "jack.travel": 0.1, "sensors.position_noise": 1e-6,
-     "sensors.pressure_noise": 2e4, "sensors.spool_noise": 1e-6, "quantisation.lsb": 2.5e-5,
+     "sensors.pressure_noise": 1e5, "sensors.spool_noise": 1e-6, "quantisation.lsb": 2.5e-5,
      "compressibility.volume": 6e-3},  # m3, of oil between pump and ram, with its hoses
-    has=("quantisation",), controller=False, table=Table(skip=60, separator=";", load=tare, columns={
+    has=("quantisation",), lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
+    controller=False, scatter={"pump.displacement": 0.1}, table=Table(skip=60, separator=";", load=tare, columns={
         "t": (Term("EXP_Time"),), "com": (Term("EXP_PosRef", 1e-3),), "xj": (Term("EXP_PosFb", 1e-3),),
         "cor": (Term("EXP_Velocity"),),  # the pressures are means of 20 and 60 rows, here put back by half of that
         "p12": (Term("EXP_Pressure_A", 1e5, 10), Term("EXP_Pressure_B", -ROD * 1e5, 30))}))

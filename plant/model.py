@@ -213,6 +213,6 @@ def bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function
     ports["pack"], ports["unpack"] = flat.packers(initial(effects))
     if any(CATALOGUE[e].port in ("supply", "viscosity") for e in effects):
         ports["oiled"] = step_module.changing_oil
-    if any(CATALOGUE[e].port in ("valve", "jack_drag") for e in effects):
+    if kind.step is not step_module.step or any(CATALOGUE[e].port in ("valve", "jack_drag") for e in effects):
         ports["yielding"] = step_module.as_resisted
     return ports

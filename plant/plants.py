@@ -19,6 +19,7 @@ from plant.compile import Function, called
 from plant.effects import Effect
 from plant.errors import InputError
 from plant.parameters import GROUPS, nominal
+from plant.quantity import Quantity
 
 Array = NDArray[np.float64]
 MODULES = {"ehs": "plant.ehs"}  # plants beside the reference model; read when first named
@@ -61,6 +62,8 @@ class Plant:
     groups: Mapping[str, type[Any]]  # its parameters
     given: Mapping[str, float]  # their values, 0 if not given; and what is not as usual here of effects' parameters
     has: tuple[str, ...] = ()  # effects of the nominal model
+    lacks: tuple[str, ...] = ()  # effects that cannot be
+    scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their groups say
     controller: bool = True  # the controller is known, so that Cor can be held against com and XJ
     table: Table | None = field(default=None, repr=False)
 
@@ -70,6 +73,12 @@ class Plant:
         zero = {f"{group}.{name}": 0.0 for group, cls in self.groups.items() for name in cls._fields}
         return {**zero, **self.given}
 
+    def tolerance(self, name: str, q: Quantity) -> float:
+        """How far a parameter of one unit differs from another's, a fraction; what is not there does not scatter."""
+        if self.nominal.get(name) == 0.0:
+            return 0.0
+        return q.tolerance if self.scatter is None else self.scatter.get(name, 0.0)
+
     @cached_property
     def ports(self) -> frozenset[str]:
         """Where effects can act: the ports that its step calls, and those of the sampled loop around it."""
@@ -78,7 +87,7 @@ class Plant:
 
     def offers(self, e: Effect) -> bool:
         """Whether an effect makes sense here: its port or its parameters are there, and its input has this unit."""
-        if e.plant not in ("", self.name):
+        if e.plant not in ("", self.name) or e.name in self.lacks:
             return False
         if e.base:
             return all(name in self.nominal for name in e.fitted)

@@ -182,10 +182,11 @@ def as_resisted(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tu
 yielding = as_ever
 
 
-def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line) -> tuple[float, float, float, Memory, Memory]:
-    """The ram: XJ, XJ', P12, memory of the load and of the drag."""
+def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line,
+         given: float) -> tuple[float, float, float, Memory, Memory]:
+    """The ram against a `given` load, N: XJ, XJ', P12, memory of the load and of the drag."""
     g, h, v0 = p.jack, u.h, s.jack_speed
-    load, m_load = at_load(u.load, s.memory.load, s, u, p)
+    load, m_load = at_load(given, s.memory.load, s, u, p)
     drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
     push = h * g.area
     free, coupled = yielding(k, drag, line, p, h)
@@ -202,7 +203,7 @@ def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
     xf, vf, m_current, m_feedback = flapper(s, u, p, k)
     xs, vs, m_nozzle, m_force = spool(s, u, p, k, xf)
     line, m_metering, m_valve = metering(s, u, p, k, xs)
-    xj, vj, p12, m_load, m_drag = jack(s, u, p, k, line)
+    xj, vj, p12, m_load, m_drag = jack(s, u, p, k, line, u.load)
     m = s.memory
     now = State(xf, vf, xs, vs, xj, vj, p12, s.sensed, m)  # the transducer feels the end of the step
     sensed, m_position = at_position(xj, m.position, now, u, p)

@@ -46,8 +46,8 @@ def tolerances(model: Model) -> tuple[Free, ...]:
     free = []
     for name, value in model.values.items():
         q = meaning(name, plant=model.plant)
-        if q.tolerance > 0.0 and usual.get(name, value) != 0.0:  # what is not there does not scatter
-            scale = q.tolerance * (abs(usual.get(name, value)) or 1.0)
+        if (tolerance := model.kind.tolerance(name, q)) > 0.0:
+            scale = tolerance * (abs(usual.get(name, value)) or 1.0)
             low, high = value - FURTHEST * scale, value + FURTHEST * scale
             free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
     return tuple(free)

@@ -155,7 +155,7 @@ def slope(fit: Fit) -> Slope:
 def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str]) -> tuple[float, Floats]:
     """Cost of a whitened residual (s, n) after the fit's unknowns, but for those `held`, have shifted linearly.
 
-    Twice, as what can be fitted is known only after the first time.
+    Twice, as what can be fitted is known only after the first time; not at all where that is worse than to stay.
     """
     move = np.array([f.name not in held for f in fit.free])
     prior = np.where(move, s.prior, 1e30)  # what is held does not move
@@ -167,4 +167,5 @@ def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str]) -> tuple[float, 
         gradient = heavy @ few + s.prior * fit.x * move
         x = np.where(move, np.clip(fit.x - cho_solve(cho_factor(hessian), gradient), s.low, s.high), fit.x)
         left = white + ((x - fit.x) @ s.whole).reshape(white.shape)
-    return float(misfit(left[None])[0] + (x * move) ** 2 @ s.prior), x
+    costs = misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, fit.x)]
+    return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), fit.x)
