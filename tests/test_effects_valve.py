@@ -160,7 +160,7 @@ def _moved(s, spool, load, record, h, out):
     for i in range(len(spool)):
         u = Input(0.0, load[i], 0.0, i * h, 0.0, h)
         line, a, b = metering(s, u, p, k, spool[i])
-        x, v, p12, c, d = ram(s, u, p, k, line)
+        x, v, p12, c, d = ram(s, u, p, k, line, load[i])
         m = s.memory
         s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x, Ports(
             m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, a, b, c, d, m.position,
