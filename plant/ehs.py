@@ -69,7 +69,7 @@ PLANT = Plant(
     {"controller": in_unit(GROUPS["controller"], "A", "raw", 1e6), "pump": Pump, **{
         name: GROUPS[name] for name in ("supply", "jack", "sensors")}},
     {"controller.proportional_gain": 4e5, "controller.current_limit": 3e3, "controller.period": 1e-3,
-     "pump.displacement": 2.3e-8, "pump.area_ratio": 1.0, "pump.drain": 0.05, "supply.pressure": 1e7,
+     "pump.displacement": 2.3e-8, "pump.area_ratio": 1.0, "pump.drain": 0.2, "supply.pressure": 1e7,
      "jack.area": AREA, "jack.mass": 20.0, "jack.travel": 0.1, "sensors.position_noise": 1e-6,
      "sensors.pressure_noise": 1e5, "sensors.spool_noise": 1e-6, "quantisation.lsb": 2.5e-5,
      "compressibility.volume": 6e-3},  # m3, of oil between pump and ram, with its hoses
