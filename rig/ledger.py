@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.discovery import ledger
-from fdi.discovery.answer import NORMAL, Suspicious, Value, fitted, friction_sorted, suspicious
+from fdi.discovery.answer import NORMAL, ROUGH, Suspicious, Value, fitted, friction_sorted, suspicious
 from fdi.discovery.ledger import Provenance, Row
 from fdi.discovery.refit import Refit, model_of, refit
 from fdi.discovery.runs import Runs
@@ -148,7 +148,7 @@ def _intervals(done: Done) -> dict[str, Value]:
         return {}
     fit = done.refit.last.hypothesis.fit
     values = friction_sorted(fit.values)
-    halves = {f.name: NORMAL * fit.spread(f.name) for f in fit.free}
+    halves = {f.name: NORMAL * ROUGH * fit.spread(f.name) for f in fit.free}
     return {name: Value(v, v - halves[name], v + halves[name], "") for name, v in values.items()} | dict(done.effects)
 
 
