@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 SPEED_WINDOW, ACCELERATION_WINDOW = 15, 31  # samples of the smoothing polynomials; a millisecond apart at 1 kHz
 EDGE = 50  # samples at both ends that smoothing knows one side of only
 DRAWS = 4  # simulated runs without anything missing
+UNITS = {"force": "N", "flow": "m3/s", "current": "A"}
 
 
 class Balance(NamedTuple):
@@ -66,7 +67,7 @@ def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
     noisy = [_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, record.load, values,
                     problem.model.values["controller.period"]) for _ in range(DRAWS)]
     found = []
-    for place, unit in (("force", "N"), ("flow", "m3/s"), ("current", "A")):
+    for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
         missing = seen[place] - own[place]
         noise = float(np.sqrt(np.mean([_square(n[place] - own[place]) for n in noisy])))
         rms = float(np.sqrt(_square(missing)))
@@ -89,16 +90,25 @@ def _speed(x: Floats, period: float) -> Floats:
 
 
 def _terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float) -> dict[str, Floats]:
-    """Left side minus right side of the three equations of motion (physics of the reference model), from (3, n)."""
+    """Left side minus right side of the equations of motion (of the reference model, or of a pump), from (3, n)."""
     x, p12, xs = signals
     v = _speed(x, period)
     a = savgol_filter(x, ACCELERATION_WINDOW, 3, deriv=2, delta=period)
     smooth = savgol_filter(p12, ACCELERATION_WINDOW, 3)
     sliding = np.clip(v / 2e-4, -1.0, 1.0) * p["jack.dynamic_friction"]
     force = p["jack.area"] * smooth - p["jack.damping"] * v - load - sliding - p["jack.mass"] * a
+    if "pump.displacement" in p:
+        return {"force": force, "flow": _pumped(current, v, savgol_filter(p12, SPEED_WINDOW, 3), p)}
     spool = savgol_filter(xs, SPEED_WINDOW, 3)
     conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
     flow = p["valve.flow_gain"] * spool - conductance * savgol_filter(p12, SPEED_WINDOW, 3) - p["jack.area"] * v
     flapper = p["spool.end_area"] * _speed(xs, period) / p["pilot.flow_gain"]
     torque = p["flapper.stiffness"] * flapper + p["feedback_spring.stiffness"] * spool
     return {"force": force, "flow": flow, "current": current - torque / p["torque_motor.gain"]}
+
+
+def _pumped(speed: Floats, v: Floats, p12: Floats, p: Mapping[str, float]) -> Floats:
+    """Flow that a pump at motor `speed` (n,) delivers and the jack does not take, m3/s."""
+    area = p["jack.area"] * np.where(speed < 0.0, p["pump.area_ratio"], 1.0)
+    left: Floats = p["pump.displacement"] * speed - area * v - p["jack.leakage"] * p12
+    return left

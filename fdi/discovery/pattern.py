@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lombscargle
 
-from fdi.discovery.balance import EDGE, balances
+from fdi.discovery.balance import EDGE, Balance, States, balances
 from fdi.discovery.search import Hypothesis, Search
 from fdi.output import write_text
 
@@ -29,6 +29,7 @@ STATES = {"position": ("m", "s.jack_position"), "speed": ("m/s", "s.jack_speed")
           "spool": ("m", "s.spool_position"), "current": ("A", "u.current"), "time": ("s", "u.t")}
 PORTS = {"force": ("load", "x + {0}"), "flow": ("metering", "x - ({0}) / p.valve.flow_gain"),
          "current": ("current", "x - ({0})")}
+PUMPED = ("current", "x - ({0}) / p.pump.displacement")  # a flow, where a pump delivers it
 
 
 class Pattern(NamedTuple):
@@ -44,6 +45,7 @@ class Pattern(NamedTuple):
     doubt: Floats  # (k,) standard error of the height
     wave: tuple[float, float, float] | None  # amplitude, length in m or s, phase rad
     trace: Floats  # (n,) what is missing, over time
+    port: tuple[str, str] = PORTS["force"]  # where an effect puts it in, and how
 
     def __str__(self) -> str:
         """In words."""
@@ -68,12 +70,16 @@ def _described(p: Pattern) -> str:
 def pattern(search: Search, h: Hypothesis) -> Pattern:
     """The shape of what a hypothesis leaves unexplained."""
     found, states = balances(search, h)
-    best = found[0]
+    pumped = found[0].place == "flow" and "pump.displacement" in search.problem.model.values
+    return _shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
+
+
+def _shape(best: Balance, states: States) -> Pattern:
     if best.ratio < VISIBLE:
         none = np.empty(0)
         return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
     missing = best.missing[EDGE:-EDGE]
-    seen = {name: getattr(states, name)[EDGE:-EDGE] for name in CAUSES[best.place]}
+    seen = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
     curves = {name: curve(missing, x, best.noise) for name, x in seen.items()}
     name = max(curves, key=lambda n: curves[n][0])
     share, at, height, doubt = curves[name]
@@ -134,7 +140,7 @@ def write_effect(p: Pattern, path: str | Path, name: str = "discovered") -> None
     Raises:
         InputError: a place that cannot be written.
     """
-    port, law = PORTS[p.place or "force"]
+    port, law = p.port
     unit = p.unit or "N"
     if p.wave:
         over, variable = STATES[p.state]
