@@ -118,7 +118,9 @@ def _chosen(trace: Trace, signals: Sequence[str] | None, where: object) -> tuple
 
 
 def _believable(trace: Trace, model: Model, chosen: Sequence[str], where: object) -> None:
-    """Refuse other units and dead sensors."""
+    """Refuse another plant's recordings, other units and dead sensors."""
+    if trace.provenance.get("plant", model.plant) != model.plant:
+        raise InputError(where, "--model", f"{trace.provenance['plant']}, whose rig recorded this, not {model.plant}")
     if trace.period > 50 * model["controller.period"]:
         raise InputError(where, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for name, unit, factor, limit in RANGES:

@@ -10,7 +10,7 @@ from plant import InputError, Model, load_model
 def add_model(parser: argparse.ArgumentParser) -> None:
     """--model, --set, --seed, --effects: which plant to run."""
     add = parser.add_argument
-    add("--model", metavar="FILE|NAME", help="model file, or eha for the nominal actuator (default)")
+    add("--model", metavar="FILE|NAME", help="model file, or a nominal plant: eha (default), ehs (a pump-driven servo)")
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
         help="change a parameter of the model or of an effect, SI units (repeatable)")
     add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")

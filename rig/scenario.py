@@ -32,8 +32,9 @@ class Scenario(NamedTuple):
         """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load.
 
         Raises:
-            InputError: a fault that contradicts this model's parameters.
+            InputError: a fault that contradicts this model's parameters, or a plant that this bus does not speak of.
         """
+        require_servovalve(model)
         require_sensible(plan, model)
         counts = [0] * plan.start + np.rint(load / FORCE).astype(int).tolist()
         return cls(model.having(_touched(plan)), plan, tuple(counts), seed)
@@ -78,6 +79,12 @@ class Scenario(NamedTuple):
             raise
         except Exception as error:  # anybody may send anything
             raise InputError(WHERE, "", f"compressed JSON of a scenario ({type(error).__name__}: {error})") from error
+
+
+def require_servovalve(model: Model) -> None:
+    """Refuse a plant that the bench's bus has no words for: what is sent to it is the current of a servovalve."""
+    if model.plant != "eha":
+        raise InputError("--model", model.name, "a model of eha; the bench drives a servovalve")
 
 
 def _touched(plan: Plan) -> set[str]:

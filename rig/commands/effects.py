@@ -19,6 +19,7 @@ HELP = "list the catalogue of physical effects, or tell about one"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     parser.add_argument("name", nargs="?", metavar="NAME", help="one effect; without it the whole catalogue")
+    parser.add_argument("--model", metavar="FILE|NAME", default="eha", help="of which plant (default eha)")
     parser.add_argument("--effects", action="append", default=[], type=_path, metavar="FILE.py",
                         help="your own effects (repeatable); told about one of them, it is tried as well")
     parser.add_argument("--test", action="store_true",
@@ -33,15 +34,15 @@ def _path(text: str) -> Path:
 
 def run(args: argparse.Namespace) -> int:
     """List the catalogue of effects, or tell about one of them."""
-    from plant.effects import CATALOGUE
-    from plant.model import entry
+    from plant.model import entry, load_model, offered
 
     options.load_user_effects(args.effects)
-    chosen = [entry(args.name)] if args.name else list(CATALOGUE.values())
+    plant = load_model(args.model).plant
+    chosen = [entry(args.name, plant)] if args.name else offered(plant)
     own = {file.absolute() for file in args.effects}
     tried = chosen if args.test or (args.name and chosen[0].file in own) else []
     reports = {e.name: _tried(e) for e in tried}
-    rows = [describe(e) | ({"self_test": _rows(reports[e.name])} if e.name in reports else {}) for e in chosen]
+    rows = [describe(e, plant) | ({"self_test": _rows(reports[e.name])} if e.name in reports else {}) for e in chosen]
     text = json.dumps({"effects": rows}, indent=None if args.json else 1)
     if args.out:
         from fdi.output import write_text
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(text)
     elif not args.quiet:
-        tell(chosen[0]) if args.name else table(chosen)
+        tell(chosen[0], plant) if args.name else table(chosen)
         for report in reports.values():
             tell_report(report)
     return int(any(report.faults for report in reports.values()))
@@ -63,11 +64,11 @@ def _tried(e: Effect) -> Report:
     return examine(e.name, load_sequence("preflight").main_profile().command)
 
 
-def describe(e: Effect) -> dict[str, Any]:
+def describe(e: Effect, plant: str = "eha") -> dict[str, Any]:
     """An effect for machines: parameters with unit, off value and allowed range in words."""
-    from plant.parameters import nominal
+    from plant.plants import find
 
-    base = nominal()
+    base = find(plant).nominal
     parameters = {name: {"unit": q.unit, "off": e.off.get(name, base.get(name)), "expected": q.expected,
                          "typical": q.typical, "fitted": name in e.fitted} for name, q in e.parameters.items()}
     return {"effect": e.name, "port": e.port, "in_reference_model": e.base, "in_firmware": e.firmware, "law": e.law,
@@ -97,7 +98,7 @@ def table(chosen: list[Effect]) -> None:
               "their own group); [bold]rig effects EFFECT[/] tells its law.", highlight=False)
 
 
-def tell(e: Effect) -> None:
+def tell(e: Effect, plant: str = "eha") -> None:
     """One effect at length."""
     from rich.markup import escape
     from rich.table import Table
@@ -109,7 +110,7 @@ def tell(e: Effect) -> None:
     port = f"{e.port} ({getattr(UNITS, e.port)})" if e.port else "the reference model itself"
     rows = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
             ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
-    for name, p in describe(e)["parameters"].items():
+    for name, p in describe(e, plant)["parameters"].items():
         words = [p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
                  "" if p["fitted"] else "not fitted"]
         rows.append(("parameter", f"{name} in {p['unit']}: {'; '.join(filter(None, words))}"))

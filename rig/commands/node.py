@@ -65,10 +65,11 @@ def maker(args: argparse.Namespace) -> Callable[[Send], Node]:
     """What builds the node that the options describe."""
     from rig.emulator import Emulator
     from rig.firmware import Firmware, gains_of
-    from rig.scenario import Scenario
+    from rig.scenario import Scenario, require_servovalve
     from rig.sequences.faults import Plan
 
     model = options.model_of(args)
+    require_servovalve(model)
     if args.node == "plant":
         return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
     return lambda send: Firmware(send, gains_of(model), model)
