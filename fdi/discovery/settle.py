@@ -51,7 +51,7 @@ def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats,
     near = slopes.whitened(slopes.residuals(free, np.vstack([x, x + moves])))
     residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
-    flat = np.linalg.lstsq(moves, (near[1:] - near[0]).reshape(len(x), -1), rcond=None)[0]
+    flat = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
     prior = np.diag([f.prior**-2 for f in free])
     heavy = (flat.reshape(len(x), *white[0].shape) * weights(white[0])).reshape(len(x), -1)
     held = float(misfit(white)[0])
