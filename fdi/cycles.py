@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fdi.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
+from plant.plants import MODULES
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -119,8 +120,9 @@ def _chosen(trace: Trace, signals: Sequence[str] | None, where: object) -> tuple
 
 def _believable(trace: Trace, model: Model, chosen: Sequence[str], where: object) -> None:
     """Refuse another plant's recordings, other units and dead sensors."""
-    if trace.provenance.get("plant", model.plant) != model.plant:
-        raise InputError(where, "--model", f"{trace.provenance['plant']}, whose rig recorded this, not {model.plant}")
+    recorded = trace.provenance.get("plant", "")
+    if recorded in MODULES and recorded != model.plant:
+        raise InputError(where, "--model", f"{recorded}, whose rig recorded this, not {model.plant}")
     if trace.period > 50 * model["controller.period"]:
         raise InputError(where, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for name, unit, factor, limit in RANGES:

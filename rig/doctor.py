@@ -78,7 +78,8 @@ def python() -> Iterator[Finding]:
     version = f"{platform.python_implementation()} {platform.python_version()}"
     new_enough = sys.version_info >= (3, 11)
     yield _finding("python", "Python", version if new_enough else "", "runs everything", "Python 3.11 or newer", True)
-    extras = {"": "the bench", "view": "the rerun viewer", "dev": "the tests"}
+    extras = {"": "the bench", "view": "the rerun viewer", "dev": "the tests", "fleet": "rig campaign",
+              "learn": "comparators of rig fdi", "bench": "rivals of rig bench"}
     for extra, names in requirements().items():
         found = versions(names)
         absent = [name for name, installed in found.items() if not installed]

@@ -229,7 +229,7 @@ def test_each_dependency_is_explained() -> None:
 def test_each_import_is_declared() -> None:
     """What another package happens to bring along today may be gone tomorrow."""
     distributions = {"can": "python-can", "mcap_protobuf": "mcap-protobuf-support", "google": "protobuf",
-                     "rerun": "rerun-sdk", "llvmlite": "numba"}  # numba pins llvmlite itself
+                     "rerun": "rerun-sdk", "llvmlite": "numba", "sklearn": "scikit-learn"}  # numba pins llvmlite itself
     named = {re.split("[<>=]", line)[0] for line in requirements()}
     for path in MODULES:
         for module in {module.partition(".")[0] for module in imported(path)}:
