@@ -1,1 +1,1 @@
-"""How healthy the servovalve is: bands, precursors, grid and refined size of two faults, from one captured preflight."""
+"""How healthy the servovalve is: bands, precursors, grid and refined sizes of two faults, from one captured test."""
