@@ -46,7 +46,7 @@ def draws(seed: int) -> Iterator[list[float]]:
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
-             fast: bool = True) -> Columns:
+             fast: bool = True, drawn: Array | None = None) -> Columns:
     """The model with its own controller over a command.
 
     Args:
@@ -56,6 +56,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         seed: of the noise.
         steps: steps a cycle.
         fast: compiled; False runs the same source in plain Python.
+        drawn: (n, NOISES) random numbers in place of those of `seed`: noise that is not white.
 
     Raises:
         InputError: an empty command, or a load of another length.
@@ -68,7 +69,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     record = model.record()
     with laws(model):
         run = kernel("closed_loop", model.effects, fast, model.plant)
-        run(model.state(), com, force, noise(seed, len(com)), record, steps, out)
+        run(model.state(), com, force, noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)

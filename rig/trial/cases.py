@@ -65,13 +65,18 @@ def draw(seed: int, kind: str | None = None, effects: Sequence[str] = (), level:
     drawn = _level(rng)
     quality = LEVELS[level] if level else drawn
     signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
-    plant = {symbol: nominal_symbols()[symbol] * (1 + quality.scatter * rng.standard_normal()) for symbol in SCATTERED}
+    plant = scattered(quality.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
     found = tuple(hidden.draw(name, nominal_symbols() | plant, rng, low, sizes[1])
                   for name in effects or _names(kind, rng))
     needed = max((effect.known_load for effect in found), default=0.0)
     chance = float(rng.uniform(2000, 8000)) if rng.random() < LOADED and quality.scatter > 0 else 0.0
     return Case(seed, kind, found, signals, quality, plant, needed or chance)
+
+
+def scattered(spread: float, rng: np.random.Generator) -> dict[str, float]:
+    """The symbols of a healthy plant, each off its nominal value by the standard deviation `spread`, relative."""
+    return {symbol: nominal_symbols()[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED}
 
 
 def _level(rng: np.random.Generator) -> Level:
@@ -114,12 +119,12 @@ def measure(case: Case, name: str) -> Measured:
     rng = np.random.default_rng([case.seed, 5, turn])
     com = np.round(command.holdout(rng) if name == "holdout" else command.preflight(), 12)
     n = len(com)
-    noise = {"xj": _coloured(n, case.level, rng)} | {s: FLOORS[s] * rng.standard_normal(n) for s in ("p12", "xs")}
+    noise = {"xj": coloured(n, case.level, rng)} | {s: FLOORS[s] * rng.standard_normal(n) for s in ("p12", "xs")}
     run = simulate(com, symbols(case), noise["xj"], command.known_load(n, case.load))
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
 
 
-def _coloured(n: int, level: Level, rng: np.random.Generator) -> Array:
+def coloured(n: int, level: Level, rng: np.random.Generator) -> Array:
     """Noise of the position sensor, (n,) m: first order, of the floor's RMS, and hum."""
     white, colour = FLOORS["xj"] * rng.standard_normal(n), level.colour
     out, last = np.empty(n), float(white[0])
