@@ -2,13 +2,19 @@
 
 The datagrams are those of python-can's `udp_multicast`. Its own bus listens on every interface, sends by the default
 route, needs one to exist at all, and hears its own frames; here the group is joined on 127.0.0.1, sent to from there
-with a TTL of 0, and a bus does not hear itself, as on a real one.
+with a TTL of 0, and a bus does not hear itself, as on a real one. All nodes hear all frames in one order, as on a real
+one too: the kernel hands a datagram to one socket after the other, so a node that heard it early could answer before the
+others have it. A lock between the processes keeps the next frame back until this one is everywhere.
 """
 from __future__ import annotations
 
+import fcntl
 import select
 import socket
 import struct
+import tempfile
+from pathlib import Path
+from typing import IO
 
 import can
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
@@ -45,6 +51,7 @@ class LoopbackBus(can.BusABC):
             self._tx.close()
             raise can.CanInitializationError(f"{group}: {error.strerror}") from error
         self._own = self._tx.getsockname()
+        self._turn = _lock(f"eha-rig-{group}-{port}.lock")
         super().__init__(channel=group)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -59,8 +66,13 @@ class LoopbackBus(can.BusABC):
         return None, False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        data = pack_message(msg)
         try:
-            self._tx.sendto(pack_message(msg), self._destination)
+            fcntl.flock(self._turn, fcntl.LOCK_EX)
+            try:
+                self._tx.sendto(data, self._destination)
+            finally:
+                fcntl.flock(self._turn, fcntl.LOCK_UN)
         except OSError as error:
             raise can.CanOperationError(f"{self.channel_info}: {error.strerror}") from error
 
@@ -71,6 +83,15 @@ class LoopbackBus(can.BusABC):
         super().shutdown()
         self._rx.close()
         self._tx.close()
+        self._turn.close()
+
+
+def _lock(name: str) -> IO[bytes]:
+    """A file of this name that processes of all users may lock."""
+    path = Path(tempfile.gettempdir()) / name
+    if not path.exists():
+        path.touch(0o444)
+    return path.open("rb")
 
 
 def _message(data: bytes) -> can.Message:

@@ -74,7 +74,7 @@ def test_processes_on_a_bus_give_the_same_signals(tmp_path: Path, reference: np.
     where = spec("udp_multicast")
     outcome = play(job(seed=1, bus=where), tmp_path / "b")
     assert (outcome.verdict, outcome.aborted, set(outcome.counters.values())) == ("PASS", "", {0})
-    assert np.array_equal(columns(tmp_path / "b"), reference)
+    assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
     assert nodes_on(where) == []
 
 
@@ -156,4 +156,4 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, r
             node.send_signal(signal.SIGTERM)
         said = [finished(node) for node in nodes]
     assert outcome.verdict == "PASS" and [one.status for one in said] == [0, 0]
-    assert np.array_equal(columns(tmp_path / "b"), reference)
+    assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
