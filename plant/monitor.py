@@ -1,0 +1,264 @@
+"""The monitoring model (Fig. 6 of the paper): what is left of the actuator when only two faults are asked for.
+
+    XF = clip((GM Cor - KSF XS)/KF, +-XFM)     XS' = GQF1/ASV deadzone(XF, FSS/(GPF1 ASV)), |XS| <= XSM
+    P12 = clip(GP XS - GP/GQ AJ XJ', +-PSR)    MJ XJ'' = AJ P12 - CJ XJ', |XJ| <= XJM
+
+A static flapper, a spool without mass, a jack without dry friction, leakage, load or noise. The current is held over a
+cycle, so XS has a closed form: a straight line while the flapper is at its stop, then an exponential with the pilot
+loop's Kv = KSF GQF1/(KF ASV). The ram lags behind it by MJ/(AJ^2 GP/GQ + CJ), 22 us. One step makes a cycle, where the
+reference model takes 20 to 100. Many runs stand side by side, as in `plant.block`.
+"""
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from math import exp
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.compile import Function, compiled
+from plant.controller import Loop, answer
+from plant.errors import InputError
+from plant.flat import lane_packers
+from plant.friction import clip, soften
+from plant.model import Model
+from plant.parameters import Controller
+
+Array = NDArray[np.float64]
+
+FAULTS = ("filter.clogging", "spool.static_friction")
+WIDTH = 16  # runs side by side
+FEWEST = 1e-300  # stands for no speed at all, where something is divided by it
+
+
+class Cell(NamedTuple):
+    """What a step of `h` s needs of the parameters of one run."""
+
+    tilt: float  # GM/KF, flapper displacement by current, m/A
+    back: float  # KSF/KF, by the spool's
+    unback: float  # 1 over it
+    dead: float  # FSS/(GPF1 ASV), flapper displacement at which the spool breaks away, m
+    slide: float  # the same of a spool that slides, m
+    most: float  # XFM less the latter, m
+    speed: float  # GQF1/ASV, spool speed by flapper displacement, 1/s
+    rate: float  # Kv, 1/s
+    unrate: float  # 1/Kv, s
+    wait: float  # 1 over the speed at which the spool takes back flapper displacement at the stop, s/m
+    spool_travel: float  # XSM, m
+    follow: float  # ram speed by spool displacement in a steady state, 1/s
+    lag: float  # of the ram behind it, s
+    fade: float  # exp(-h/lag)
+    push: float  # h AJ PSR/(MJ + h CJ), the most that the ram's speed can gain, m/s
+    coast: float  # MJ/(MJ + h CJ)
+    jack_travel: float  # XJM, m
+    pressure_gain: float  # GP, Pa/m
+    pressure_slope: float  # GP AJ/GQ, Pa s/m
+    pressure_limit: float  # PSR, Pa
+
+
+class Motion(NamedTuple):
+    """The monitor at one instant."""
+
+    spool: float = 0.0  # XS, m
+    position: float = 0.0  # XJ, m
+    speed: float = 0.0  # XJ', m/s
+    sliding: float = 0.0  # which way the spool slides: -1, 1, or 0 for stuck
+
+
+class Drive(NamedTuple):
+    """Current, A: in this cycle, and the controller's answer for the next."""
+
+    now: float = 0.0
+    next: float = 0.0
+
+
+def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
+    """The monitor `h` seconds later, the current held.
+
+    Exact, but for the step in which the spool meets its stop or P12 its limit, and for the bend of XS within the lag.
+    """
+    tilt = c.tilt * current - c.back * s.spool
+    asked = soften(tilt, c.slide)  # through the dead zone; from here on it only falls
+    asked = asked if asked * s.sliding > 0.0 or abs(tilt) > c.dead else 0.0
+    begin = clip(asked, c.most)
+    wait = abs(asked - begin) * c.wait  # s, the flapper at its stop
+    wait = wait if wait < h else h
+    end = begin * exp(c.rate * (wait - h))
+    line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
+    spool = clip(s.spool + line + curve, c.spool_travel)
+    area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
+    mean = clip(s.spool + area / h, c.spool_travel)
+    before = s.spool - c.lag * c.speed * begin
+    free = c.follow * (spool - c.lag * c.speed * end) + (s.speed - c.follow * before) * c.fade
+    low, high = c.coast * s.speed - c.push, c.coast * s.speed + c.push  # P12 is no more than PSR
+    v = free if free > low else low
+    v = v if v < high else high
+    way = h * c.follow * mean - c.lag * (v - s.speed) if v == free else 0.5 * h * (s.speed + v)
+    x = s.position + way
+    sliding = 1.0 if asked > 0.0 else 0.0
+    sliding = sliding if asked >= 0.0 else -1.0
+    return Motion(spool, clip(x, c.jack_travel), v if abs(x) <= c.jack_travel else 0.0, sliding)
+
+
+def cells(model: Model, names: Sequence[str], values: Array, h: float, sliding: float) -> Array:
+    """Cells of many runs, (fields, m): `values` (m, len(names)) in place of those of the model, steps of `h` s.
+
+    A spool that slides has `sliding` times the friction of one that is stuck.
+    """
+    def of(name: str) -> Array:
+        return values[:, names.index(name)] if name in names else np.full(len(values), model[name])
+
+    left = 1.0 - of("filter.clogging")  # 1 - Kintas
+    kf, ksf, asv = of("flapper.stiffness"), of("feedback_spring.stiffness"), of("spool.end_area")
+    gpf1, speed = of("pilot.pressure_gain") * left, of("pilot.flow_gain") * left**of("filter.law") / asv
+    dead = of("spool.static_friction") / (gpf1 * asv)
+    most = np.maximum(of("flapper.travel") - sliding * dead, 0.0)
+    gp, aj, cj, mj, psr = (of(name) for name in (
+        "valve.pressure_gain", "jack.area", "jack.damping", "jack.mass", "supply.pressure"))
+    slope = gp * aj / of("valve.flow_gain")
+    lag, back, inertia = mj / (aj * slope + cj), ksf / kf, 1.0 / (mj + h * cj)
+    return np.array([  # as the fields of Cell
+        of("torque_motor.gain") / kf, back, 1.0 / back, dead, sliding * dead, most, speed, speed * back,
+        1.0 / (speed * back), 1.0 / np.maximum(speed * back * most, FEWEST), of("spool.travel"),
+        gp * aj / (aj * slope + cj), lag, np.exp(-h / lag), h * aj * psr * inertia, mj * inertia, of("jack.travel"),
+        gp, slope, psr])
+
+
+def _bound(*arguments: Any) -> Any:
+    raise TypeError("no layout is bound")
+
+
+# each of these is put in its place by `kernel`: x_at(buffer, lane), keep_x(x, buffer, lane)
+motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _bound
+
+
+def control(a: Any, lane: int, demand: float) -> float:
+    """What the controller of one lane answers to a demand, A; it acts in the next cycle."""
+    cor, loop = answer(loop_at(a, lane), demand, motion_at(a, lane).position, controller_at(a, lane))
+    keep_loop(loop, a, lane)
+    keep_drive(Drive(drive_at(a, lane).next, cor), a, lane)
+    return cor
+
+
+def run(a: Any, rows: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
+        out: Any) -> None:
+    """A block of runs; fills out[rows[lane], :, k] = XJ, or XJ, Cor, P12 and XS, at sample k.
+
+    Args:
+        a: the block's buffer: cells and controllers in place, the rest zero. Used up.
+        rows: (WIDTH,) where in `out` each lane goes.
+        driven: (n,) demand m in closed loop, else the measured current A: driven[k - 1] acts from k to k + 1.
+        position: (n,) m, measured, to which the ram is pulled; or (1,), where it starts; or (0,), in the middle.
+        anchor: 1/s, how fast it is pulled.
+        closed: with the controller.
+        period: of a cycle, s.
+        steps: a cycle.
+        out: (m, 1 or 4, n), written.
+    """
+    h, n = period / steps, len(driven)
+    for lane in range(WIDTH):
+        keep_motion(Motion(0.0, position[0] if len(position) else 0.0, 0.0, 0.0), a, lane)
+    for k in range(n):
+        given = driven[k - 1] if k else 0.0
+        pulled = anchor * period if len(position) == n and position[k] == position[k] else 0.0
+        shown = position[k] if pulled != 0.0 else 0.0
+        for lane in range(WIDTH):
+            s = motion_at(a, lane)
+            out[rows[lane], 0, k] = s.position
+            keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
+        if closed:
+            for lane in range(WIDTH):
+                control(a, lane, driven[k])
+        else:
+            for lane in range(WIDTH):
+                keep_drive(Drive(given, driven[k]), a, lane)
+        if out.shape[1] > 1:
+            for lane in range(WIDTH):
+                s, c = motion_at(a, lane), cell_at(a, lane)
+                out[rows[lane], 1, k], out[rows[lane], 3, k] = drive_at(a, lane).next, s.spool
+                out[rows[lane], 2, k] = clip(c.pressure_gain * s.spool - c.pressure_slope * s.speed, c.pressure_limit)
+        for _ in range(steps):
+            for lane in range(WIDTH):  # the loop that everything is for
+                keep_motion(step(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
+
+
+PARTS = {"motion": Motion(), "loop": Loop(), "drive": Drive(), "cell": Cell(*[0.0] * len(Cell._fields)),
+         "controller": Controller(*[0.0] * len(Controller._fields))}
+STATES = 9  # numbers of the first three
+
+
+@cache
+def kernel() -> Function:
+    """`run` as machine code; the first time on a machine this takes some seconds."""
+    made, place = {}, 0
+    for name, shape in PARTS.items():
+        made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, WIDTH, place)
+    return compiled(run, made)
+
+
+class Monitor:
+    """Runs of the monitor of `model` that differ in the parameters `names` ("group.field"); no effects.
+
+    The paper's dead zone resists a spool that slides as one that is stuck (`sliding` 1). The plant's friction is less
+    then, FDS; with `sliding` FDS/FSS the spool sticks and slides as the plant's does.
+    """
+
+    def __init__(self, model: Model, names: Sequence[str] = FAULTS, steps: int = 1, workers: int | None = None,
+                 sliding: float = 1.0) -> None:
+        self.model, self.names, self.steps, self.sliding = model, tuple(names), steps, sliding
+        self.workers = workers or os.cpu_count() or 1
+        for name in self.names:
+            if name not in model.values or name == "controller.period" or model.plant != "eha":
+                raise InputError("monitor", name, "a parameter of the reference model other than the period")
+
+    def replay(self, values: Array, current: Array, position: Array | None = None, anchor: float = 0.0,
+               whole: bool = False) -> Array:
+        """The monitor without its controller, driven by a measured current.
+
+        Args:
+            values: (m, len(names)) parameters of each run, SI.
+            current: (n,) A; current[k - 1] acts from sample k to k + 1, none before.
+            position: (n,) m, measured, NaN where missing: runs start at rest at position[0].
+            anchor: 1/s, how fast the ram is pulled to the measured position; 0 is a free run.
+            whole: all columns, not XJ alone.
+
+        Returns:
+            (m, columns, n): XJ m; or XJ, Cor A, P12 Pa, XS m at each sample.
+
+        Raises:
+            InputError: shapes that do not fit.
+        """
+        return self._run(values, current, np.empty(0) if position is None else position, anchor, False, whole)
+
+    def closed_loop(self, values: Array, com: Array, start: float = 0.0, whole: bool = False) -> Array:
+        """The monitor with the model's controller over a command `com` (n,) m, at rest at `start` m; as `replay`."""
+        return self._run(values, com, np.array([start]), 0.0, True, whole)
+
+    def _run(self, values: Array, driven: Array, position: Array, anchor: float, closed: bool, whole: bool) -> Array:
+        values, driven, position = (np.ascontiguousarray(x, float) for x in (values, driven, position))
+        if values.ndim != 2 or values.shape[1] != len(self.names):
+            raise InputError("monitor", "values", f"one row a run of {len(self.names)}, not shape {values.shape}")
+        if driven.ndim != 1 or position.shape not in (driven.shape, (0,), (1,)):
+            raise InputError("monitor", "position", f"one a cycle, not {position.shape} beside {driven.shape}")
+        out = np.empty((len(values) + 1, 4 if whole else 1, len(driven)))  # the last for idle lanes
+        inputs = driven, position, anchor, closed, float(self.model["controller.period"]), self.steps
+        run, blocks = kernel(), list(self._blocks(values))
+        with ThreadPoolExecutor(self.workers) as pool:
+            list(pool.map(lambda block: run(*block, *inputs, out), blocks))
+        return out[:-1]
+
+    def _blocks(self, values: Array) -> Iterator[tuple[Array, NDArray[np.uint64]]]:
+        """The runs WIDTH at a time: the buffer at the start, and where the rows go; idle lanes repeat the last run."""
+        h = self.model["controller.period"] / self.steps
+        fixed = [values[:, self.names.index(name)] if name in self.names else np.full(len(values), self.model[name])
+                 for name in (f"controller.{field}" for field in Controller._fields)]
+        numbers = np.array([*cells(self.model, self.names, values, h, self.sliding), *fixed])  # (numbers, m)
+        for first in range(0, len(values), WIDTH):
+            lanes = np.minimum(np.arange(first, first + WIDTH), len(values) - 1)
+            buffer = np.concatenate([np.zeros((STATES, WIDTH)), numbers[:, lanes]])
+            rows = np.where(np.arange(first, first + WIDTH) < len(values), lanes, len(values))
+            yield buffer.reshape(-1), rows.astype(np.uint64)  # unsigned: no test for counting from the end
