@@ -22,12 +22,18 @@ STEPS = 20  # steps a cycle: 50 us
 FEW = 6  # effects that a model may have and still get one kernel for all its runs
 
 
+def threads() -> int:
+    """One a core, or as many as OMP_NUM_THREADS says: how a worker of a cluster is told not to take all of a machine."""
+    said = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
+
+
 class Lanes:
     """Runs of `model` that differ in the parameters `names` ("group.field")."""
 
     def __init__(self, model: Model, names: Sequence[str], steps: int = STEPS, workers: int | None = None) -> None:
         self.model, self.names, self.steps = model, tuple(names), steps
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or threads()
         known = model.names()
         for name in self.names:
             if name not in known or name == "controller.period":
