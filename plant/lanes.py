@@ -23,7 +23,7 @@ FEW = 6  # effects that a model may have and still get one kernel for all its ru
 
 
 def threads() -> int:
-    """One a core, or as many as OMP_NUM_THREADS says: how a worker of a cluster is told not to take all of a machine."""
+    """One a core, or as many as OMP_NUM_THREADS says: how a cluster tells its workers to share a machine."""
     said = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
 
