@@ -1,0 +1,219 @@
+"""The statistics of a campaign: false alarms, missed faults by size, confusion, errors, coverage; all with counts."""
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi.binomial import Share, share
+from fdi.health.types import CLOGGING, FAULTS, FRICTION, Fault, Level
+from rig.campaign.case import FAILED, OK, REFUSED, Row
+from rig.campaign.matrix import HEALTHY, label
+
+OFF_GRID = label({"filter_clogging": 0.17, "spool_friction": 45.0})
+"""The paper's second worked case, which no cell of a 21 x 21 grid hits."""
+CLOSE = {CLOGGING.name: 0.05, FRICTION.name: 0.02}  # relative error asked of it
+LEVELS = [level.word for level in Level]
+
+
+class Rate(NamedTuple):
+    """A share that is asked for, and what was found."""
+
+    name: str
+    share: Share
+    least: float = 0.0  # asked
+    most: float = 1.0
+
+    @property
+    def met(self) -> bool | None:
+        """Whether it is what was asked for; None where there is nothing to count."""
+        return self.least <= self.share.value <= self.most if self.share.of else None
+
+
+class Point(NamedTuple):
+    """How often a single fault of one size is detected."""
+
+    size: float
+    detected: Share  # level beyond acceptable
+    most: Share  # level non-nominal
+    ruling: Share  # named as the ruling fault
+
+
+class Error(NamedTuple):
+    """How far the estimates of one fault are off, over the cases of one label that have them."""
+
+    label: str
+    fault: str
+    truth: float
+    cases: int
+    bias: float
+    rms: float
+    most: float  # 95 of 100 are no further off
+    close: Share | None  # as close as is asked of the off-grid case
+    covered: Share  # 95 % interval holds the truth
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """All figures as JSON values: by tolerance for simulated plants, in short for recorded traces.
+
+    A case that was refused or failed detects nothing; it is never counted as a false alarm, but beside them. Of another
+    judgement than that of `rig fdi`, which names no levels, only status and time are told.
+    """
+    levelled = [row for row in rows if row["status"] != OK or f"level_{CLOGGING.name}" in row]
+    simulated = [row for row in levelled if "true_fss" in row]
+    tolerances = sorted({row["tolerance"] for row in simulated})
+    return {"cases": len(rows), "status": dict(Counter(row["status"] for row in rows)), "seconds": seconds(rows),
+            "tolerances": [_of(t, [r for r in simulated if r["tolerance"] == t]) for t in tolerances],
+            "traces": [_trace(row) for row in levelled if "true_fss" not in row],
+            "reasons": [{"case": row["label"], "seed": row["seed"], "status": row["status"], "reason": row["reason"]}
+                        for row in rows if row["status"] != OK]}
+
+
+def _of(tolerance: float, rows: Sequence[Row]) -> dict[str, Any]:
+    return {"tolerance": tolerance, "cases": len(rows),
+            "rates": [_json(rate) | {"met": rate.met} for rate in rates(rows)],
+            "curves": {fault.name: [_json(point) for point in curve(rows, fault)] for fault in FAULTS},
+            "levels": {fault.name: levels(rows, fault) for fault in FAULTS},
+            "ruling": ruling(rows),
+            "errors": [_json(error) for error in errors(rows)],
+            "false_alarms": [{"seed": row["seed"], **{f.name: row[f"level_{f.name}"] for f in FAULTS}}
+                             for row in rows if row["label"] == HEALTHY and alarm(row)]}
+
+
+def _trace(row: Row) -> dict[str, Any]:
+    names = ("label", "status", "ruling", *(f"level_{f.name}" for f in FAULTS), "kintas", "fss", "trust")
+    return {name: row.get(name) for name in names}
+
+
+def rates(rows: Sequence[Row]) -> list[Rate]:
+    """What is asked for, with counts."""
+    healthy = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK]
+    out = [Rate("false alarms, healthy plants", counted(healthy, alarm), most=0.005)]
+    for fault in FAULTS:
+        for word, least, size in (("MidBand", 0.95, fault.middle), ("MaxBand", 0.995, fault.most)):
+            of = [row for row in single(rows, fault) if truth(row, fault) == size]
+            out.append(Rate(f"{fault.name} of {word} size detected", counted(of, detects(fault)), least))
+    beyond = [(row, fault) for fault in FAULTS for row in single(rows, fault) if truth(row, fault) >= fault.middle]
+    out.append(Rate("ruling fault right, single faults from MidBand on",
+                    share(sum(row.get("ruling") == fault.name for row, fault in beyond), len(beyond)), 0.97))
+    for error in errors([row for row in rows if row["label"] == OFF_GRID]):
+        if error.close is not None:
+            out.append(Rate(f"off-grid case, {error.fault} within {100 * CLOSE[error.fault]:g} %", error.close, 0.95))
+        out.append(Rate(f"off-grid case, {error.fault} in its 95 % interval", error.covered, 0.93, 0.97))
+    return out
+
+
+def counted(rows: Iterable[Row], good: Callable[[Row], bool]) -> Share:
+    """How many rows are good."""
+    judged = [good(row) for row in rows]
+    return share(sum(judged), len(judged))
+
+
+def alarm(row: Row) -> bool:
+    """Whether any fault is said to be beyond acceptable."""
+    return any(detects(fault)(row) for fault in FAULTS)
+
+
+def detects(fault: Fault, level: Level = Level.MAINTENANCE) -> Callable[[Row], bool]:
+    """Whether a row says that a fault has reached a level."""
+    return lambda row: row["status"] == OK and LEVELS.index(row[f"level_{fault.name}"]) >= level
+
+
+def single(rows: Iterable[Row], fault: Fault) -> list[Row]:
+    """The rows of plants with this fault and no other."""
+    return [row for row in rows if row["faults"] == 1 and row["label"].startswith(f"{fault.name}=")]
+
+
+def truth(row: Row, fault: Fault) -> float:
+    """The true size, SI."""
+    return float(row[f"true_{fault.symbol}"])
+
+
+def true_level(size: float, fault: Fault) -> Level:
+    """The class of a size by Table 2 of the paper; a size at a limit is beyond it."""
+    return Level(int(size >= fault.middle) + int(size >= fault.most))
+
+
+def curve(rows: Sequence[Row], fault: Fault) -> list[Point]:
+    """Detection by size, small to large; the first point is the healthy plant."""
+    of = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK] + single(rows, fault)
+    sizes = sorted({truth(row, fault) for row in of})
+    groups = [(size, [row for row in of if truth(row, fault) == size]) for size in sizes]
+    return [Point(size, counted(group, detects(fault)), counted(group, detects(fault, Level.NON_NOMINAL)),
+                  counted(group, lambda row: row.get("ruling") == fault.name)) for size, group in groups]
+
+
+def levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]:
+    """True class to the level that was said, counts; of all plants with no fault but the two."""
+    table = {level: dict.fromkeys([*LEVELS, REFUSED, FAILED], 0) for level in LEVELS}
+    for row in rows:
+        if not others(row):
+            said = row[f"level_{fault.name}"] if row["status"] == OK else row["status"]
+            table[true_level(truth(row, fault), fault).word][said] += 1
+    return table
+
+
+def others(row: Row) -> bool:
+    """Whether a plant has another fault than the two."""
+    known = {fault.name for fault in FAULTS}
+    return any(part.partition("=")[0] not in known for part in row["label"].split() if row["label"] != HEALTHY)
+
+
+def ruling(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
+    """What plants have (fault and true class) to the ruling fault that was named, counts."""
+    table: dict[str, Counter[str]] = {}
+    for row in rows:
+        said = row.get("ruling") or "none" if row["status"] == OK else row["status"]
+        table.setdefault(_having(row), Counter())[said] += 1
+    return {name: dict(table[name]) for name in sorted(table)}
+
+
+def _having(row: Row) -> str:
+    if row["label"] == HEALTHY:
+        return HEALTHY
+    names = [part.partition("=")[0] for part in row["label"].split()]
+    if len(names) == 1 and not others(row):
+        fault = next(fault for fault in FAULTS if fault.name == names[0])
+        return f"{names[0]}, {true_level(truth(row, fault), fault).word}"
+    return " and ".join(names)
+
+
+def errors(rows: Sequence[Row]) -> list[Error]:
+    """Errors of the estimates by label and fault, in the rows' order."""
+    found = []
+    for name in dict.fromkeys(row["label"] for row in rows):
+        for fault in FAULTS:
+            of = [row for row in rows if row["label"] == name and row.get(f"{fault.symbol}_low") is not None
+                  and row["status"] == OK and math.isfinite(row[f"{fault.symbol}_high"] - row[f"{fault.symbol}_low"])]
+            if of and not others(of[0]):
+                found.append(_error(name, of, fault))
+    return found
+
+
+def _error(name: str, rows: Sequence[Row], fault: Fault) -> Error:
+    size = truth(rows[0], fault)
+    off = np.array([row[fault.symbol] for row in rows]) - size
+    within = share(int((abs(off) <= CLOSE[fault.name] * size).sum()), len(off)) if size > fault.healthy else None
+    covered = counted(rows, lambda row: row[f"{fault.symbol}_low"] <= size <= row[f"{fault.symbol}_high"])
+    return Error(name, fault.name, size, len(off), float(off.mean()), float(np.sqrt((off**2).mean())),
+                 float(np.quantile(abs(off), 0.95)), within, covered)
+
+
+def seconds(rows: Iterable[Row]) -> dict[str, float]:
+    """Time a case took to be judged: median, 95 of 100, most; empty if none was."""
+    took = [row["seconds"] for row in rows if "seconds" in row]
+    if not took:
+        return {}
+    return {"median": float(np.median(took)), "p95": float(np.quantile(took, 0.95)), "most": max(took)}
+
+
+def _json(record: Any) -> Any:
+    """A record of records as JSON values; a share has its value beside its count."""
+    if isinstance(record, Share):
+        return {**record._asdict(), "share": record.value if record.of else None}
+    if hasattr(record, "_asdict"):
+        return {key: _json(value) for key, value in record._asdict().items()}
+    return record
