@@ -46,13 +46,13 @@ def read(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | N
     sources = [source(trace), *(source(file) for file in repeats), *([source(holdout)] if holdout else [])]
     _distinct(sources, len(repeats))
     first = Trace.read(trace)
-    model, est, c = _usable(first, model, chosen, trace)
+    model, est, c = usable(first, model, chosen, trace)
     others = tuple(_repeat(c, est, Trace.read(file), model, file, n) for n, file in enumerate(repeats, 1))
     held = None
     if holdout:
         other = Trace.read(holdout)
         there = [s for s in est.signals if s in other.signals]
-        held_model, held, _ = _usable(other, model, there or est.signals, holdout)
+        held_model, held, _ = usable(other, model, there or est.signals, holdout)
         if held_model["controller.period"] != model["controller.period"]:
             raise InputError(holdout, "t", f"rows {model['controller.period']:g} s apart, as in {trace}")
     return Runs(model, est, others, held, tuple(sources), c.notes if c else first.notes)
@@ -86,8 +86,13 @@ def _distinct(sources: Sequence[Source], repeats: int) -> None:
         seen[content] = file
 
 
-def _usable(trace: Trace, model: Model, signals: Sequence[str] | None, where: str
+def usable(trace: Trace, model: Model, signals: Sequence[str] | None, where: str
             ) -> tuple[Model, Record, Cycles | None]:
+    """A trace as a fit needs it: the model at its cycle, the run, and its checked rows (None for another plant).
+
+    Raises:
+        InputError: what cannot be replayed, in one line.
+    """
     if model.plant != "eha":  # ranges and rates are checked against the reference model's own
         own = record(trace, tuple(signals) if signals else None, where)
         return at_period(model, trace.period), _known_start(own), None

@@ -1,0 +1,255 @@
+"""The sizes of the two faults from a replay of the measured current, with all that differs between healthy units.
+
+Free are the faults (Kintas, FSS and, as a nuisance, FDS), the base parameters with their tolerances as priors, and
+what else ages or is set up wrongly: jack friction, leakage, null bias, a load that nobody measured. What these do is
+then not blamed on the servovalve. A loss of pilot flow gain within its tolerance looks as a clogging filter does, so it
+is the tolerances that decide how wide the intervals are.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery import noise as noises
+from fdi.discovery.fit import Fit, misfit
+from fdi.discovery.known import free_of
+from fdi.discovery.problem import Free, Problem, quiet, unknowns
+from fdi.discovery.record import NOISE, Record
+from fdi.health.types import CLOGGING, FRICTION, Estimate
+from fdi.health.valley import descended, first_widths, flats
+from plant.effects import CATALOGUE
+from plant.model import Model
+
+Floats = NDArray[np.float64]
+
+WIDTH = 1.96  # standard deviations of a 95 % interval
+FINE = 20  # steps a cycle of the last fit
+EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
+SETTLING = 4
+LEAST, LARGEST = 0.05, 1000.0  # N, friction of the spool
+MOST = 0.95  # Kintas
+REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
+COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
+CLOSER = ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03))  # steps of Kintas and factors of FSS around the best start
+SLIDING = 1.5  # FSS over FDS in a start (nominal.toml)
+
+
+class Suspect(NamedTuple):
+    """Something else that ages or is set up wrongly: its parameter, and how far off it is thought possible."""
+
+    effect: str
+    parameter: str
+    spread: float  # standard deviation known beforehand, as wide as what is typical: SI, or of the logarithm
+    ratio: bool = False  # True: of the logarithm
+
+
+SUSPECTS = (
+    Suspect("jack_friction", "jack.dynamic_friction", 0.5, True),
+    Suspect("internal_leakage", "jack.leakage", 2.0, True),
+    Suspect("null_bias", "null_bias.current", 1.6e-4),
+    Suspect("constant_load", "constant_load.force", 3e3),
+)
+
+
+class Ratio(Free):
+    """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """SI."""
+        return math.exp(super().value(x))
+
+
+class Over(Ratio):
+    """Static friction by its ratio to the dynamic one of the same body, which comes before it."""
+
+    __slots__ = ()
+
+
+class Open(Free):
+    """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """Kintas."""
+        return 1.0 - math.exp(super().value(x))
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What the refinement found."""
+
+    kintas: Estimate
+    fss: Estimate  # N
+    correlation: float  # of the two
+    others: Mapping[str, Estimate]  # the suspects by parameter, SI
+    fit: Fit
+    errors: Mapping[str, float]  # RMS residual by signal, SI
+    floor: Mapping[str, float]  # what the sensors' noise leaves of it
+    simulations: int
+    method: str = "least squares"
+
+    @property
+    def ratio(self) -> dict[str, float]:
+        """Error over floor by signal; 1 where nothing but noise is left."""
+        return {name: self.errors[name] / self.floor[name] for name in self.errors}
+
+    @property
+    def reached(self) -> bool:
+        """True when nothing but noise is left."""
+        return max(self.ratio.values()) <= REACHED
+
+
+@dataclass
+class Counted(Problem):
+    """A problem that counts the runs it makes, and knows static friction by its ratio."""
+
+    count: list[int] = field(default_factory=lambda: [0])  # shared by the problem's copies
+
+    def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
+        return self.left(self.predict([f.name for f in free], np.array([values(free, row) for row in x])))
+
+    def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:
+        self.count[0] += len(values)
+        return super().all_signals(names, values, r)
+
+
+def values(free: Sequence[Free], x: Floats) -> Floats:
+    """Parameters in SI units, (p,), of scaled unknowns (p,)."""
+    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
+    names = [f.name for f in free]
+    for k, f in enumerate(free):
+        if isinstance(f, Over):
+            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
+    i, j = names.index("spool.static_friction"), names.index("spool.dynamic_friction")
+    found[j] = min(found[i], found[j])
+    return found
+
+
+def problem_of(model: Model, record: Record, floor: Mapping[str, float] | None = None, workers: int = 2) -> Counted:
+    """The model with the suspects ready in it, and the run to hold it against; `floor` RMS noise by signal, SI."""
+    level = {name: floor[name] if floor else model[NOISE[name]] for name in record.signals}
+    ready = quiet(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
+    return Counted(ready, record, tuple(noises.white(level[name]) for name in record.signals), workers=workers)
+
+
+def free_parameters(model: Model) -> tuple[Free, ...]:
+    """What a fit may change: the faults first, then the suspects, then the tolerances."""
+    clogging = Open(CLOGGING.parameter, 0.0, 0.015, np.inf, math.log(1.0 - MOST), 0.0, 1.0)
+    friction = [Ratio(f"spool.{kind}_friction", math.log(model[f"spool.{kind}_friction"]), 0.015, np.inf,
+                      math.log(LEAST), math.log(LARGEST), 1.0) for kind in ("static", "dynamic")]
+    suspects = [_suspected(s, model) for s in SUSPECTS]
+    usual = math.log(model["jack.static_friction"] / model["jack.dynamic_friction"])
+    over = Over("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
+    taken = {f.name for f in (clogging, *friction, *suspects, over)}
+    return (clogging, *friction, *suspects, over, *(_ratio(f) for f in free_of(model) if f.name not in taken))
+
+
+def _suspected(s: Suspect, model: Model) -> Free:
+    own = next(u for u in unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
+    usual = model.values.get(s.parameter, own.centre)
+    if s.ratio:
+        return Ratio(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual), 0.02)
+    return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
+
+
+def _ratio(f: Free) -> Free:
+    """A tolerance as one of the logarithm."""
+    if f.low <= 0.0:
+        return f
+    return Ratio(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
+
+
+def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] = COARSE,
+           floor: Mapping[str, float] | None = None, workers: int = 2) -> Refined:
+    """Fault sizes by least squares from the best of some starts.
+
+    Args:
+        model: the plant as it left the works.
+        record: the run.
+        starts: (Kintas, FSS in N) each.
+        floor: RMS noise by signal, SI; default the model's sensors.
+        workers: threads.
+    """
+    problem = problem_of(model, record, floor, workers)
+    free = free_parameters(model)
+    x = _best_start(problem, free, starts)
+    flat = flats(problem, free, x)
+    first = begun(free, x)
+    for factor, rounds in EASED:
+        first = descended(_louder(problem, factor), replace(first, covariance=first_widths(free)), rounds, flat)
+    problem = _with_noise(problem, first)
+    fine = replace(problem, steps=FINE, _lanes={})
+    return _refined(descended(fine, first, SETTLING, flat), problem)
+
+
+def _louder(problem: Counted, factor: float) -> Counted:
+    return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise))
+
+
+def begun(free: Sequence[Free], x: Floats) -> Fit:
+    """A fit that has not looked at anything yet."""
+    none = np.empty((0, 0))
+    return Fit(tuple(free), x, np.inf, np.inf, first_widths(free), none, none, none)
+
+
+def _best_start(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
+    """The start, (p,) scaled, that leaves least, looked at ever closer."""
+    loud = _louder(problem, EASED[0][0])
+    best = _least(loud, free, starts)
+    for k, f in CLOSER:
+        best = _least(loud, free, [(min(max(best[0] + i * k, 0.0), MOST), best[1] * f**j)
+                                   for i, j in product(range(-2, 3), repeat=2)])
+    return start_of(free, *best)
+
+
+def _least(problem: Problem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The start, (Kintas, FSS), that leaves least."""
+    x = np.array([start_of(free, *s) for s in starts])
+    return starts[int(np.argmin(misfit(problem.whitened(problem.residuals(free, x)))))]
+
+
+def start_of(free: Sequence[Free], kintas: float, fss: float) -> Floats:
+    """Scaled unknowns, (p,), of a plant that has the two faults and is nominal otherwise."""
+    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), MOST)),
+            FRICTION.parameter: math.log(max(fss, LEAST)),
+            "spool.dynamic_friction": math.log(max(fss, LEAST) / SLIDING)}
+    return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
+
+
+def _with_noise(problem: Counted, found: Fit) -> Counted:
+    """The problem with the noise of what a fit leaves, signal by signal, where that is noise."""
+    learnt = []
+    for old, r in zip(problem.noise, found.residuals, strict=True):
+        calm = float(np.sqrt(np.nanmean(r**2))) <= REACHED * old.level
+        learnt.append(noises.fitted(r) if calm else old)
+    return replace(problem, noise=tuple(learnt), _lanes={})
+
+
+def _refined(last: Fit, problem: Counted) -> Refined:
+    record = problem.record
+    errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, last.residuals, strict=True)}
+    floor = {s: n.level for s, n in zip(record.signals, problem.noise, strict=True)}
+    names = [f.name for f in last.free]
+    i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
+    spread = np.sqrt(np.diag(last.covariance))
+    correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
+    return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter), correlation,
+                   {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+                   problem.count[0])
+
+
+def estimate(found: Fit, name: str) -> Estimate:
+    """A parameter with its 95 % interval, within what is possible."""
+    i = [f.name for f in found.free].index(name)
+    half = WIDTH * float(np.sqrt(found.covariance[i, i]))
+    low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
+    return Estimate(found.free[i].value(float(found.x[i])), low, high)

@@ -1,0 +1,88 @@
+"""What `rig fdi` shows a person: the verdict, the two faults, bands, precursors, grid, and what else is off."""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+
+from fdi.health.diagnosis import Diagnosis
+from fdi.health.types import FAULTS, Level
+from fdi.health.words import LEVELS, NAMES, SHOWN, besides, left_over, sentence, size
+from rig.console import console
+
+COLOURS = {"ACCEPTABLE": "green", "MAINTENANCE": "yellow", "NON_NOMINAL": "red", "SOMETHING_ELSE": "yellow",
+           "CANNOT_TELL": "yellow"}
+OF_LEVEL = {Level.ACCEPTABLE: "green", Level.MAINTENANCE: "yellow", Level.NON_NOMINAL: "red", None: "yellow"}
+EVENTS = 6  # lines; page and JSON have all
+
+
+def diagnosis(d: Diagnosis, then: str, pages: Sequence[Path] = ()) -> None:
+    """Everything, on standard output."""
+    out = console()
+    out.print(f"[bold {COLOURS[d.verdict]}]{d.verdict}[/]  {escape(sentence(d))}", soft_wrap=True)
+    out.print()
+    out.print(faults(d))
+    out.print()
+    if d.precursors:
+        out.print(precursors(d))
+        out.print()
+    for label, text in lines(d):
+        out.print(f"[dim]{label:<11}[/]{escape(text)}", soft_wrap=True)
+    for page in pages:
+        out.print(f"[dim]{'written':<11}[/]{escape(str(page))}", soft_wrap=True)
+    if then:
+        out.print(f"[dim]{'next':<11}[/][bold]{escape(then)}[/]", soft_wrap=True)
+
+
+def faults(d: Diagnosis) -> Table:
+    """Both faults: level, size, interval, limits, and what bands and grid say."""
+    t = Table(box=None, pad_edge=False)
+    t.add_column("fault")
+    t.add_column("level")
+    for column in ("size", "95 % interval", "MidBand", "MaxBand", "grid", "bands"):
+        t.add_column(column, justify="right")
+    for f in FAULTS:
+        e, level = d.sizes[f.name], d.levels[f.name]
+        at = getattr(d.grid.merged, f.symbol) if d.grid else None
+        said = d.judged.levels.get(f.name) if d.judged else None
+        t.add_row(NAMES[f.name] + (" *" if d.ruling == f.name else ""), f"[{OF_LEVEL[level]}]{LEVELS[level]}[/]",
+                  size(e.value), f"{size(e.low)} .. {size(e.high)}", f"{f.middle:g}", f"{f.most:g}",
+                  "-" if at is None else size(at), said.word if said is not None else "-")
+    t.caption = "filter clogging: Kintas; spool friction: FSS in N" + ("; * rules" if d.ruling else "")
+    t.caption_justify = "left"
+    return t
+
+
+def precursors(d: Diagnosis) -> Table:
+    """The precursors beside their healthy scatter."""
+    known = any(math.isfinite(p.noise) for p in d.precursors.values())
+    t = Table(box=None, pad_edge=False)
+    t.add_column("precursor")
+    t.add_column("value", justify="right")
+    if known:
+        t.add_column("off, in healthy s.d.", justify="right")
+    for p in d.precursors.values():
+        off = f"{p.departure:+.1f}" if math.isfinite(p.departure) else "-"
+        t.add_row(p.words, p.shown, *([off] if known else []))
+    return t
+
+
+def lines(d: Diagnosis) -> list[tuple[str, str]]:
+    """Label and text of what stands below the tables."""
+    said = []
+    for e in d.events[:EVENTS]:
+        said.append(("event", f"{e.signal} outside {'MaxBand' if e.band == 'most' else 'MidBand'}, "
+                              f"{e.t_in:.3f} .. {e.t_out:.3f} s, {e.section}"))
+    if len(d.events) > EVENTS:
+        said.append(("", f"and {len(d.events) - EVENTS} more events"))
+    r = d.refined
+    fits = ", ".join(f"{SHOWN[s]} {ratio:.3g}" for s, ratio in r.ratio.items())
+    said.append(("fit", f"leaves {fits} times the noise; {r.simulations} simulations; "
+                        f"correlation of the two sizes {r.correlation:+.2f}"))
+    said += [("besides", besides(name, e)) for name, e in d.others.items()]
+    if d.verdict == "SOMETHING_ELSE":
+        said.append(("left over", left_over(d)))
+    return [*said, *(("note", note) for note in d.notes)]
