@@ -10,7 +10,6 @@ reference model takes 20 to 100. Many runs stand side by side, as in `plant.bloc
 """
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -25,6 +24,7 @@ from plant.controller import Loop, answer
 from plant.errors import InputError
 from plant.flat import lane_packers
 from plant.friction import clip, soften
+from plant.lanes import threads
 from plant.model import Model
 from plant.parameters import Controller
 
@@ -210,7 +210,7 @@ class Monitor:
     def __init__(self, model: Model, names: Sequence[str] = FAULTS, steps: int = 1, workers: int | None = None,
                  sliding: float = 1.0) -> None:
         self.model, self.names, self.steps, self.sliding = model, tuple(names), steps, sliding
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or threads()
         for name in self.names:
             if name not in model.values or name == "controller.period" or model.plant != "eha":
                 raise InputError("monitor", name, "a parameter of the reference model other than the period")
