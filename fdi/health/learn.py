@@ -5,6 +5,8 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +28,11 @@ from fdi.health.envelope import (
 from fdi.health.features import features, slow
 from fdi.health.montecarlo import STEPS, Kind, Tell, runs, silent
 from fdi.health.types import CLOGGING, FRICTION
+from fdi.output import writable
 from fdi.sections import Section, sections
+from fdi.trace import Trace
 from plant.errors import InputError
-from plant.model import Model
+from plant.model import Model, load_model
 
 Floats = NDArray[np.float64]
 
@@ -79,6 +83,36 @@ def build(model: Model, com: Floats, load: Floats, period: float, count: int = R
     return replace(bands, middle_share=shares[0], most_share=shares[1])
 
 
+def run(sources: Sequence[str | Path], out: str | Path, model: Model | None = None, com: Floats | None = None,
+        name: str = "", seed: int = SEED, tell: Tell = silent) -> dict[str, Any]:
+    """Bands from the traces `sources`, or without any by simulation over the command `com` (n,) m; written to `out`.
+
+    Returns what was made, for --json.
+
+    Raises:
+        InputError: traces that cannot be learned from, or a place that cannot be written.
+    """
+    from fdi.health.fleet import learn
+    from fdi.health.store import save
+
+    place = writable(out, "--out")
+    if sources:
+        traces = []
+        for done, source in enumerate(sources):
+            tell("reading", done, len(sources))
+            traces.append(Trace.read(source))
+        bands = learn(traces, model, [str(source) for source in sources], tell)
+    elif com is None:
+        raise InputError("--learn-bands", "", "traces, or a command to simulate")
+    else:
+        model = model or load_model()
+        bands = build(model, com, np.zeros_like(com), model["controller.period"], seed=seed, tell=tell, name=name)
+    save(bands, place)
+    clogging, friction = bands.judges
+    return {"bands": str(out), "judges": [fault.name for fault, seen in ((CLOGGING, clogging), (FRICTION, friction))
+                                          if seen], "provenance": dict(bands.provenance)}
+
+
 def _step(number: int, s: Section, period: float, frictions: Sequence[Floats], clogged: Sequence[Floats]) -> StepBand:
     first, stop = round(FIRST / period), min(round(HORIZON / period) + 1, s.stop - s.start)
     fine = np.arange(first, stop)
@@ -94,8 +128,8 @@ def _step(number: int, s: Section, period: float, frictions: Sequence[Floats], c
     shifts = [between(x.mean(axis=0) - alike) for x in parts[1:]]
     known = len(frictions)
     spread = np.array([between(x.std(axis=0, ddof=1)) for x in parts[:known]])
-    return StepBand(number, fine.astype(float) * period, healthy, np.array([np.zeros(len(fine)), *shifts[:known - 1]]), spread,
-                    shifts[-2], shifts[-1])
+    shift = np.array([np.zeros(len(fine)), *shifts[:known - 1]])
+    return StepBand(number, fine.astype(float) * period, healthy, shift, spread, shifts[-2], shifts[-1])
 
 
 def _ramp(number: int, s: Section, com: Floats, period: float, frictions: Sequence[Floats], amounts: Sequence[float]
@@ -113,7 +147,7 @@ def _ramp(number: int, s: Section, com: Floats, period: float, frictions: Sequen
 
 
 def _width(healthy: Floats, middle: Floats, most: Floats) -> Width:
-    """Limits that let 1 - OUT_RAMP of the faulty units out, where that is clear of the healthy ones; (runs, rows) each."""
+    """Limits that all but OUT_RAMP of the faulty units leave, where clear of the healthy ones; (runs, rows) each."""
     centre = float(np.nanmean(healthy))
     usual, lesser, greater = (lasting_most(np.abs(x - centre)) for x in (healthy, middle, most))
     clear = float(usual.mean() + CLEAR * usual.std(ddof=1))
