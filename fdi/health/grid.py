@@ -29,6 +29,9 @@ KINTAS = np.linspace(0.0, 0.5, 21)
 FSS = np.linspace(0.0, 90.0, 21)  # N
 SLIDING = (2.0 / 3.0, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS, as the plant has it and as it may be
 DRIVES = ("current", "command")
+# corners of the unit square (Kintas, FSS N): MidBand in its middle, MaxBand at its right and upper edge
+LEFT = 2.0 * CLOGGING.middle - CLOGGING.most, 2.0 * FRICTION.middle - FRICTION.most
+RIGHT = CLOGGING.most, FRICTION.most
 
 
 class Point(NamedTuple):
@@ -159,7 +162,7 @@ def merge(step: Map | None, ramp: Map | None) -> Merged:
 
 def bisector(kintas: float, fss: float) -> float:
     """Signed distance along Kintas from the first bisector of the unit square, over that of the edge: -1 .. 1."""
-    x, y = (min(max((size - (2.0 * f.middle - f.most)) / (2.0 * (f.most - f.middle)), 0.0), 1.0)
-            for size, f in ((kintas, CLOGGING), (fss, FRICTION)))
+    x, y = (min(max((size - low) / (high - low), 0.0), 1.0)
+            for size, low, high in zip((kintas, fss), LEFT, RIGHT, strict=True))
     room = 1.0 - y if x > y else y
     return (x - y) / room if x != y else 0.0
