@@ -21,6 +21,7 @@ Progress = Callable[[str, float], None]
 
 FINE = 20  # steps a cycle of the last fits
 FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
+TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
 COARSE = 0.2  # times the floor; a solver's error beyond it is not hidden by the noise
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
 MOST = 3  # effects looked for one after the other
@@ -28,6 +29,7 @@ EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are
 CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
 BETTER = 0.8  # times the error before: what counts as a part of the explanation
 FAIR = 0.1  # of the excess cost that an effect has to take away if another one is to be looked for on top of it
+DOUBTFUL = 500.0  # gain up to which it may be what the base's own fit has left lying about
 HELD_OUT = 1.2  # times the floor, in the typical block of a run with another command
 TYPICAL = 0.85  # of the blocks
 
@@ -142,24 +144,26 @@ def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool
 
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
                holdout: Record | None) -> Explanation:
-    search.refine(FINE)
+    search.refine(FINE, TRUEST)
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
         depth = 1
-    base = search.again(levels[0][0], 4)
-    if not depth and not base.reached:  # nothing helps: then the base's own fit had better be beyond doubt
-        base = search.settle(base, LONG)
+    base = search.settle(levels[0][0], 2 if depth or levels[0][0].reached else LONG)  # nothing helps: beyond doubt
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
     close = sorted((search.settle(h) for h in close), key=lambda h: h.cost + h.repeat_cost)
+    if close and base.cost - close[0].cost < DOUBTFUL:
+        base = search.settle(search.without(base, close[:1]), LONG)
+        if depth == 1 and not _significant(base, close[0]):
+            close, depth = [], 0
     others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])
               if h.effects not in [c.effects for c in close]]
     ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.floor(close[0] if close else base)
     if search.solver_error(close[0] if close else base, floor) > COARSE:
-        search.refine(FINEST)
-        base, close = search.again(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
+        search.refine(FINEST, TRUEST)
+        base, close = search.settle(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
@@ -218,7 +222,7 @@ def held_out(search: Search, h: Hypothesis, record: Record) -> dict[str, float]:
 
 
 def _unseen(search: Search, h: Hypothesis, record: Record) -> Floats:
-    problem: Problem = replace(search.problem, record=record, also=())
+    problem: Problem = replace(search.problem, record=record, steps=TRUEST, also=(), _lanes={})
     left: Floats = problem.residuals(h.fit.free, h.fit.x[None])[0]
     return left
 

@@ -113,7 +113,7 @@ def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     """All of them with the noise that the last one leaves, with the repeats and with finer steps."""
     search.learn_noise(chain[-1])
     coarse = search.problem.steps
-    search.refine(STEPS)
+    search.refine(STEPS, STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
     last = settled(search.problem, chain[-1].fit, LAST, slopes)
     if last.misfit > POOR * np.count_nonzero(last.white):

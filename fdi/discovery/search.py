@@ -69,6 +69,7 @@ class Search:
         bare = quiet(model)
         self.problem = Problem(ready, record, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
+        self.fine: Problem | None = None  # with the steps of last residuals
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
 
     def base(self) -> Hypothesis:
@@ -99,12 +100,12 @@ class Search:
 
         What an effect gains is then not what the base's own fit had left lying about.
         """
-        names = [f.name for f in base.fit.free]
         starts = []
         for h in tried:
-            there = {f.name: (float(x), f) for f, x in zip(h.fit.free, h.fit.x, strict=True)}
-            starts.append(np.array([there[n][0] if np.isfinite(there[n][1].prior) else 0.0 for n in names]))
-        return self.retried(base, starts)
+            values = h.fit.values
+            starts.append([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
+                           for f in base.fit.free])
+        return self.retried(base, map(np.array, starts))
 
     def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
@@ -175,7 +176,8 @@ class Search:
 
     def settle(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
-        return self.judged(h.effects, settled(self.problem, fit(self.problem, h.fit.free, h.fit.x, 2), rounds))
+        near = fit(self.problem, h.fit.free, h.fit.x, 2)
+        return self.judged(h.effects, settled(self.fine or self.problem, near, rounds, self.problem))
 
     def solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
@@ -186,10 +188,11 @@ class Search:
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
         return max(float(t) / floor[s] for s, t in zip(self.problem.record.signals, typical, strict=True))
 
-    def refine(self, steps: int) -> None:
-        """Finer steps from here on, and fits to the repeats as well."""
+    def refine(self, steps: int, finest: int) -> None:
+        """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.record for p in self.repeats))
-        self.repeats = [replace(p, steps=steps, _lanes={}) for p in self.repeats]
+        self.fine = replace(self.problem, steps=finest, _lanes={})
+        self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
 
 
 def noise_of(h: Hypothesis, record: Record, before: Sequence[Noise]) -> list[Noise]:
