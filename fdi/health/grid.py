@@ -29,6 +29,7 @@ KINTAS = np.linspace(0.0, 0.5, 21)
 FSS = np.linspace(0.0, 90.0, 21)  # N
 SLIDING = (2.0 / 3.0, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS, as the plant has it and as it may be
 DRIVES = ("current", "command")
+BETWEEN = np.linspace(-1.0, 1.0, 13)  # cells along FSS, around the best of each Kintas
 # corners of the unit square (Kintas, FSS N): MidBand in its middle, MaxBand at its right and upper edge
 LEFT = 2.0 * CLOGGING.middle - CLOGGING.most, 2.0 * FRICTION.middle - FRICTION.most
 RIGHT = CLOGGING.most, FRICTION.most
@@ -68,6 +69,7 @@ class Grid:
     ramp: Map | None
     joint: Map
     merged: Merged
+    best: Point  # between the cells: the joint map is a valley narrower than they are
     sliding: float  # FDS/FSS of the spool, at which the grid fits best
     drive: str
     simulations: int
@@ -96,10 +98,27 @@ def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats 
     values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
     tried = {ratio: _rms(c, _runs(c, model, values, drive, ratio), rows) for ratio in sliding}
     joint = {ratio: _joint(maps, rows) for ratio, maps in tried.items()}
-    best = min(joint, key=lambda ratio: float(joint[ratio].min()))
-    step, ramp = (_map(tried[best][kind], kintas, fss) if kind in rows else None for kind in ("step", "ramp"))
-    return Grid(kintas, fss, step, ramp, _map(joint[best], kintas, fss), merge(step, ramp), best, drive,
-                len(values) * len(sliding))
+    ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
+    step, ramp = (_map(tried[ratio][kind], kintas, fss) if kind in rows else None for kind in ("step", "ramp"))
+    both = _map(joint[ratio], kintas, fss)
+    near = _valley(both, kintas, fss)
+    finer = _joint(_rms(c, _runs(c, model, near, drive, ratio), rows), rows)
+    deepest = int(finer.argmin())
+    best = Point(float(near[deepest, 0]), float(near[deepest, 1]), float(finer[deepest]))
+    return Grid(kintas, fss, step, ramp, both, merge(step, ramp), best, ratio, drive,
+                len(values) * len(sliding) + len(near))
+
+
+def _valley(joint: Map, kintas: Floats, fss: Floats) -> Floats:
+    """Pairs (m, 2) along the floor of a map's valley, closer along FSS than its cells.
+
+    What counts is friction over pilot pressure, so the valley runs across the grid, and which of its cells is deepest
+    says first of all which of them happens to lie on the floor.
+    """
+    apart = float(fss[1] - fss[0]) if len(fss) > 1 else 0.0
+    floor = fss[joint.rms.argmin(axis=1)]
+    across = np.maximum(floor[:, None] + apart * BETWEEN, 0.0)
+    return np.column_stack([np.repeat(kintas, len(BETWEEN)), across.reshape(-1)])
 
 
 def _rows(c: Cycles, kind: str) -> Flags:
