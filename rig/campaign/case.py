@@ -100,10 +100,12 @@ def run(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     chance = draw(case, len(com), spec["colour"], spec["hum"])
     there = {"source": case.label, "seed": str(case.seed)}
     if spec["simulator"] == "independent":
-        return _independent(case, model, com, chance, there)
-    healthy = model.replace({name: factor * model[name] for name, factor in chance.scatter.items()})
-    columns = simulate(faulty(healthy, case.sizes), com, drawn=chance.noise)
-    return Trace.of(columns._asdict(), model["controller.period"], there)
+        columns = _independent(case, model, com, chance)
+    else:
+        healthy = model.replace({name: factor * model[name] for name, factor in chance.scatter.items()})
+        columns = simulate(faulty(healthy, case.sizes), com, drawn=chance.noise)._asdict()
+    measured = {"com", "cor", "load", *spec["signals"].split(",")}
+    return Trace.of({name: columns[name] for name in columns if name in measured}, model["controller.period"], there)
 
 
 def draw(case: Case, cycles: int, colour: float, hum: float) -> Drawn:
@@ -134,7 +136,7 @@ def faulty(model: Model, sizes: Mapping[str, float]) -> Model:
     return model
 
 
-def _independent(case: Case, model: Model, com: Array, chance: Drawn, there: Mapping[str, str]) -> Trace:
+def _independent(case: Case, model: Model, com: Array, chance: Drawn) -> dict[str, Array]:
     """The same by the blind trial's simulator, which shares no physics with `plant`."""
     known = {name: symbol for symbol, name in truth.SYMBOLS.items()}
     for name in model.differences().keys() - known.keys():
@@ -148,9 +150,8 @@ def _independent(case: Case, model: Model, com: Array, chance: Drawn, there: Map
             raise InputError("--simulator", name, "an effect of one size, which the independent simulator has")
         symbols |= changes
     made = truth.simulate(com, symbols, cases.FLOORS["xj"] * chance.noise[:, 0])
-    made = made._replace(p12=made.p12 + cases.FLOORS["p12"] * chance.noise[:, 1],
-                         xs=made.xs + cases.FLOORS["xs"] * chance.noise[:, 2])
-    return Trace.of(made._asdict(), truth.PERIOD, there)
+    return made._asdict() | {"p12": made.p12 + cases.FLOORS["p12"] * chance.noise[:, 1],
+                             "xs": made.xs + cases.FLOORS["xs"] * chance.noise[:, 2]}
 
 
 @cache

@@ -17,10 +17,13 @@ from typing import Any
 from plant.errors import InputError, RigError
 from rig.campaign.case import Row, one, told
 from rig.campaign.matrix import Case
+from rig.clock import WallClock
 
 HOST = "127.0.0.1"
 IN_FLIGHT = 400  # cases that a cluster is given ahead of time
 ANSWER = 20  # s, within which a scheduler answers and has a worker
+LOST = 30  # s without a result, after which it is asked whether there is still a worker
+NS = 1_000_000_000
 
 
 def here(cases: Iterable[Case], spec: Mapping[str, Any], code: str) -> Iterator[Row]:
@@ -96,9 +99,26 @@ def by(client: Any, cases: Iterable[Case], spec: Mapping[str, Any], code: str) -
             coming.add(future)
 
     order(IN_FLIGHT)
-    for future in coming:
+    for future in _arrived(coming, client):
         yield _row(future, ordered.pop(future), shared)
         order(1)
+
+
+def _arrived(coming: Any, client: Any) -> Iterator[Any]:
+    """The futures as they are done. Raises RigError when all workers have gone and none comes back."""
+    clock, seen = WallClock(), 0
+    while not coming.is_empty():
+        batch = coming.next_batch(block=False)
+        yield from batch
+        if batch:
+            seen = clock.now()
+        elif clock.now() - seen < LOST * NS:
+            clock.sleep_until(clock.now() + NS // 50)
+        elif client.nthreads():
+            seen = clock.now()
+        else:
+            raise RigError(f"the cluster has had no worker for {LOST} s; what is finished is kept, the same command "
+                           "goes on")
 
 
 def _row(future: Any, case: Case, spec: Mapping[str, Any]) -> Row:

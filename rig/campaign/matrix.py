@@ -26,6 +26,7 @@ from plant.model import Model, entry
 from plant.parameters import accept, parse_toml, read_toml
 
 SIMULATORS = ("plant", "independent")
+SIGNALS = ("xj,p12,xs", "xj,p12", "xj")
 HEALTHY = "healthy"
 DEFAULTS: dict[str, Any] = {
     "seeds": 20,  # runs of each size
@@ -34,6 +35,7 @@ DEFAULTS: dict[str, Any] = {
     "simulator": "plant",  # ours in 10 us steps, or the blind trial's in C
     "colour": 0.8,  # correlation of the position sensor's noise from one cycle to the next
     "hum": 0.7e-6,  # m, of the mains on it
+    "signals": "xj,p12,xs",  # measured
 }
 TRACES = (".mcap", ".csv", ".csv.gz")
 
@@ -89,24 +91,31 @@ def matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) ->
 
 
 def _check(common: dict[str, Any], where: object) -> None:
-    common["tolerance"] = [_number(where, "tolerance", x, 0.0, 0.2) for x in _listed(common["tolerance"])]
+    common["tolerance"] = _tolerances(common["tolerance"], where)
     common["colour"] = _number(where, "colour", common["colour"], 0.0, 0.99)
     common["hum"] = _number(where, "hum", common["hum"], 0.0, 1e-3)
     if common["simulator"] not in SIMULATORS:
         raise InputError(where, "simulator", f"one of {', '.join(SIMULATORS)}, not {common['simulator']!r}")
+    if common["signals"] not in SIGNALS:
+        raise InputError(where, "signals", f"one of {'; '.join(SIGNALS)}, not {common['signals']!r}")
     _count(where, "seeds", common["seeds"], 1)
     _count(where, "first", common["first"], 0)
+
+
+def _tolerances(value: Any, where: object) -> list[float]:
+    return [_number(where, "tolerance", x, 0.0, 0.2) for x in _listed(value)]
 
 
 def _block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, where: object) -> dict[str, Any]:
     sizes = {}
     for name, values in block.items():
-        if name != "seeds":
+        if name not in ("seeds", "tolerance"):
             quantity = _effect(name, model, where).parameters[_effect(name, model, where).fitted[0]]
             sizes[name] = [accept(where, name, quantity, value) for value in _listed(values)]
             if not sizes[name]:
                 raise InputError(where, name, "at least one size")
-    return {"seeds": _count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes}
+    return {"seeds": _count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes,
+            "tolerance": _tolerances(block.get("tolerance", common["tolerance"]), where)}
 
 
 def _effect(name: str, model: Model, where: object) -> Effect:
@@ -138,7 +147,7 @@ def _cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
     for block in spec["case"]:
         for values in itertools.product(*block["sizes"].values()):
             sizes = dict(sorted(zip(block["sizes"], values, strict=True)))
-            for tolerance, k in itertools.product(spec["tolerance"], range(block["seeds"])):
+            for tolerance, k in itertools.product(block["tolerance"], range(block["seeds"])):
                 key = label(sizes), tolerance, spec["first"] + k
                 found.setdefault(key, ((k + 0.5) / block["seeds"], sizes))
     ordered = sorted(found.items(), key=lambda item: item[1][0])  # stable: within a round as the file has them

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from fdi.figures import COMMAND, GREEN, INK, RED, STYLE, svg
 from fdi.health.types import FAULTS, Fault
+from rig.campaign.summary import title
 
 BLUE = "#1f6feb"
 LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN))
@@ -41,4 +42,4 @@ def _curve(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:
         ax.axvline(size, color=COMMAND, lw=0.9, ls="--", zorder=0)
         ax.text(size, 50, f" {word}", color=INK, fontsize=8, rotation=90, va="center", ha="right")
     unit = f" [{fault.unit}]" if fault.unit != "1" else ""
-    ax.set_xlabel(f"{fault.name}, {'Kintas' if fault.symbol == 'kintas' else fault.symbol.upper()}{unit}")
+    ax.set_xlabel(f"{fault.name}, {title(fault)}{unit}")

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from fdi.health.types import FAULTS
 from rig.campaign.run import Progress
+from rig.campaign.summary import title
 
 REASONS = 10  # failed or refused cases that are listed
 
@@ -76,11 +77,17 @@ def percent(count: Mapping[str, Any]) -> tuple[str, str, str]:
 def _rates(rates: Sequence[Mapping[str, Any]]) -> Table:
     table = _table("", "count", "share", "95 % interval", "asked", "")
     for r in rates:
-        low, high = 100 * r["least"], 100 * r["most"]
-        asked = f"{low:g} .. {high:g} %" if low > 0 and high < 100 else f">= {low:g} %" if low > 0 else f"<= {high:g} %"
         if r["share"]["of"]:
-            table.add_row(r["name"], *percent(r["share"]), asked, "met" if r["met"] else "NOT met")
+            asked = _asked(100 * r["least"], 100 * r["most"])
+            verdict = ("too few" if asked else "") if r["met"] is None else "met" if r["met"] else "NOT met"
+            table.add_row(r["name"], *percent(r["share"]), asked, verdict)
     return table
+
+
+def _asked(low: float, high: float) -> str:
+    if low > 0 and high < 100:
+        return f"{low:g} .. {high:g} %"
+    return f">= {low:g} %" if low > 0 else f"<= {high:g} %" if high < 100 else ""
 
 
 def _curve(name: str, unit: str, points: Sequence[Mapping[str, Any]]) -> Table:
@@ -109,11 +116,14 @@ def _ruling(counts: Mapping[str, Mapping[str, int]]) -> Table:
 
 
 def _errors(errors: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("estimates of", "", "cases", "bias", "RMS error", "95 % within", "covered", "share", "95 % interval")
+    table = _table("estimates of", "", "cases", "bias", "RMS", "p95", "covered", "95 % interval")
     for e in errors:
-        symbol = next(fault.symbol for fault in FAULTS if fault.name == e["fault"])
-        table.add_row(e["label"], symbol, str(e["cases"]), *(f"{e[key]:.3g}" for key in ("bias", "rms", "most")),
-                      *percent(e["covered"]))
+        fault = next(fault for fault in FAULTS if fault.name == e["fault"])
+        plant = e["label"]
+        for other in FAULTS:
+            plant = plant.replace(f"{other.name}=", f"{title(other)} ")
+        table.add_row(plant, title(fault), str(e["cases"]), *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")),
+                      *percent(e["covered"])[1:])
     return table
 
 

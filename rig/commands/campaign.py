@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tolerance", metavar="X,..", help="standard deviation of the base parameters, relative (default 0.015)")
     add("--simulator", choices=("plant", "independent"), help="ours (default), or the blind trial's in C, which "
                                                                "shares no physics with it")
+    add("--signals", metavar="xj,p12,xs", help="what is measured (default: all three)")
     add("--model", metavar="FILE|NAME", help="the healthy plant (default eha)")
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE", help="change a parameter of it (repeatable)")
     add("--work", default="fdi", metavar="MODULE:FUNCTION", help="another judgement than that of rig fdi")
@@ -99,7 +100,7 @@ def _matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     from rig.campaign.folder import is_campaign, matrix_of
     from rig.campaign.judge import WORKS
 
-    wanted = {"seeds": args.seeds, "first": args.seed, "simulator": args.simulator,
+    wanted = {"seeds": args.seeds, "first": args.seed, "simulator": args.simulator, "signals": args.signals,
               "tolerance": None if args.tolerance is None else _numbers(args.tolerance)}
     changed = {key: value for key, value in wanted.items() if value is not None}
     if args.what and is_campaign(args.what):
