@@ -18,3 +18,7 @@ class InputError(RigError):
     def __init__(self, where: object, field: str, expected: str) -> None:
         self.where, self.field, self.expected = str(where), field, expected
         super().__init__(f"{where}: {field}: expected {expected}" if field else f"{where}: expected {expected}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """As a worker process hands it on."""
+        return type(self), (self.where, self.field, self.expected)

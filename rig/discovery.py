@@ -42,7 +42,7 @@ def model_of(args: argparse.Namespace) -> tuple[Model, Provenance]:
     """
     from fdi.discovery.ledger import Provenance, load
 
-    options.load_user_effects(args.effects)
+    options.load_user_effects([*args.effects, *options.named_in(args.model, args.effects)])
     if args.model and Path(args.model).is_file():
         model, known = load(Path(args.model))
         return model.replace(options.changes(args.set)), known

@@ -54,8 +54,24 @@ def model_of(args: argparse.Namespace) -> Model:
     Raises:
         InputError: a file, name or value that cannot be used.
     """
-    load_user_effects(args.effects)
+    load_user_effects([*args.effects, *named_in(args.model, args.effects)])
     return load_model(args.model or "eha").replace(changes(args.set))
+
+
+def named_in(model: str | None, given: list[Path]) -> list[Path]:
+    """The files of a user's own effects that a model file names, where they are found: here or beside it.
+
+    A file of the same name among the `given` ones takes the place of one.
+    """
+    if model is None or not Path(model).is_file():
+        return []
+    from plant.parameters import read_toml
+
+    said = read_toml(Path(model)).get("provenance", {})
+    named = said.get("effect_files", []) if isinstance(said, dict) else []
+    files = [Path(name) for name in named if isinstance(name, str)]
+    places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
+    return [p for p in places if p is not None and p.name not in [g.name for g in given]]
 
 
 def load_user_effects(files: list[Path]) -> None:

@@ -129,7 +129,7 @@ def test_bad_input_is_told_in_one_line(line: list[str], complaint: str, runs: di
     assert model.read_text() == before and not Path("model.toml").exists()
 
 
-def test_a_model_with_a_users_effect_asks_for_its_file(tmp_path: Path) -> None:
+def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Path) -> None:
     own = tmp_path / "own.py"
     own.write_text(STIFF.format(scale=1.0))
     with restored_catalogue():
@@ -140,6 +140,10 @@ def test_a_model_with_a_users_effect_asks_for_its_file(tmp_path: Path) -> None:
         interval = {"spring.stiffness": Value(1e5, 9e4, 1.1e5, "N/m")}
         (tmp_path / "m.toml").write_text(ledger.written(model, interval, known))
         assert ledger.load(tmp_path / "m.toml") == (model, known)
+    with restored_catalogue():
+        said = rig("compare", tmp_path / "s.csv", "--model", tmp_path / "m.toml")
+        assert said.status == 0, said.err
+    own.rename(tmp_path / "elsewhere.py")
     said = rig("add", "null_bias", tmp_path / "s.csv", "--model", tmp_path / "m.toml")
     assert said.status == 2 and f"--effects {own} with it, where spring is defined" in said.err
     said = rig("explain", tmp_path / "s.csv", "--model", tmp_path / "m.toml")
