@@ -1,0 +1,159 @@
+"""The sizes of both faults in each dated trace of a folder, kept so that no trace is diagnosed twice."""
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fdi.health.types import FAULTS, Estimate
+from fdi.trace import Trace
+from fdi.trend.dates import AXES, TABLE, Row, days, in_name, read_table, row_of
+from plant.compile import cache_folder
+from plant.errors import InputError
+from plant.model import Model
+
+Progress = Callable[[str, int, int], None]
+Keep = Path | None
+
+ENDINGS = (".mcap", ".csv", ".csv.gz")
+ROOT = Path(__file__).parents[2]
+
+
+class Point(NamedTuple):
+    """One trace: where it stands on the axis, and its sizes."""
+
+    trace: str  # path within the folder
+    t: float
+    sizes: Mapping[str, Estimate]  # by fault
+    note: str = ""
+
+
+class Gathered(NamedTuple):
+    """The traces of one unit in the order of time."""
+
+    source: str
+    axis: str  # "date" | "hours" | "flights"
+    points: tuple[Point, ...]
+    notes: tuple[str, ...]
+
+
+class Options(NamedTuple):
+    """How to gather."""
+
+    axis: str | None = None  # default: the first that all traces have
+    table: Path | None = None  # default: dates.csv in the folder, if there is one
+    again: bool = False  # diagnose even what is known
+
+
+def gather(folder: Path, model: Model, options: Options, progress: Progress) -> Gathered:
+    """Diagnose all traces of a folder and below.
+
+    Raises:
+        InputError: no folder, no traces, no axis on which all of them stand, or none that can be judged.
+    """
+    files, notes = traces(folder), []
+    place = options.table or folder / TABLE
+    table = read_table(place) if options.table or place.is_file() else {}
+    known: list[tuple[str, Row, Mapping[str, Any]]] = []
+    for i, file in enumerate(files):
+        progress(f"trace {i + 1} of {len(files)}", i, len(files))
+        name = file.relative_to(folder).as_posix()
+        try:
+            told = diagnosed(file, model, options.again)
+        except InputError as error:
+            notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
+            continue
+        known.append((name, _row(folder, name, told, row_of(table, name)), told))
+    progress("trend", len(files), len(files))
+    if not known:
+        raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
+    axis = _axis(folder, known, options.axis)
+    notes += [f"{key} stands in {place.name}, but there is no such trace" for key, row in table.items()
+              if row not in [row_of(table, name) for name, _, _ in known]]
+    column = list(AXES).index(axis)
+    points = [Point(name, row[column], {f.name: Estimate(*told["sizes"][f.name]) for f in FAULTS}, told["note"])
+              for name, row, told in known]
+    return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes))
+
+
+def traces(folder: Path) -> list[Path]:
+    """All files that may be traces. Raises InputError where there are none."""
+    if not folder.is_dir():
+        raise InputError(folder, "", "a folder of dated traces, or the JSON file of an earlier answer")
+    found = sorted(path for path in folder.rglob("*") if path.name.endswith(ENDINGS) and path.name != TABLE
+                   and not any(part.startswith(".") for part in path.relative_to(folder).parts))
+    if not found:
+        raise InputError(folder, "", "traces in it: .mcap, .csv or .csv.gz")
+    return found
+
+
+def _row(folder: Path, name: str, told: Mapping[str, Any], row: Row | None) -> Row:
+    """Where a trace stands: by the table, else by its own start time, else by its name."""
+    row = row or Row(math.nan, math.nan, math.nan)
+    if not math.isnan(row.date):
+        return row
+    own = days(told["started"])
+    return row._replace(date=own if not math.isnan(own) else in_name(Path(folder.resolve().name) / name))
+
+
+def _axis(folder: Path, known: list[tuple[str, Row, Mapping[str, Any]]], wanted: str | None) -> str:
+    """The axis asked for, or the first on which every trace stands."""
+    without = {axis: [name for name, row, _ in known if math.isnan(row[i])] for i, axis in enumerate(AXES)}
+    for axis in (wanted,) if wanted else AXES:
+        if not without[axis]:
+            return axis
+    missing = without[wanted or "date"]
+    where = folder / missing[0]
+    if (wanted or "date") == "date":
+        raise InputError(where, "date", "a start time in the log, an ISO date in the name of file or folder "
+                                        f"(2026-01-31), or a line in {folder / TABLE} (file,date)")
+    raise InputError(where, str(wanted), f"a line in {folder / TABLE} with a column {wanted}")
+
+
+def diagnosed(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
+    """Start time and sizes of a trace, by `diagnose` or from what was kept of an earlier call.
+
+    Raises:
+        InputError: a trace that cannot be judged; that is not kept.
+    """
+    place = _kept(file, model)
+    if place.is_file() and not again:
+        found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
+        return found
+    from fdi.health.diagnosis import diagnose
+
+    trace = Trace.read(file)
+    d = diagnose(trace, model, source=str(file))
+    note = "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""
+    found = {"started": trace.provenance.get("started", ""), "sizes": {f.name: list(d.sizes[f.name]) for f in FAULTS},
+             "note": note}
+    place.parent.mkdir(parents=True, exist_ok=True)
+    half = place.with_suffix(f".{hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:8]}")
+    half.write_text(json.dumps(found), encoding="utf-8")
+    half.replace(place)  # whole or not at all
+    return found
+
+
+def _kept(file: Path, model: Model) -> Path:
+    """Where the answer of a trace is kept: under a hash of the trace, the model and the code that judges."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise InputError(file, "", f"a readable file ({error.strerror})") from error
+    text = json.dumps([sorted(model.values.items()), model.effects, model.plant, _code()])
+    return cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
+
+
+@cache
+def _code() -> str:
+    """A hash of the physics and of what judges a trace."""
+    digest = hashlib.sha256()
+    for folder in ("plant", "fdi", "fdi/discovery", "fdi/health"):
+        for path in sorted((ROOT / folder).glob("*.*")):
+            if path.suffix in (".py", ".toml", ".npz", ".json"):
+                digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()

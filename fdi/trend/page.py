@@ -1,0 +1,38 @@
+"""One HTML page about a trend that needs no network: remaining life of both faults, picture, traces."""
+from __future__ import annotations
+
+from typing import Any
+
+from fdi.health.types import FAULTS
+from fdi.trend.answer import NAMES, Answer, date, interval, left, sentences
+from fdi.trend.dates import iso
+from fdi.trend.figure import drawing
+from fdi.trend.trend import Trend
+
+MOODS = ("good", "doubtful", "bad")
+
+
+def render(found: Answer) -> str:
+    """The page as text."""
+    from jinja2 import Environment, PackageLoader
+
+    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    g = found.gathered
+    return pages.get_template("trend.html").render(
+        title=g.source, verdict=found.level.name.replace("_", " "), mood=MOODS[found.level], traces=len(g.points),
+        first=_place(found, g.points[0].t), last=_place(found, g.points[-1].t), notes=g.notes, picture=drawing(found),
+        faults=[{"name": t.fault.name.replace("_", " "), "verdict": t.verdict.replace("_", " "),
+                 "lines": sentences(t, found), "rows": _rows(t, found)} for t in found.trends],
+        symbols=[f.symbol for f in FAULTS],
+        points=[{"trace": p.trace, "at": _place(found, p.t), "note": p.note,
+                 "sizes": [interval(p.sizes[f.name], f.unit) for f in FAULTS]} for p in g.points])
+
+
+def _rows(trend: Trend, found: Answer) -> list[dict[str, Any]]:
+    return [{"name": NAMES[level], "left": left(r, trend, found),
+             "from": date(r.low, found), "at": date(r.value, found), "to": date(r.high, found),
+             "soon": f"{100 * r.within(trend.t[-1] - trend.t[0]):.0f} %"} for level, r in trend.remaining.items()]
+
+
+def _place(found: Answer, t: float) -> str:
+    return iso(t) if found.gathered.axis == "date" else f"{t:g} {found.unit}"
