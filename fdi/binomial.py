@@ -1,4 +1,4 @@
-"""How sure a count is."""
+"""How sure a count is: shares with their exact intervals."""
 from __future__ import annotations
 
 import math
