@@ -2,8 +2,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -35,6 +36,15 @@ def diagnosis(d: Diagnosis, then: str, pages: Sequence[Path] = ()) -> None:
         out.print(f"[dim]{'written':<11}[/]{escape(str(page))}", soft_wrap=True)
     if then:
         out.print(f"[dim]{'next':<11}[/][bold]{escape(then)}[/]", soft_wrap=True)
+
+
+def bands(made: Mapping[str, Any]) -> None:
+    """What `--learn-bands` wrote."""
+    out = console()
+    judged = " and ".join(NAMES[name] for name in made["judges"]) or "neither fault: both are within healthy scatter"
+    out.print(f"[bold]{escape(made['bands'])}[/]  judges {judged}", soft_wrap=True)
+    for label, text in made["provenance"].items():
+        out.print(f"[dim]{label:<13}[/]{escape(text)}", soft_wrap=True)
 
 
 def faults(d: Diagnosis) -> Table:

@@ -93,8 +93,9 @@ class Excursion(NamedTuple):
 
     @property
     def judged(self) -> bool:
-        """Whether there is a limit at any known sample."""
-        return bool((np.isfinite(self.departure) & np.isfinite(self.middle)).any())
+        """Whether there is a limit over known samples for long enough to be left."""
+        limited = np.isfinite(self.departure) & np.isfinite(self.middle)
+        return bool(lasting_most(limited.astype(float)) > 0.0)
 
 
 def judge_columns(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LASTING = 3  # samples in a row beyond a limit that make an event; as many within end it
-CLEAR = 5.0  # healthy standard deviations by which a fault must move a step's response where it is to be judged
+CLEAR = 4.5  # healthy standard deviations by which a fault must move a step's response where it is to be judged
 NEAREST = 4.0  # healthy standard deviations; nearer to the healthy response no limit stands
 HORIZON = 0.1  # s after a step; later there is only stick-slip, which the ramps show better
 FIRST = 0.004  # s; the command has to come through the pilot stage and a cycle of the bus

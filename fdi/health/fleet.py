@@ -41,8 +41,8 @@ def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[s
           ) -> Bands:
     """Bands from healthy traces of one command.
 
-    The mean is the fleet's own. The scatter is the fleet's, too, with the simulated one as if it were PRIOR traces more,
-    and wider by what so few traces leave unsure (Student's t). What the faults add is simulated with `model`.
+    The mean is the fleet's own. The scatter is the fleet's, too, with the simulated one as if of PRIOR traces more, and
+    wider by what so few traces leave unsure (Student's t). What the faults add is simulated with `model`.
 
     Args:
         traces: at least FEWEST, without load.

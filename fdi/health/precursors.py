@@ -69,7 +69,7 @@ def measure(source: Trace | Cycles, bands: Bands | None = None) -> dict[str, Pre
 
 def _precursor(name: str, value: float, known: Mapping[str, float]) -> Precursor:
     kind = MEANINGS[kind_of(name)]
-    size = f", {name.rpartition('_')[2]}" if kind_of(name) in OF_STEPS else ""
+    size = f", {name.rpartition('_')[2].replace('mm', ' mm')}" if kind_of(name) in OF_STEPS else ""
     numbers = (known.get(key, math.nan) for key in ("healthy", "noise", CLOGGING.name, FRICTION.name))
     return Precursor(value, SI.get(kind.unit, kind.unit), kind.words + size, shown(value, name), *numbers)
 

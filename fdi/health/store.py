@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 DEFAULT = "preflight_bands.toml"
 UM, MS = 1e6, 1e3
-COARSE = 4  # cycles between the times at which shifts and spreads are written
+COARSE = 2  # cycles between the times at which shifts and spreads are written
 LISTS = ("healthy_um", "spread_um", "friction_um", "middle_um", "most_um")
 HEADER = """\
 # Bands of a command, as `rig fdi --learn-bands` writes them; `rig fdi TRACE --bands FILE` judges by them.

@@ -18,13 +18,20 @@ HELP = "judge filter clogging and spool friction from a trace: levels, sizes wit
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     add = parser.add_argument
-    add("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
+    add("trace", metavar="TRACE", nargs="?",
+        help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
     options.add_model(parser)
-    add("--bands", metavar="FILE", help="bands to judge by (default: the software's own, for the preflight command)")
+    add("--bands", metavar="FILE", help="bands to judge by (default: the software's own, of the preflight command)")
+    add("--learn-bands", nargs="*", metavar="TRACE", help="make bands from a fleet's healthy traces and write them to "
+                                                          "--out FILE.toml; without traces, from simulated units")
+    add("--command", dest="command_file", metavar="FILE",
+        help="what --learn-bands simulates: CSV with t,com (default: the main phase of preflight)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Diagnose a trace; exit status 0 if both faults are acceptable, 1 otherwise."""
+    """Diagnose a trace; exit status 0 if both faults are acceptable, 1 otherwise. Or learn bands."""
+    if args.learn_bands is not None:
+        return learned(args)
     from fdi.health.diagnosis import diagnose
     from fdi.health.words import to_json
     from fdi.output import write_text
@@ -36,13 +43,39 @@ def run(args: argparse.Namespace) -> int:
     model = options.model_of(args)
     with waiting(args.json or args.quiet) as progress:
         found = diagnose(Trace.read(args.trace), model, bands_of(args), progress, str(args.trace))
-        if answer is not None:
+        if answer is not None and answer.suffix == ".html":
+            from fdi.health.page import render
+
+            progress("the page", 0, 0)
+            write_text(answer, render(found))
+        elif answer is not None:
             write_text(answer, json.dumps(to_json(found)) + "\n")
     if args.json:
         print(json.dumps(to_json(found)))
     elif not args.quiet:
         show_fdi.diagnosis(found, next_command(args, found), [answer] if answer else [])
     return 0 if found.passed else 1
+
+
+def learned(args: argparse.Namespace) -> int:
+    """Make bands of a command and write them; exit status 0."""
+    from fdi.health.learn import run as learn
+    from plant import InputError
+    from rig import show_fdi
+    from rig.commands.simulate import command_of
+    from rig.waiting import waiting
+
+    if args.trace is not None or not args.out or Path(args.out).suffix != ".toml":
+        raise InputError("--learn-bands", str(args.trace or args.out), "traces behind it, and --out FILE.toml")
+    model = options.model_of(args)
+    com, _, name = command_of(args.command_file, model["controller.period"])
+    with waiting(args.json or args.quiet) as progress:
+        made = learn(args.learn_bands, args.out, model, com, name, args.seed, progress)
+    if args.json:
+        print(json.dumps(made))
+    elif not args.quiet:
+        show_fdi.bands(made)
+    return 0
 
 
 def bands_of(args: argparse.Namespace) -> Bands | None:
@@ -63,6 +96,8 @@ def places(args: argparse.Namespace) -> Path | None:
     from fdi.output import writable
     from plant import InputError
 
+    if args.trace is None:
+        raise InputError("TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
     if not args.out:
         return None
     out = Path(args.out)

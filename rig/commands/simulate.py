@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from plant.model import STEPS
 
     model = options.model_of(args)
-    com, load, name = _command(args.command_file, model["controller.period"])
+    com, load, name = command_of(args.command_file, model["controller.period"])
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _command(file: str | None, period: float) -> tuple[Any, Any, str]:
+def command_of(file: str | None, period: float) -> tuple[Any, Any, str]:
     """Demand and load of every cycle of `period` s, and what to call them."""
     import numpy as np
 
