@@ -21,9 +21,10 @@ from fdi.discovery.settle import PATIENCE, WIDTH, _better, _inside
 Floats = NDArray[np.float64]
 
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
-LEVEL = 50.0  # sum of squares in whitened units, that this way may change; what shows makes a thousand
+LEVEL = 500.0  # sum of squares in whitened units, that this way may change; what shows makes more
 ACROSS = 1e-3  # of the logarithms: the first differences across
 NARROWEST, WIDEST = 1e-12, 9.0  # variances of scaled unknowns, within which a direction across is taken
+LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
 # Logarithms that move together, by their parameters; the first of each is the one that is left out across.
 FLAT: tuple[Mapping[str, float], ...] = (
     {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
@@ -38,7 +39,9 @@ FLAT: tuple[Mapping[str, float], ...] = (
 def flats(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
     """Directions at `x` (p,) of scaled unknowns that change no signal, as columns (p, k): those of `FLAT` that hold."""
     law = problem.model["filter.law"]
-    said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else flat for flat in FLAT]
+    load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
+    said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
+            {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT]
     ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in said])
     trials = np.array([_inside(free, x, TRIED * way) for way in ways])
     full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)

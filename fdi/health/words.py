@@ -13,7 +13,8 @@ NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
 LEVELS = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance required", Level.NON_NOMINAL: "non-nominal",
           None: "cannot be judged"}
 SUSPECTS = {
-    "jack.dynamic_friction": ("jack friction", "N", 1.0), "jack.leakage": ("leakage across the piston", "m3/s/Pa", 1.0),
+    "jack.dynamic_friction": ("jack friction", "N", 1.0), "jack.damping": ("viscous drag of the jack", "N s/m", 1.0),
+    "jack.mass": ("moving mass", "kg", 1.0), "jack.leakage": ("leakage across the piston", "m3/s/Pa", 1.0),
     "null_bias.current": ("null bias", "mA", 1e3), "constant_load.force": ("a load that was not measured", "N", 1.0),
 }
 SHOWN = {"xj": "XJ", "p12": "P12", "xs": "XS"}
