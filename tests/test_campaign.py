@@ -21,6 +21,8 @@ from plant import InputError, Model
 from plant.effects import CATALOGUE
 from rig.campaign import case as cases
 from rig.campaign import crew, folder, matrix, summary
+from rig.campaign.run import Hands, Progress
+from rig.campaign.run import run as campaign
 from rig.trial.truth import SYMBOLS, available
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
@@ -150,6 +152,16 @@ def test_own_workers_listen_on_this_machine_alone_and_give_the_same_rows(environ
     assert len({pid for pid, _ in calls(environment)}) == 2
 
 
+def test_it_tells_how_far_it_is_and_how_long_the_rest_takes(local: Path, tmp_path: Path) -> None:
+    told: list[Progress] = []
+    found = campaign(folder.matrix_of(local), tmp_path / "there", Hands(), told.append, most=8)
+    assert [(p.done, p.total) for p in told] == [(i + 1, 8) for i in range(8)]
+    assert told[-1].left == 0.0 < told[0].left and told[-1].failed == 1
+    assert [row["case"] for row in found] == list(range(8))
+    campaign(folder.matrix_of(local), tmp_path / "there", Hands(), told.append)
+    assert len(told) == 8  # nothing was left to do
+
+
 def test_a_failed_case_is_kept_with_its_reason_and_done_again_on_demand(local: Path) -> None:
     failed = [row for row in rows(local) if row["status"] == "failed"]
     assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
@@ -180,6 +192,8 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "filter_clogging"), "--fault: filter_clogging: expected healthy"),
     (("--fault", "healthy", "--tolerance", "0.5"), "tolerance: expected a number from 0 to 0.2"),
     (("--fault", "healthy", "--seeds", "0"), "seeds: expected a whole number from 1"),
+    (("--fault", "healthy", "--model", "ehs"), "--model: ehs: expected eha"),
+    (("--fault", "healthy", "--set", "controller.period=2e-3"), "--set: controller.period: expected 0.001 s"),
     (("--fault", "healthy", "--jobs", "0"), "--jobs: 0: expected 1 or more"),
     (("--fault", "healthy", "--work", "nothing:here"), "--work: nothing:here: expected module:function"),
     (("--fault", "healthy", "--scheduler", "tcp://127.0.0.1:1"), "--scheduler: tcp://127.0.0.1:1: expected the addr"),

@@ -28,6 +28,7 @@ from plant.parameters import accept, parse_toml, read_toml
 SIMULATORS = ("plant", "independent")
 SIGNALS = ("xj,p12,xs", "xj,p12", "xj")
 HEALTHY = "healthy"
+PERIOD = 1e-3  # s
 DEFAULTS: dict[str, Any] = {
     "seeds": 20,  # runs of each size
     "first": 0,  # seed of the first
@@ -75,13 +76,14 @@ def matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) ->
     """The campaign that the tables of a matrix file describe.
 
     Raises:
-        InputError: an unknown key or effect, a value that cannot be, or no case at all.
+        InputError: an unknown key or effect, a value or model that cannot be, or no case at all.
     """
     given = {key: value for key, value in tables.items() if key != "case"}
     for key in given.keys() - DEFAULTS.keys():
         raise InputError(where, key, f"one of {', '.join([*DEFAULTS, '[[case]]'])}")
     common = {**DEFAULTS, **given}
     _check(common, where)
+    _checked(model)
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
         raise InputError(where, "case", "at least one [[case]]; an empty one is a healthy plant")
@@ -100,6 +102,14 @@ def _check(common: dict[str, Any], where: object) -> None:
         raise InputError(where, "signals", f"one of {'; '.join(SIGNALS)}, not {common['signals']!r}")
     _count(where, "seeds", common["seeds"], 1)
     _count(where, "first", common["first"], 0)
+
+
+def _checked(model: Model) -> None:
+    """The preflight check, its scatter and its noise are those of one plant in its own cycle."""
+    if model.plant != "eha":
+        raise InputError("--model", model.plant, "eha, whose preflight check this is")
+    if model["controller.period"] != PERIOD:
+        raise InputError("--set", "controller.period", f"{PERIOD:g} s, the cycle of the preflight check")
 
 
 def _tolerances(value: Any, where: object) -> list[float]:
