@@ -10,10 +10,10 @@ reference model takes 20 to 100. Many runs stand side by side, as in `plant.bloc
 """
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from math import exp
+from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +29,10 @@ from plant.model import Model
 from plant.parameters import Controller
 
 Array = NDArray[np.float64]
+Reduction = Callable[[Array], Array]
 
 FAULTS = ("filter.clogging", "spool.static_friction")
-WIDTH = 16  # runs side by side
+WIDTH = 64  # runs side by side
 FEWEST = 1e-300  # stands for no speed at all, where something is divided by it
 
 
@@ -76,6 +77,15 @@ class Drive(NamedTuple):
     next: float = 0.0
 
 
+def decay(x: float) -> float:
+    """e^x for -1 <= x <= 0, to 4e-11, and at the usual -0.25 to 1e-16: Taylor's series for a quarter, squared twice."""
+    x = 0.25 * x
+    y = 1.0 + x * (1.0 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720 + x * (
+        1 / 5040 + x * (1 / 40320))))))))
+    y = y * y
+    return y * y
+
+
 def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
     """The monitor `h` seconds later, the current held.
 
@@ -87,17 +97,17 @@ def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
     begin = clip(asked, c.most)
     wait = abs(asked - begin) * c.wait  # s, the flapper at its stop
     wait = wait if wait < h else h
-    end = begin * exp(c.rate * (wait - h))
+    end = begin * decay(c.rate * (wait - h))
     line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
     spool = clip(s.spool + line + curve, c.spool_travel)
     area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
-    mean = clip(s.spool + area / h, c.spool_travel)
+    total = clip(h * s.spool + area, h * c.spool_travel)  # integral of XS
     before = s.spool - c.lag * c.speed * begin
     free = c.follow * (spool - c.lag * c.speed * end) + (s.speed - c.follow * before) * c.fade
     low, high = c.coast * s.speed - c.push, c.coast * s.speed + c.push  # P12 is no more than PSR
     v = free if free > low else low
     v = v if v < high else high
-    way = h * c.follow * mean - c.lag * (v - s.speed) if v == free else 0.5 * h * (s.speed + v)
+    way = c.follow * total - c.lag * (v - s.speed) if v == free else 0.5 * h * (s.speed + v)
     x = s.position + way
     sliding = 1.0 if asked > 0.0 else 0.0
     sliding = sliding if asked >= 0.0 else -1.0
@@ -136,54 +146,59 @@ def _bound(*arguments: Any) -> Any:
 motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _bound
 
 
-def control(a: Any, lane: int, demand: float) -> float:
-    """What the controller of one lane answers to a demand, A; it acts in the next cycle."""
-    cor, loop = answer(loop_at(a, lane), demand, motion_at(a, lane).position, controller_at(a, lane))
+def sample(a: Any, lane: int, pulled: float, shown: float) -> float:
+    """What one lane's ram shows; and the ram pulled by a share to the position `shown`."""
+    s = motion_at(a, lane)
+    keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
+    position: float = s.position
+    return position
+
+
+def control(a: Any, lane: int, demand: float, position: float) -> None:
+    """The controller of one lane answers to a demand; that acts in the next cycle."""
+    cor, loop = answer(loop_at(a, lane), demand, position, controller_at(a, lane))
     keep_loop(loop, a, lane)
     keep_drive(Drive(drive_at(a, lane).next, cor), a, lane)
-    return cor
 
 
-def run(a: Any, rows: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
-        out: Any) -> None:
-    """A block of runs; fills out[rows[lane], :, k] = XJ, or XJ, Cor, P12 and XS, at sample k.
+def run(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int, out: Any) -> None:
+    """A block of runs; fills out[:, k, lane] = XJ, or XJ, Cor, P12 and XS, at sample k.
 
     Args:
         a: the block's buffer: cells and controllers in place, the rest zero. Used up.
-        rows: (WIDTH,) where in `out` each lane goes.
         driven: (n,) demand m in closed loop, else the measured current A: driven[k - 1] acts from k to k + 1.
         position: (n,) m, measured, to which the ram is pulled; or (1,), where it starts; or (0,), in the middle.
         anchor: 1/s, how fast it is pulled.
         closed: with the controller.
         period: of a cycle, s.
         steps: a cycle.
-        out: (m, 1 or 4, n), written.
+        out: (1 or 4, n, WIDTH), written.
     """
     h, n = period / steps, len(driven)
     for lane in range(WIDTH):
         keep_motion(Motion(0.0, position[0] if len(position) else 0.0, 0.0, 0.0), a, lane)
     for k in range(n):
         given = driven[k - 1] if k else 0.0
-        pulled = anchor * period if len(position) == n and position[k] == position[k] else 0.0
-        shown = position[k] if pulled != 0.0 else 0.0
+        there = len(position) == n and position[k] == position[k]
+        pulled, shown = (anchor * period, position[k]) if there else (0.0, 0.0)
         for lane in range(WIDTH):
-            s = motion_at(a, lane)
-            out[rows[lane], 0, k] = s.position
-            keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
+            out[0, k, lane] = sample(a, lane, pulled, shown)
         if closed:
             for lane in range(WIDTH):
-                control(a, lane, driven[k])
-        else:
-            for lane in range(WIDTH):
-                keep_drive(Drive(given, driven[k]), a, lane)
-        if out.shape[1] > 1:
+                control(a, lane, driven[k], out[0, k, lane])
+        if len(out) > 1:
             for lane in range(WIDTH):
                 s, c = motion_at(a, lane), cell_at(a, lane)
-                out[rows[lane], 1, k], out[rows[lane], 3, k] = drive_at(a, lane).next, s.spool
-                out[rows[lane], 2, k] = clip(c.pressure_gain * s.spool - c.pressure_slope * s.speed, c.pressure_limit)
+                out[1, k, lane] = drive_at(a, lane).next if closed else driven[k]
+                out[2, k, lane] = clip(c.pressure_gain * s.spool - c.pressure_slope * s.speed, c.pressure_limit)
+                out[3, k, lane] = s.spool
         for _ in range(steps):
-            for lane in range(WIDTH):  # the loop that everything is for
-                keep_motion(step(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
+            if closed:
+                for lane in range(WIDTH):  # the loop that everything is for
+                    keep_motion(step(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
+            else:
+                for lane in range(WIDTH):
+                    keep_motion(step(motion_at(a, lane), given, h, cell_at(a, lane)), a, lane)
 
 
 PARTS = {"motion": Motion(), "loop": Loop(), "drive": Drive(), "cell": Cell(*[0.0] * len(Cell._fields)),
@@ -216,7 +231,7 @@ class Monitor:
                 raise InputError("monitor", name, "a parameter of the reference model other than the period")
 
     def replay(self, values: Array, current: Array, position: Array | None = None, anchor: float = 0.0,
-               whole: bool = False) -> Array:
+               whole: bool = False, reduced: Reduction = lambda rows: rows) -> Array:
         """The monitor without its controller, driven by a measured current.
 
         Args:
@@ -225,40 +240,49 @@ class Monitor:
             position: (n,) m, measured, NaN where missing: runs start at rest at position[0].
             anchor: 1/s, how fast the ram is pulled to the measured position; 0 is a free run.
             whole: all columns, not XJ alone.
+            reduced: what to keep of some runs, (w, columns, n), as (w, ..): it saves the memory of all.
 
         Returns:
-            (m, columns, n): XJ m; or XJ, Cor A, P12 Pa, XS m at each sample.
+            (m, columns, n): XJ m; or XJ, Cor A, P12 Pa, XS m at each sample. Or what `reduced` makes of it.
 
         Raises:
-            InputError: shapes that do not fit.
+            InputError: shapes that do not fit, or no position to start from.
         """
-        return self._run(values, current, np.empty(0) if position is None else position, anchor, False, whole)
+        return self._run(values, current, np.empty(0) if position is None else position, anchor, False, whole, reduced)
 
-    def closed_loop(self, values: Array, com: Array, start: float = 0.0, whole: bool = False) -> Array:
+    def closed_loop(self, values: Array, com: Array, start: float = 0.0, whole: bool = False,
+                    reduced: Reduction = lambda rows: rows) -> Array:
         """The monitor with the model's controller over a command `com` (n,) m, at rest at `start` m; as `replay`."""
-        return self._run(values, com, np.array([start]), 0.0, True, whole)
+        return self._run(values, com, np.array([start]), 0.0, True, whole, reduced)
 
-    def _run(self, values: Array, driven: Array, position: Array, anchor: float, closed: bool, whole: bool) -> Array:
+    def _run(self, values: Array, driven: Array, position: Array, anchor: float, closed: bool, whole: bool,
+             reduced: Reduction) -> Array:
         values, driven, position = (np.ascontiguousarray(x, float) for x in (values, driven, position))
         if values.ndim != 2 or values.shape[1] != len(self.names):
             raise InputError("monitor", "values", f"one row a run of {len(self.names)}, not shape {values.shape}")
-        if driven.ndim != 1 or position.shape not in (driven.shape, (0,), (1,)):
-            raise InputError("monitor", "position", f"one a cycle, not {position.shape} beside {driven.shape}")
-        out = np.empty((len(values) + 1, 4 if whole else 1, len(driven)))  # the last for idle lanes
-        inputs = driven, position, anchor, closed, float(self.model["controller.period"]), self.steps
-        run, blocks = kernel(), list(self._blocks(values))
-        with ThreadPoolExecutor(self.workers) as pool:
-            list(pool.map(lambda block: run(*block, *inputs, out), blocks))
-        return out[:-1]
+        if driven.ndim != 1 or position.shape not in (driven.shape, (0,), (1,)) or np.isnan(position[:1]).any():
+            raise InputError("monitor", "position", "one a cycle, the first of them known, "
+                             f"not {position.shape} beside {driven.shape}")
+        period = float(self.model["controller.period"])
+        kv = cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
+        steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # as far as `decay` goes; one for any usual pilot
+        inputs = driven, position, float(anchor), closed, period, steps
+        run = kernel()
 
-    def _blocks(self, values: Array) -> Iterator[tuple[Array, NDArray[np.uint64]]]:
-        """The runs WIDTH at a time: the buffer at the start, and where the rows go; idle lanes repeat the last run."""
-        h = self.model["controller.period"] / self.steps
+        def do(block: tuple[int, Array]) -> Array:
+            out = np.empty((4 if whole else 1, len(driven), WIDTH))
+            run(block[1], *inputs, out)
+            return reduced(out[:, :, :block[0]].transpose(2, 0, 1))
+
+        with ThreadPoolExecutor(self.workers) as pool:
+            return np.concatenate(list(pool.map(do, self._blocks(values, period / steps))))
+
+    def _blocks(self, values: Array, h: float) -> Iterator[tuple[int, Array]]:
+        """The runs WIDTH at a time: how many they are, and the buffer at the start; idle lanes repeat the last run."""
         fixed = [values[:, self.names.index(name)] if name in self.names else np.full(len(values), self.model[name])
                  for name in (f"controller.{field}" for field in Controller._fields)]
         numbers = np.array([*cells(self.model, self.names, values, h, self.sliding), *fixed])  # (numbers, m)
         for first in range(0, len(values), WIDTH):
             lanes = np.minimum(np.arange(first, first + WIDTH), len(values) - 1)
             buffer = np.concatenate([np.zeros((STATES, WIDTH)), numbers[:, lanes]])
-            rows = np.where(np.arange(first, first + WIDTH) < len(values), lanes, len(values))
-            yield buffer.reshape(-1), rows.astype(np.uint64)  # unsigned: no test for counting from the end
+            yield min(WIDTH, len(values) - first), buffer.reshape(-1)

@@ -9,7 +9,7 @@ import pytest
 
 from plant import InputError, Model, simulate
 from plant.lanes import Lanes
-from plant.monitor import FAULTS, Cell, Monitor, Motion, cells, step
+from plant.monitor import FAULTS, Cell, Monitor, Motion, cells, decay, step
 from rig.sequences import load_sequence
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
@@ -138,10 +138,22 @@ def test_is_the_reference_model_without_what_it_leaves_out(clogging: float, fric
     assert np.abs(ours[0] - reference[:, 0])[:600].max() < 2e-6
 
 
+def test_decay_is_the_exponential() -> None:
+    for x in np.linspace(-1.0, 0.0, 41):
+        assert decay(x) == pytest.approx(exp(x), rel=1e-10 if x < -0.25 else 1e-15)
+
+
+def test_a_fast_pilot_takes_more_steps() -> None:
+    fast = QUIET.replace({"pilot.flow_gain": 40 * 0.069})  # Kv 10 a cycle
+    values = np.array([[0.0, 5.0], [0.3, 60.0]])
+    once, often = (Monitor(fast, steps=n).replay(values, 1e-3 * np.sin(np.arange(300)), whole=True) for n in (1, 200))
+    assert np.abs(once - often)[:, 3].max() < 1e-11
+
+
 def test_side_by_side_is_alone() -> None:
-    values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (19, 2))  # not a whole block
+    values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (71, 2))  # not a whole block
     runs = Monitor(QUIET).closed_loop(values, STEP, whole=True)
-    for row in (0, 7, 16, 18):
+    for row in (0, 7, 64, 70):
         assert (runs[row] == one(STEP, *values[row])).all()
     assert (Monitor(QUIET).closed_loop(values, STEP)[:, 0] == runs[:, 0]).all()
 
@@ -167,7 +179,7 @@ def test_replay_follows_the_measured_ram() -> None:
 
 
 def test_several_times_cheaper_than_the_reference() -> None:
-    """Against the fewest steps at which the reference may be used for fits; it is some 9 times."""
+    """Against the fewest steps at which the reference may be used for fits; it is some 13 times."""
     values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (64, 2))
     monitor, reference = Monitor(QUIET, workers=1), Lanes(QUIET, FAULTS, 10, 1)
     none = np.zeros_like(PREFLIGHT)

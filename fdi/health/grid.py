@@ -96,13 +96,13 @@ def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats 
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
     values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
-    tried = {ratio: _rms(c, _runs(c, model, values, drive, ratio), rows) for ratio in sliding}
+    tried = {ratio: _rms(c, model, values, drive, ratio, rows) for ratio in sliding}
     joint = {ratio: _joint(maps, rows) for ratio, maps in tried.items()}
     ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
     step, ramp = (_map(tried[ratio][kind], kintas, fss) if kind in rows else None for kind in ("step", "ramp"))
     both = _map(joint[ratio], kintas, fss)
     near = _valley(both, kintas, fss)
-    finer = _joint(_rms(c, _runs(c, model, near, drive, ratio), rows), rows)
+    finer = _joint(_rms(c, model, near, drive, ratio, rows), rows)
     deepest = int(finer.argmin())
     best = Point(float(near[deepest, 0]), float(near[deepest, 1]), float(finer[deepest]))
     return Grid(kintas, fss, step, ramp, both, merge(step, ramp), best, ratio, drive,
@@ -129,23 +129,22 @@ def _rows(c: Cycles, kind: str) -> Flags:
     return chosen & ~np.isnan(c.measured("xj"))
 
 
-def _runs(c: Cycles, model: Model, values: Floats, drive: str, sliding: float) -> Floats:
-    """XJ of the monitor, (m, n)."""
+def _rms(c: Cycles, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]
+         ) -> dict[str, Floats]:
+    """RMS of XJ, measured less monitor, by kind of section; (m,) m each."""
+    def reduced(runs: Floats) -> Floats:
+        found = []
+        for chosen in rows.values():
+            left = runs[:, 0].T[chosen] - c.xj[chosen, None]
+            found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
+        return np.stack(found, -1)
+
     monitor = Monitor(model, sliding=sliding)
-    start = float(c.xj[0]) if known_start(c) else 0.0
     if drive == "command":
-        return monitor.closed_loop(values, c.com, start)[:, 0]
-    return monitor.replay(values, c.cor, c.xj if known_start(c) else None, ANCHOR)[:, 0]
-
-
-def _rms(c: Cycles, runs: Floats, rows: dict[str, Flags]) -> dict[str, Floats]:
-    """By kind of section, (m,) m."""
-    found = {}
-    for kind, chosen in rows.items():
-        left = runs[:, chosen]
-        left -= c.xj[chosen]
-        found[kind] = np.sqrt(np.einsum("ij,ij->i", left, left) / chosen.sum())
-    return found
+        out = monitor.closed_loop(values, c.com, float(c.xj[0]) if known_start(c) else 0.0, reduced=reduced)
+    else:
+        out = monitor.replay(values, c.cor, c.xj if known_start(c) else None, ANCHOR, reduced=reduced)
+    return dict(zip(rows, out.T, strict=True))
 
 
 def _joint(maps: dict[str, Floats], rows: dict[str, Flags]) -> Floats:
