@@ -25,7 +25,9 @@ def judged(label: str, kintas: float, fss: float, said: tuple[str, str], n: int,
     ruling = "filter_clogging" if said[0] != "acceptable" else "spool_friction" if said[1] != "acceptable" else ""
     return [{"label": label, "faults": len(label.split()) if label != "healthy" else 0, "tolerance": 0.015, "seed": i,
              "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss, "level_filter_clogging": said[0],
-             "level_spool_friction": said[1], "ruling": ruling, "seconds": 2.0, **sizes, **more} for i in range(n)]
+             "level_spool_friction": said[1], "ruling": ruling,
+             "band_spool_friction": said[1] if said[1] == "non_nominal" else "acceptable",
+             "seconds": 2.0, **sizes, **more} for i in range(n)]
 
 
 def test_statistics_count_what_was_said() -> None:
@@ -49,6 +51,7 @@ def test_statistics_count_what_was_said() -> None:
     assert count("ruling fault, MidBand on") == (68, 72, False)
     assert count("off-grid Kintas covered") == (25, 25, False) and count("off-grid FSS within 2 %") == (25, 25, None)
     points = [(p.size, p.detected.good, p.most.good) for p in summary.curve(found, FRICTION)]
+    assert [p.bands.good for p in summary.curve(found, FRICTION)] == [0, 30]
     assert points == [(5.0, 3, 0), (70.0, 30, 30)]
     assert summary.levels(found, CLOGGING)["acceptable"] == {
         fine: 402 + 30 + 25, bad: 1, worst: 0, "cannot_tell": 0, "refused": 1, "failed": 0}

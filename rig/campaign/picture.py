@@ -13,7 +13,8 @@ from fdi.health.types import FAULTS, Fault
 from rig.campaign.summary import title
 
 BLUE = "#1f6feb"
-LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN))
+LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN),
+         ("bands", "maintenance or worse, by the bands alone", COMMAND))
 
 
 def detection(part: Mapping[str, Any]) -> str:
@@ -34,7 +35,7 @@ def _curve(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:
     span = max([fault.most, *(point["size"] for point in points)]) - fault.healthy
     for i, (key, label, colour) in enumerate(LINES):
         known = [point for point in points if point[key]["of"]]
-        x = [point["size"] + 0.004 * (i - 1) * span for point in known]  # beside one another
+        x = [point["size"] + 0.004 * (i - 1.5) * span for point in known]  # beside one another
         y = [100 * point[key]["share"] for point in known]
         ends = [[100 * abs(point[key]["share"] - point[key][end]) for point in known] for end in ("low", "high")]
         ax.errorbar(x, y, ends, color=colour, lw=1.4, marker="o", ms=3.5, elinewidth=0.9, capsize=2, label=label)

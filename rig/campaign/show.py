@@ -78,13 +78,14 @@ def _rates(rates: Sequence[Mapping[str, Any]]) -> Table:
     table = _table("", "count", "share", "95 % interval", "asked", "")
     for r in rates:
         if r["share"]["of"]:
-            asked = _asked(100 * r["least"], 100 * r["most"])
-            verdict = ("too few" if asked else "") if r["met"] is None else "met" if r["met"] else "NOT met"
-            table.add_row(r["name"], *percent(r["share"]), asked, verdict)
+            wanted = asked(100 * r["least"], 100 * r["most"])
+            verdict = ("too few" if wanted else "") if r["met"] is None else "met" if r["met"] else "NOT met"
+            table.add_row(r["name"], *percent(r["share"]), wanted, verdict)
     return table
 
 
-def _asked(low: float, high: float) -> str:
+def asked(low: float, high: float) -> str:
+    """What is asked for, between two shares in per cent; "" where nothing is."""
     if low > 0 and high < 100:
         return f"{low:g} .. {high:g} %"
     return f">= {low:g} %" if low > 0 else f"<= {high:g} %" if high < 100 else ""
@@ -92,9 +93,10 @@ def _asked(low: float, high: float) -> str:
 
 def _curve(name: str, unit: str, points: Sequence[Mapping[str, Any]]) -> Table:
     table = _table(f"{name}{f', {unit}' if unit != '1' else ''}", "detected", "share", "95 % interval",
-                   "non-nominal", "ruling")
+                   "non-nominal", "ruling", "by bands")
     for p in points if len(points) > 1 else []:
-        table.add_row(f"{p['size']:g}", *percent(p["detected"]), percent(p["most"])[1], percent(p["ruling"])[1])
+        more = (percent(p[key])[1] for key in ("most", "ruling", "bands"))
+        table.add_row(f"{p['size']:g}", *percent(p["detected"]), *more)
     return table
 
 

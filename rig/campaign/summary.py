@@ -43,6 +43,7 @@ class Point(NamedTuple):
     detected: Share  # level beyond acceptable
     most: Share  # level non-nominal
     ruling: Share  # named as the ruling fault
+    bands: Share  # beyond acceptable by the bands alone
 
 
 class Error(NamedTuple):
@@ -104,7 +105,17 @@ def rates(rows: Sequence[Row]) -> list[Rate]:
     beyond = [(row, fault) for fault in FAULTS for row in single(rows, fault) if truth(row, fault) >= fault.middle]
     out.append(Rate("ruling fault, MidBand on",
                     share(sum(row.get("ruling") == fault.name for row, fault in beyond), len(beyond)), 0.97))
-    return [*out, *_off_grid([row for row in rows if row["label"] == OFF_GRID])]
+    return [*out, *_covered(rows), *_off_grid([row for row in rows if row["label"] == OFF_GRID])]
+
+
+def _covered(rows: Sequence[Row]) -> list[Rate]:
+    """Over all plants that scatter; not where the truth is a bound: an interval that starts there holds it."""
+    out = []
+    for fault in FAULTS:
+        of = [e.covered for e in errors([row for row in rows if row["tolerance"] > 0.0])
+              if e.fault == fault.name and e.truth > 0.0]
+        out.append(Rate(f"{title(fault)} covered, all", share(sum(c.good for c in of), sum(c.of for c in of))))
+    return out
 
 
 def _off_grid(rows: Sequence[Row]) -> list[Rate]:
@@ -137,9 +148,9 @@ def alarm(row: Row) -> bool:
     return any(detects(fault)(row) for fault in FAULTS) or row.get("verdict") == "SOMETHING_ELSE"
 
 
-def detects(fault: Fault, level: Level = Level.MAINTENANCE) -> Callable[[Row], bool]:
-    """Whether a row says that a fault has reached a level."""
-    return lambda row: row["status"] == OK and row[f"level_{fault.name}"] in LEVELS[level:]
+def detects(fault: Fault, level: Level = Level.MAINTENANCE, by: str = "level") -> Callable[[Row], bool]:
+    """Whether a row says that a fault has reached a level; `by` the sizes ("level") or the bands alone ("band")."""
+    return lambda row: row["status"] == OK and row.get(f"{by}_{fault.name}") in LEVELS[level:]
 
 
 def single(rows: Iterable[Row], fault: Fault) -> list[Row]:
@@ -163,7 +174,8 @@ def curve(rows: Sequence[Row], fault: Fault) -> list[Point]:
     sizes = sorted({truth(row, fault) for row in of})
     groups = [(size, [row for row in of if truth(row, fault) == size]) for size in sizes]
     return [Point(size, counted(group, detects(fault)), counted(group, detects(fault, Level.NON_NOMINAL)),
-                  counted(group, lambda row: row.get("ruling") == fault.name)) for size, group in groups]
+                  counted(group, lambda row: row.get("ruling") == fault.name),
+                  counted(group, detects(fault, by="band"))) for size, group in groups]
 
 
 def levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]:
@@ -202,9 +214,11 @@ def _having(row: Row) -> str:
 
 
 def errors(rows: Sequence[Row]) -> list[Error]:
-    """Errors of the estimates by label and fault, in the rows' order."""
+    """Errors of the estimates by label and fault: healthy plants, single faults, both, each by size."""
     found = []
-    for name in dict.fromkeys(row["label"] for row in rows):
+    sizes = {row["label"]: (row["faults"], row["true_kintas"] == 0.0, row["true_kintas"], row["true_fss"])
+             for row in rows}
+    for name in sorted(sizes, key=lambda name: (sizes[name], name)):
         for fault in FAULTS:
             of = [row for row in rows if row["label"] == name and row.get(f"{fault.symbol}_low") is not None
                   and row["status"] == OK and math.isfinite(row[f"{fault.symbol}_high"] - row[f"{fault.symbol}_low"])]

@@ -1,0 +1,70 @@
+"""Put a campaign's figures into fdi_statistics.md, and its picture beside it: python docs/fdi_statistics.py FOLDER."""
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdi.health.types import FAULTS
+from rig.campaign.folder import read_rows
+from rig.campaign.picture import detection
+from rig.campaign.show import asked, percent
+from rig.campaign.summary import summary, title
+
+PAGE = Path(__file__).with_suffix(".md")
+BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines) + "\n"
+
+
+def part(figures: Mapping[str, Any]) -> str:
+    """The tables of one tolerance."""
+    out = f"## Plants with {100 * figures['tolerance']:g} % scatter: {figures['cases']} cases\n\n"
+    judged = [r for r in figures["rates"] if r["share"]["of"]]
+    out += table(("", "count", "share", "95 % interval", "asked", ""),
+                 [(r["name"].strip(), *percent(r["share"]), asked(100 * r["least"], 100 * r["most"]),
+                   "" if r["met"] is None else "met" if r["met"] else "**not met**") for r in judged])
+    for fault in FAULTS:
+        points = figures["curves"][fault.name]
+        if len(points) > 1:
+            out += table((title(fault), "maintenance or worse", "share", "95 % interval", "non-nominal", "ruling",
+                          "by the bands alone"),
+                         [(f"{p['size']:g}", *percent(p["detected"]),
+                           *(percent(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
+    for fault in FAULTS:
+        counts = figures["levels"][fault.name]
+        said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
+        out += table((f"{title(fault)}: true level, said", *said),
+                     [(name, *(str(row[word]) for word in said)) for name, row in counts.items() if any(row.values())])
+    said = sorted({word for row in figures["ruling"].values() for word in row})
+    out += table(("ruling fault: truth, said", *said),
+                 [(name, *(str(row.get(word, 0)) for word in said)) for name, row in figures["ruling"].items()])
+    return out + table(
+        ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
+        [(e["label"], title(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
+          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *percent(e["covered"])[1:])
+         for e in figures["errors"]])
+
+
+def main(folder: str) -> None:
+    """Write page and picture."""
+    figures = summary(read_rows(folder))
+    took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
+    text = f"{figures['cases']} cases: {status}. Time a trace on one core, beside other work: {took['median']:.1f} s " \
+           f"(median), {took['p95']:.1f} s (95 of 100), {took['most']:.1f} s (most).\n\n"
+    text += "".join(part(of) for of in reversed(figures["tolerances"]))
+    for reason in figures["reasons"]:
+        text += f"{reason['status']}: {reason['case']}, seed {reason['seed']}: {reason['reason']}\n\n"
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    PAGE.write_text(before + BEGIN + "\n" + text + END + rest.partition(END)[2], encoding="utf-8")
+    curves = max(figures["tolerances"], key=lambda of: sum(map(len, of["curves"].values())))
+    PAGE.with_suffix(".svg").write_text(detection(curves), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
