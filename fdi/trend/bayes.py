@@ -3,10 +3,10 @@
     size_i = offset + steps + rise * shape(u_i) + wander(u_i) + error_i          rise >= 0
 
 `shape` runs over all laws, onsets and bends (laws.py). `wander` is what no law foresees: nothing, a Wiener process, or
-an integrated one, of several strengths. `error` has the variances of the intervals, of which a part may be the same in
-all traces of one unit (its tolerances) or nearly so, or which may be too small. Offset and steps are Gaussian and go
-into the covariance, the rise is solved in closed form, all else is a sum over a grid: the posterior is exact but for
-the grid, and the same every time.
+an integrated one, of several strengths. `error` has the variances of the intervals, which may be too small, or of which
+a part is the same in all traces of one unit, by its tolerances. That part goes into the offset, and no size can tell it
+from one: it is taken off what is foretold (life.py). Offset and steps are Gaussian and go into the covariance, the rise
+is solved in closed form, all else is a sum over a grid: exact but for the grid, and the same every time.
 """
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from fdi.trend.laws import Shape, basis, shapes
 
 Floats = NDArray[np.float64]
 
-RISE, OFFSET, STEP = 1.0, 0.5, 0.5  # prior deviations, in units of (MaxBand - healthy)
+OFFSET, STEP = 0.5, 0.5  # prior deviations, in units of (MaxBand - healthy)
 # (common part of the variance, factor on the deviation)
 NOISES = ((0.0, 1.0), (0.5, 1.0), (0.9, 1.0), (0.98, 1.0), (0.996, 1.0), (0.0, 2.0))
 NOISE_PRIOR = (0.18, 0.18, 0.18, 0.18, 0.18, 0.1)
 WANDERS = (("still", 0.0), ("wiener", 0.03), ("wiener", 0.1), ("wiener", 0.3),
            ("integrated", 0.03), ("integrated", 0.1), ("integrated", 0.3))  # kind, deviation at u = 1
 WANDER_PRIOR = (0.22, 0.13, 0.13, 0.13, 0.13, 0.13, 0.13)
-LASTING = 3.0  # how slowly the common part changes as the fault grows, in u
 LOOSE = 10.0  # deviation of a size that says nothing
 GRAIN = 1e-4  # no interval is taken for narrower than this deviation
 
@@ -41,6 +40,7 @@ class Scaled(NamedTuple):
     sigma: Floats
     steps: tuple[int, ...] = ()  # rows at which the size jumped for good
     loose: tuple[int, ...] = ()  # rows out of line, which say nothing
+    bounded: tuple[int, ...] = ()  # rows that only say "not more than": the estimate stopped at what is possible at all
 
 
 class Part(NamedTuple):
@@ -95,8 +95,8 @@ def covariance(data: Scaled, noise: int, wander: int) -> Floats:
     common, factor = NOISES[noise]
     sigma = factor * np.maximum(data.sigma, GRAIN)
     jumps = _jumps(data)
-    slowly = np.exp(-0.5 * ((data.u[:, None] - data.u) / LASTING) ** 2)
-    out: Floats = (np.diag((1 - common) * sigma ** 2) + common * np.outer(sigma, sigma) * slowly + OFFSET ** 2
+    own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
+    out: Floats = (np.diag(own * sigma ** 2) + OFFSET ** 2
                    + STEP ** 2 * jumps.T @ jumps + _wander(wander, data.u))
     out[data.loose, data.loose] += LOOSE ** 2
     return out
@@ -133,16 +133,18 @@ def _part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     white = solve_triangular(factor, np.column_stack([data.y, g, end_with(data, data.u, wander).T]), lower=True,
                              check_finite=False)
     y, g, s = white[:, 0], white[:, 1:-2], white[:, -2:]
-    precision = (g * g).sum(axis=0) + RISE ** -2
+    every, _ = shapes()
+    usual = np.array([shape.rise for shape in every])
+    precision = (g * g).sum(axis=0) + usual ** -2
     rise, deviation = (g.T @ y) / precision, precision ** -0.5
-    evidence = odds(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y + truncated(rise, deviation)
+    evidence = odds(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y + truncated(rise, deviation, usual)
     own = np.array([[OFFSET ** 2 + len(data.steps) * STEP ** 2, 0.0], [0.0, 0.0]])
     return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, own + _end(kind, strength) - s.T @ s)
 
 
-def truncated(rise: Floats, deviation: Floats) -> Floats:
+def truncated(rise: Floats, deviation: Floats, usual: Floats) -> Floats:
     """Log of what a rise >= 0, half-normal beforehand, adds to the evidence, from its mean and deviation uncut."""
-    out: Floats = (0.5 * (rise / deviation) ** 2 + np.log(deviation / RISE) + np.log(2.0) + log_ndtr(rise / deviation))
+    out: Floats = (0.5 * (rise / deviation) ** 2 + np.log(deviation / usual) + np.log(2.0) + log_ndtr(rise / deviation))
     return out
 
 

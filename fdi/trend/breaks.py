@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
-from fdi.trend.bayes import NOISES, RISE, STEP, WANDERS, Scaled, covariance, odds
+from fdi.trend.bayes import NOISES, STEP, WANDERS, Scaled, covariance, odds
 from fdi.trend.laws import basis, shapes
 
 Floats = NDArray[np.float64]
 
 ODDS = 0.01  # prior probability that a series holds any one kind of break
+AT_LAST = 0.2  # that the last size is not in line: not much is lost by asking for another trace
 MOST = 5  # breaks looked for
 FEWEST = 3  # sizes in line among which another can be out of it
 
@@ -60,7 +61,7 @@ def _since(data: Scaled, at: int) -> Scaled:
     """What comes from a row on, on its own scale of time."""
     u = data.u[at:] - data.u[at]
     return Scaled(u / (u[-1] or 1.0), data.y[at:], data.sigma[at:], tuple(row - at for row in data.steps if row > at),
-                  tuple(row - at for row in data.loose if row >= at))
+                  *(tuple(row - at for row in rows if row >= at) for rows in (data.loose, data.bounded)))
 
 
 def _strongest(data: Scaled) -> tuple[str, int, float] | None:
@@ -71,6 +72,7 @@ def _strongest(data: Scaled) -> tuple[str, int, float] | None:
     v = np.column_stack([spikes, jumps])
     gain, size = _gains(data, v)
     gain = gain + np.log(ODDS / np.repeat([n, max(n - 2, 1)], [n, n - 2]))
+    gain[n - 1] += np.log(AT_LAST / ODDS * n)
     gain[[*data.loose, *(n + row - 1 for row in data.steps if row < n - 1)]] = -np.inf  # known already
     if n == 3:  # each of three is out of line with the other two
         gain[:] = np.where(np.abs(size) > STEP, gain, -np.inf)
@@ -86,13 +88,14 @@ def _gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
     """Log evidence that each column of v, shape (n, m), adds, and its factor under the best law: shape (m,) both."""
     every, _ = shapes()
     g = basis(every, data.u)
+    usual = np.array([shape.rise for shape in every])
     plain, with_it, factors = [], [], []
     for i in range(len(NOISES)):
         for j in range(len(WANDERS)):
             factor = np.linalg.cholesky(covariance(data, i, j))
             white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
             chance = odds(i, j) - np.log(np.diag(factor)).sum() - 0.5 * white[:, 0] @ white[:, 0]
-            alone, both, size = _two(white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):])
+            alone, both, size = _two(white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):], usual)
             plain.append(chance + alone)
             with_it.append(chance[:, None] + both)
             factors.append(size)
@@ -102,14 +105,14 @@ def _gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
     return np.logaddexp.reduce(stack, axis=0) - base, np.concatenate(factors)[best, np.arange(v.shape[1])]
 
 
-def _two(y: Floats, g: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+def _two(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[Floats, Floats, Floats]:
     """What the rise, and rise and a column's factor, add to the evidence, (k,) and (k, m); and that factor, (k, m)."""
-    gg, vv, gv = (g * g).sum(axis=0) + RISE ** -2, (v * v).sum(axis=0) + STEP ** -2, g.T @ v
+    gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP ** -2, g.T @ v
     gy, vy = g.T @ y, v.T @ y
-    alone = 0.5 * gy ** 2 / gg - 0.5 * np.log(gg * RISE ** 2) + log_ndtr(gy / np.sqrt(gg))
+    alone = 0.5 * gy ** 2 / gg - 0.5 * np.log(gg * usual ** 2) + log_ndtr(gy / np.sqrt(gg))
     left = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
     rest = gy[:, None] - gv * (vy / vv)
     both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP ** 2) + 0.5 * rest ** 2 / left
-            - 0.5 * np.log(left * RISE ** 2) + log_ndtr(rest / np.sqrt(left)))
+            - 0.5 * np.log(left * usual[:, None] ** 2) + log_ndtr(rest / np.sqrt(left)))
     rise = np.maximum(rest / left, 0.0)
     return alone, both, (vy - gv * rise) / vv

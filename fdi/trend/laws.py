@@ -20,15 +20,17 @@ EXPONENTS = (0.5, 0.7, 1.5, 2.0, 3.0)
 BLOW_UPS = (1.1, 1.25, 1.5, 2.0, 3.0)  # when a runaway has no end any more; 1 is the last trace
 WITHIN = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # onsets since the first trace
 BEFORE = (-2.0, -0.5)  # a power law shows how long ago it began; the other two do not
+RISES = (0.15, 1.0)  # one for what has only begun
 LARGEST = 1e6
 
 
 class Shape(NamedTuple):
-    """One law with its onset and its e-foldings or exponent."""
+    """One law with its onset, its e-foldings, exponent or end, and how large its rise is thought to be."""
 
     law: str
     onset: float = 0.0
     bend: float = 1.0
+    rise: float = 1.0  # deviation of the half-normal prior, in units of (MaxBand - healthy)
 
 
 @cache
@@ -44,7 +46,8 @@ def shapes() -> tuple[tuple[Shape, ...], Floats]:
         early = sum(shape.onset <= 0.0 for shape in table[law])
         late = len(table[law]) - early
         weights += [(0.5 / early if s.onset <= 0.0 else 0.5 / late) if late else 1.0 / early for s in table[law]]
-    return flat, np.array(weights) / len(LAWS)
+    every = tuple(shape._replace(rise=rise) for rise in RISES for shape in flat)
+    return every, np.tile(weights, len(RISES)) / len(LAWS) / len(RISES)
 
 
 def basis(every: tuple[Shape, ...], u: Floats) -> Floats:
@@ -58,8 +61,8 @@ def _column(shape: Shape, u: Floats) -> Floats:
         return np.zeros_like(u)
     if shape.law == "exponential":
         top = np.log(LARGEST) + shape.bend
-        return np.minimum(np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend), LARGEST)
-    if shape.law == "runaway":
+        grown = np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend)
+    elif shape.law == "runaway":
         left = np.maximum(shape.bend - since, 1e-9)
         grown = (1.0 / left - 1.0 / shape.bend) / (1.0 / (shape.bend - 1.0) - 1.0 / shape.bend)
     else:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from fdi.trend.bayes import WANDERS, Posterior
+from fdi.trend.bayes import NOISES, WANDERS, Posterior
 from fdi.trend.laws import basis
 
 Floats = NDArray[np.float64]
@@ -17,7 +17,7 @@ FAR = 50.0  # times the time seen so far; what comes later is called never
 AHEAD = np.concatenate([[0.0], np.logspace(-2.5, np.log10(FAR), 80)])  # from the last trace, in u
 
 
-PACE = 0.15  # deviation of the logarithm of how fast the course found goes on, of which the traces so far say nothing
+PACE, FREEDOM = 0.12, 3.0  # Student's scale and freedom of the logarithm of how fast the course found goes on from here
 
 
 class Paths(NamedTuple):
@@ -27,7 +27,14 @@ class Paths(NamedTuple):
     rate: Floats  # now, (paths,), per u
 
 
-def draw(posterior: Posterior, seed: int = 0, paths: int = PATHS) -> Paths:
+class Own(NamedTuple):
+    """Deviation of a size by the unit's tolerances: base + share * size."""
+
+    base: float = 0.0
+    share: float = 0.0
+
+
+def draw(posterior: Posterior, own: Own, seed: int = 0, paths: int = PATHS) -> Paths:
     """Paths of equal probability."""
     rng = np.random.default_rng(seed)
     weights = posterior.weights
@@ -46,7 +53,9 @@ def draw(posterior: Posterior, seed: int = 0, paths: int = PATHS) -> Paths:
         wander = _wander(kind, strength, level[1], rng)
         sizes[rows] = rise[:, None] * ahead[k] + level[0][:, None] + wander
         rate[rows] = rise * slopes[k] + (level[1] if kind == "integrated" else 0.0)
-    pace = np.exp(PACE * rng.standard_normal(paths))
+    common = np.sqrt([NOISES[p.noise][0] for p in posterior.parts])[part] * rng.standard_normal(paths)
+    sizes -= common[:, None] * (own.base + own.share * sizes)
+    pace = np.exp(np.clip(PACE * rng.standard_t(FREEDOM, paths), -2.0, 2.0))
     sizes = np.array([np.interp(AHEAD, AHEAD * slower, row) for slower, row in zip(pace, sizes, strict=True)])
     return Paths(sizes, rate / pace)
 

@@ -18,7 +18,8 @@ Floats = NDArray[np.float64]
 
 FEWEST = 3  # traces that make a trend: two points lie on every line
 DOUBT = 0.05  # largest probability that nothing grows at which a trend is told
-LATEST = 300  # traces; older ones are left out, they no longer tell where the size goes
+LATEST = 200  # traces; older ones are left out, they no longer tell where the size goes
+LEVER = 0.15  # of (MaxBand - healthy); over less, intervals do not show how they go with the size
 WIDTH = 1.96  # standard deviations of a 95 % interval
 LIMITS = {"maintenance": "middle", "non_nominal": "most"}  # level that begins there: field of Fault
 
@@ -82,7 +83,7 @@ def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) 
         return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
     span = float(t[-1] - t[found.first])
     posterior = regress(found.data)
-    paths, laws = _drawn(found, posterior), posterior.laws()
+    paths, laws = _drawn(found, posterior, _own(data, used)), posterior.laws()
     remaining = {level: _remaining(getattr(fault, field), fault, unit, paths, span)
                  for level, field in LIMITS.items()}
     middle = np.linspace(0.0, 1.0, 60)
@@ -98,22 +99,32 @@ def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled,
     value, low, high = np.array(sizes).T
     sigma = np.maximum(high - value, value - low) / WIDTH / unit  # one side may end at what is possible at all
     span = float(t[-1] - t[0]) or 1.0
-    return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma), unit
+    bounded = tuple(int(row) for row in np.flatnonzero(value <= low))
+    return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
 
 
-def _drawn(found: Cleaned, posterior: Posterior) -> life.Paths:
+def _own(data: Scaled, used: NDArray[np.bool_]) -> life.Own:
+    """A line through the intervals' deviations over the sizes; their mean where these hardly differ."""
+    y, sigma = data.y[used], data.sigma[used]
+    if np.ptp(y) < LEVER:
+        return life.Own(float(sigma[-1]))
+    share, base = np.polyfit(y, sigma, 1)
+    return life.Own(float(base), float(share))
+
+
+def _drawn(found: Cleaned, posterior: Posterior, own: life.Own) -> life.Paths:
     """Paths from the last trace on.
 
     A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
     """
     last = found.breaks[-1] if found.breaks else None
     if last is None or last.kind != "last" or last.size < 0.0:
-        return life.draw(posterior)
+        return life.draw(posterior, own)
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
     third = life.PATHS // 3
-    three = (life.draw(posterior, 0, third), life.draw(regress(tight._replace(steps=(*tight.steps, at))), 1, third),
-             life.draw(regress(tight), 2, third))
+    jumped = regress(tight._replace(steps=(*tight.steps, at)))
+    three = [life.draw(p, own, i, third) for i, p in enumerate((posterior, jumped, regress(tight)))]
     return life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
 
