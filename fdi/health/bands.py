@@ -99,15 +99,17 @@ class Excursion(NamedTuple):
 
 
 def judge_columns(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,
-                  where: object = "trace") -> Judged:
+                  where: object = "trace", parts: list[Section] | None = None) -> Judged:
     """Judge a command and sensed position, (n,) m, NaN where missing, one row per `period` s from `t0` s.
+
+    `parts` are the command's sections, for who judges many runs of one.
 
     Raises:
         InputError: no position, bands of another command, or a load that the bands do not know.
     """
     if np.isnan(xj).all():
         raise InputError(where, "xj", "a measured position: bands judge nothing else")
-    parts = sections(com, period)
+    parts = parts or sections(com, period)
     check_command(bands, parts, period, where)
     if load is not None and loaded(load) and "load" not in bands.provenance:
         most = float(np.nanmax(np.abs(load)))

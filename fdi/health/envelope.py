@@ -28,7 +28,7 @@ SETTLED = 0.2  # s from a ramp's start until it is judged
 SPAN = 0.02  # s between the two samples of a speed: 2 um of noise become 0.14 mm/s
 SAME_PLACE, SAME_TIME, SAME_RATE = 2e-6, 0.004, 0.002  # m, s, a fraction: one command recorded twice
 LARGEST_LOAD = 100.0  # N, a load that moves nothing: 0.6 um of droop
-SCALED = 0.9, 1.5  # a range of friction's error that low or high dynamic friction can account for
+SCALED = 0.9, 1.3  # a range of friction's error that low or high dynamic friction can account for
 KNOWN = 0.8  # of a section's samples that must have been measured
 
 
@@ -118,7 +118,7 @@ def stays(beyond: Flags, lasting: int = LASTING) -> list[Stay]:
     runs = [Stay(int(a), int(b) - 1) for a, b in edges]
     joined: list[list[Stay]] = []
     for run in runs:
-        if joined and run.first - joined[-1][-1].last <= lasting - 1:
+        if joined and run.first - joined[-1][-1].last <= lasting:
             joined[-1].append(run)
         else:
             joined.append([run])
