@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class Outcome:
     timing: dict[str, Any]
     counters: dict[str, int]
     speed: float  # multiple of real time, of the cycles alone
+    fdi: dict[str, Any] = field(default_factory=dict)  # what `rig fdi` says of it, if it was asked
 
     @property
     def verdict(self) -> str:
@@ -70,7 +71,7 @@ class Outcome:
                 "checks": [_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 "events": [_plain(event._asdict()) for event in self.events],
-                "run": self.job.settings(), "fdi": {}}
+                "run": self.job.settings(), "fdi": self.fdi}
 
 
 def timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:

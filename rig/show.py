@@ -117,6 +117,8 @@ def outcome(o: Outcome) -> None:
         out.print(f"[yellow]{event.t:8.3f} s[/]  {event.kind}: {escape(event.text)}", soft_wrap=True)
     if len(notable) > EVENTS:
         out.print(f"            and {len(notable) - EVENTS} more in the report")
+    if o.fdi:
+        out.print(f"servovalve {escape(o.fdi['sentence'])}", highlight=False)
     out.print(f"results   {escape(str(o.folder))}/ trace.mcap, verdict.json, report.html")
     words = o.why or "every check passed"
     out.print(f"[bold {COLOURS[o.verdict]}]{o.verdict}[/]  {escape(words)}", soft_wrap=True)

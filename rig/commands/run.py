@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +12,7 @@ from rig import options
 
 if TYPE_CHECKING:
     from rig.job import Job
+    from rig.outcome import Outcome
 
 HELP = "run a test sequence: log, checks, verdict"
 
@@ -30,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="node 3: auto takes the one that answers on the bus, else starts one (default)")
     add("--max-overruns", type=float, default=None, metavar="FRACTION",
         help="real time: more overruns than this part of all cycles make the timing invalid (default 0.001)")
+    add("--fdi", action="store_true", help="then judge the servovalve as rig fdi does: a healthy nominal one expected")
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run of this log")
 
 
@@ -49,12 +53,33 @@ def run(args: argparse.Namespace) -> int:
         outcome = do(job, folder, progress, stop)
         progress("report", 0, 0)
         write_report(folder / "trace.mcap", folder / "report.html")
+        if args.fdi:
+            outcome = diagnosed(outcome, progress)
     with contextlib.suppress(BrokenPipeError):  # who does not read on has no bearing on the verdict
         if args.json:
             show.as_json(outcome)
         elif not args.quiet:
             show.outcome(outcome)
     return outcome.status
+
+
+def diagnosed(outcome: Outcome, progress: Callable[[str, int, int], None]) -> Outcome:
+    """The outcome with what `rig fdi` says of its trace, in verdict.json as well; the run's own verdict stays."""
+    import json
+
+    from fdi.health.diagnosis import diagnose
+    from fdi.health.words import to_json
+    from fdi.output import write_text
+    from fdi.trace import Trace
+    from plant import InputError
+
+    try:
+        found = to_json(diagnose(Trace.read(outcome.folder), progress=progress, source=str(outcome.folder)))
+    except InputError as error:  # a sequence too short to tell, say
+        found = {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
+    told = replace(outcome, fdi=found)
+    write_text(outcome.folder / "verdict.json", json.dumps(told.to_json(), indent=1) + "\n")
+    return told
 
 
 def asked(args: argparse.Namespace) -> Job:
