@@ -19,6 +19,7 @@ from plant.model import STEPS, kernel
 from plant.run import noise
 from rig.many import many
 from rig.rivals import FLAGS, SAME_ROUNDING, built, gcc
+from rig.rivals_grid import grid
 from rig.stopwatch import Run, duration, durations
 
 Array = NDArray[np.float64]
@@ -140,4 +141,5 @@ def report(command: Array, tell: Callable[[str], None] = lambda what: None) -> d
     cost = step_vs_c(command)
     one = {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
            "lockstep": lockstep()}
-    return one | {"many": [rival._asdict() for rival in many(command, tell)]}
+    return one | {"many": [rival._asdict() for rival in many(command, tell)],
+                  "grid": [rival._asdict() for rival in grid(command, tell)]}

@@ -47,7 +47,7 @@ class Work:
         return np.ascontiguousarray(np.pad(made, ((0, 0), (0, -len(self.values) % width)), "edge"))
 
 
-def grid(command: Array, tell: Callable[[str], None] = lambda what: None, rounds: int = 7) -> list[Rival]:
+def grid(command: Array, tell: Callable[[str], None] = lambda what: None, rounds: int = 5) -> list[Rival]:
     """Runs of all cells over `command` (n,) m; speeds are cycles of a cell per second."""
     work = Work(command)
     with tempfile.TemporaryDirectory() as folder:
@@ -151,7 +151,7 @@ def _progpy(work: Work, our_speed: float, tell: Callable[[str], None]) -> Rival:
     plant, acting = _progpy_plant(work), np.r_[0.0, work.current[:-1]]
 
     def inputs(t: float, x: Any = None) -> Any:
-        row = min(int(t / work.h + 0.5), PIECE)
+        row = max(int(t / work.h - 0.5), 0)  # it asks for the end of the cycle, where ours takes the start
         return plant.InputContainer({"current": acting[row], "measured": work.position[row]})
 
     times = [(row - 0.5) * work.h for row in range(1, PIECE + 1)]  # half a cycle early: it takes the next state

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from physics_cases import PREFLIGHT
 
-from rig import bench, cli, many, rivals
+from rig import bench, cli, many, rivals, rivals_grid
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {rivals.GET_GCC}")
 
@@ -31,6 +31,7 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     words = " ".join(capsys.readouterr().out.split())
     assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in words
     assert "C, one run after the other: skipped, there is no gcc" in words
+    assert "C, OpenMP: skipped, there is no gcc" in words
     assert "jax, vmap: skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
     assert "ProgPy, vectorised: skipped, progpy is not installed" in words
 
@@ -38,13 +39,15 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     monkeypatch.setattr(bench, "step_vs_c", lambda command: None)
     monkeypatch.setattr(bench, "lockstep", lambda: 10.0)
-    monkeypatch.setattr(bench, "many", lambda command, tell: [many.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")])
+    for part in ("many", "grid"):
+        monkeypatch.setattr(bench, part, lambda command, tell: [many.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")])
     assert cli.main(["bench", "--json", "--out", str(tmp_path / "b.json")]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads((tmp_path / "b.json").read_text())
     assert answer["times_real_time"] > 20
     assert 0 < answer["cycle"] < 1e-3
     assert answer["many"] == [{"name": "jax, vmap", "speed": 5e7, "ratio": 7.0, "difference": 1e-12, "note": ""}]
+    assert answer["grid"] == answer["many"]
 
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
@@ -75,3 +78,18 @@ def test_every_rival_makes_the_same_runs() -> None:
         assert found[name].difference == 0.0
     slowest = found["C, one run after the other"].ratio
     assert slowest is not None and slowest > 1.2  # 5 on a quiet machine with AVX-512
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_map() -> None:
+    told: list[str] = []
+    found = {rival.name: rival for rival in rivals_grid.grid(PREFLIGHT[:1500], told.append, rounds=2)}
+    assert len(found) == 8 and told
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        elif name != rivals_grid.REFERENCE:
+            assert rival.difference is not None and rival.difference < 1e-12
+    reference = found[rivals_grid.REFERENCE]
+    assert reference.ratio is not None and reference.ratio > 2.0  # 13 on a quiet machine
+    assert reference.difference is not None and 1e-6 < reference.difference < 3e-3

@@ -66,7 +66,8 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
     out.print(table)
     if answer["step"] is None:
         out.print(f"step beside C: skipped, there is no gcc; to get it: {GET_GCC}")
-    _show_many(out, answer["many"])
+    _show_many(out, answer["many"], "Many runs at once", "steps/s", "XJ apart by")
+    _show_many(out, answer["grid"], "The RMS grid, 21x21 cells", "cycles/s", "RMS apart by")
     if rows:
         out.print()
         out.print("Error of XJ over the preflight, closed loop, against steps of 0.2 us, um")
@@ -77,14 +78,14 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
         out.print(table)
 
 
-def _show_many(out: Console, rivals: Sequence[dict[str, Any]]) -> None:
+def _show_many(out: Console, rivals: Sequence[dict[str, Any]], title: str, speed: str, apart: str) -> None:
     from rich.table import Table
 
-    table = Table("Many runs at once", "steps/s", "ours / its", "XJ apart by", box=None, pad_edge=False)
+    table = Table(title, speed, "ours / its", apart, box=None, pad_edge=False)
     for rival in rivals:
         if rival["speed"] is not None:
-            apart = f"{rival['difference'] * 1e6:.0e} um" if rival["difference"] else "no bit"
-            table.add_row(rival["name"], f"{rival['speed'] / 1e6:.3g} M", f"{rival['ratio']:.3g}", apart)
+            by = f"{rival['difference'] * 1e6:.0e} um" if rival["difference"] else "no bit"
+            table.add_row(rival["name"], f"{rival['speed'] / 1e6:.3g} M", f"{rival['ratio']:.3g}", by)
     out.print()
     out.print(table)
     for rival in rivals:
