@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 
 SMOOTH = 5  # samples
 SETTLING_BAND = 0.05  # of the step
+SURE = 0.05  # s, as long a response must stay within, as an oscillation passes through now and then
 LEAST_STEP = 2e-4  # m, below which noise and friction are all that a step shows
 RESTING = 0.25  # s after a step, from when on the ram should be at rest
 STUCK = 0.3  # of the ramp's rate, slower than that the ram sticks
@@ -102,7 +103,8 @@ def _step(x: Floats, s: Section, period: float) -> Iterator[tuple[str, Floats]]:
     yield "peak_time", period * _vertex(y, peak)
     outside = np.abs(y - 1) > SETTLING_BAND
     last = rows - 1 - np.argmax(outside[:, ::-1], axis=1)
-    yield "settling_time", np.where(last == rows - 1, np.nan, (last + 1) * period)
+    settled = rows - 1 - last >= (SURE / period if rows > 2 * SURE / period else 1)
+    yield "settling_time", np.where(settled, (last + 1) * period, np.nan)
     if (resting := round(RESTING / period)) < rows:
         yield "rest_error", np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
 
