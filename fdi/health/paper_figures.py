@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fdi.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
 from fdi.health.bands import Excursion
+from fdi.health.envelope import Bands, StepBand
 from fdi.health.grid import LEFT, RIGHT, Grid, Map
 from fdi.sections import Section
 from fdi.trace import Trace
@@ -72,11 +73,15 @@ def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
         return svg(figure, "ramps")
 
 
-def banded(excursions: list[Excursion], trace: Trace, kind: str, signal: str) -> str:
-    """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): departure from the healthy centre in bands.
+def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
+    """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): a trace in the bands.
+
+    A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
 
     Args:
         excursions: of the trace, from `fdi.health.bands.excursions`; positive is towards the fault.
+        friction: N, that a step is allowed, from there too.
+        bands: what they are excursions from.
         trace: their trace.
         kind: of the sections, "step" or "ramp".
         signal: "position" or "speed".
@@ -87,36 +92,62 @@ def banded(excursions: list[Excursion], trace: Trace, kind: str, signal: str) ->
     chosen = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.judged]
     if not chosen:
         return ""
-    scale, unit = (1e6, "µm") if signal == "position" else (1e3, "mm/s")
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 3.2), layout="constrained")
         axes = figure.subplots(1, len(chosen), sharey=kind == "ramp", squeeze=False)[0]
         for ax, e in zip(axes, chosen, strict=True):
-            t = trace.t[e.start:e.start + len(e.departure)]
-            _band(ax, t, e.middle * scale, e.most * scale, kind == "ramp")
-            ax.plot(*thin(t, e.departure * scale), color=INK, lw=1.0)
-            _events(ax, t, e, scale)
+            if kind == "step":
+                band = _band(bands, trace, e)
+                _on_step(ax, trace, e, band, band.centre(friction, bands.friction)[0])
+            else:
+                _on_ramp(ax, trace, e)
             size = (e.section.last - e.section.first) * 1e3
-            ax.set_title(f"{kind} of {size:+.3g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
-            ax.set_xlabel("time [s]")
-        axes[0].set_ylabel(f"{signal}, departure [{unit}]")
-        axes[0].legend(loc="upper right", frameon=False, fontsize=7)
+            ax.set_title(f"{kind} of {size:+.2g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
+        unit = "mm" if kind == "step" else "departure, µm" if signal == "position" else "departure, mm/s"
+        axes[0].set_ylabel(f"{signal} [{unit}]")
+        axes[0].legend(loc="best", frameon=False, fontsize=7)
         return svg(figure, f"banded {kind} {signal}")
 
 
-def _band(ax: Axes, t: Floats, middle: Floats, most: Floats, both: bool) -> None:
-    """The two limits; shaded between them and within the first."""
-    low = -middle if both else np.zeros_like(middle)
-    ax.fill_between(t, low, middle, color=GREEN, alpha=0.10, lw=0)
-    ax.plot(t, middle, color=AMBER, lw=1.0, label="MidBand")
-    ax.plot(t, most, color=RED, lw=1.0, label="MaxBand")
+def _band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
+    """The band that a step was held against."""
+    own = [s for s in trace.sections() if s.kind in ("step", "ramp")]
+    known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
+    return next(step for step in bands.steps if step.section == known[own.index(e.section)])
 
 
-def _events(ax: Axes, t: Floats, e: Excursion, scale: float) -> None:
-    """What is beyond the first limit, in red."""
+def _on_step(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Floats) -> None:
+    """Position near a step's end, the healthy response with the friction there is, and the limits where they hold."""
+    rows = slice(e.start, e.start + len(e.departure))
+    t, x = (trace.t[rows] - trace.t[e.section.start]) * 1e3, trace.xj[rows] * 1e3
+    held = np.isfinite(e.departure)
+    healthy = np.interp(t * 1e-3, band.t, centre) * 1e3
+    side = np.sign(np.interp(t * 1e-3, band.t, band.middle)) * 1e3
+    ax.plot(t, healthy, color=GREEN, lw=1.0, label="healthy")
+    ax.plot(t, x, color=INK, lw=1.0, label="measured")
+    for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
+        ax.plot(t, np.where(held, healthy + side * limit, np.nan), color=colour, lw=1.6, label=label)
+    with np.errstate(invalid="ignore"):
+        beyond = np.where(e.departure > e.middle, x, np.nan)
+    ax.plot(t, beyond, color=RED, lw=3.5, alpha=0.5, label="outside")
+    size = abs(e.section.last - e.section.first) * 1e3
+    ax.set_ylim(e.section.last * 1e3 - 0.3 * size, e.section.last * 1e3 + 0.3 * size)
+    ax.set_xlabel("time from the step [ms]")
+
+
+def _on_ramp(ax: Axes, trace: Trace, e: Excursion) -> None:
+    """Departure from the healthy centre over time, either way."""
+    scale = 1e6 if e.signal == "position" else 1e3
+    t = trace.t[e.start:e.start + len(e.departure)]
+    ax.fill_between(t, 0.0 * e.middle, e.middle * scale, color=GREEN, alpha=0.10, lw=0)
+    for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
+        ax.plot(t[[0, -1]], limit[[0, -1]] * scale, color=colour, lw=1.0, label=label)
+    ax.plot(*thin(t, e.departure * scale), color=INK, lw=0.8, label="measured")
     with np.errstate(invalid="ignore"):
         beyond = np.where(e.departure > e.middle, e.departure, np.nan)
-    ax.plot(t, beyond * scale, color=RED, lw=1.6, label="outside" if (~np.isnan(beyond)).any() else None)
+    ax.plot(*thin(t, beyond * scale), color=RED, lw=1.6, label="outside")
+    ax.set_ylim(0.0, 1.1 * scale * max(float(np.nanmax(e.departure)), float(e.most[0])))
+    ax.set_xlabel("time [s]")
 
 
 def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
@@ -133,6 +164,8 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
         axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
         for ax, (name, m, letter) in zip(axes, drawn, strict=True):
             _map(ax, grid, m, letter)
+            if m is grid.joint:
+                ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
             ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} µm at {letter}", fontsize=9)
             ax.set_xlabel("Kintas")
             if truth:
