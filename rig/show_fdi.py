@@ -13,6 +13,7 @@ from fdi.health.diagnosis import Diagnosis
 from fdi.health.types import FAULTS, Level
 from fdi.health.words import LEVELS, NAMES, SHOWN, besides, left_over, sentence, size
 from rig.console import console
+from rig.methods import Row
 
 COLOURS = {"ACCEPTABLE": "green", "MAINTENANCE": "yellow", "NON_NOMINAL": "red", "SOMETHING_ELSE": "yellow",
            "CANNOT_TELL": "yellow"}
@@ -20,8 +21,8 @@ OF_LEVEL = {Level.ACCEPTABLE: "green", Level.MAINTENANCE: "yellow", Level.NON_NO
 EVENTS = 6  # lines; page and JSON have all
 
 
-def diagnosis(d: Diagnosis, then: str, pages: Sequence[Path] = ()) -> None:
-    """Everything, on standard output."""
+def diagnosis(d: Diagnosis, then: str, pages: Sequence[Path] = (), rows: Sequence[Row] = ()) -> None:
+    """Everything, on standard output; `rows` are other methods' answers."""
     out = console()
     out.print(f"[bold {COLOURS[d.verdict]}]{d.verdict}[/]  {escape(sentence(d))}", soft_wrap=True)
     out.print()
@@ -29,6 +30,9 @@ def diagnosis(d: Diagnosis, then: str, pages: Sequence[Path] = ()) -> None:
     out.print()
     if d.precursors:
         out.print(precursors(d))
+        out.print()
+    if rows:
+        out.print(methods(rows))
         out.print()
     for label, text in lines(d):
         out.print(f"[dim]{label:<11}[/]{escape(text)}", soft_wrap=True)
@@ -50,18 +54,37 @@ def bands(made: Mapping[str, Any]) -> None:
 def faults(d: Diagnosis) -> Table:
     """Both faults: level, size, interval, limits, and what bands and grid say."""
     t = Table(box=None, pad_edge=False)
-    t.add_column("fault")
-    t.add_column("level")
-    for column in ("size", "95 % interval", "MidBand", "MaxBand", "grid", "bands"):
-        t.add_column(column, justify="right")
+    t.add_column("fault", no_wrap=True)
+    t.add_column("level", no_wrap=True)
+    for column in ("size", "95 % interval", "limits", "grid", "bands"):
+        t.add_column(column, justify="right", no_wrap=True)
     for f in FAULTS:
         e, level = d.sizes[f.name], d.levels[f.name]
         at = getattr(d.grid.merged, f.symbol) if d.grid else None
         said = d.judged.levels.get(f.name) if d.judged else None
         t.add_row(NAMES[f.name] + (" *" if d.ruling == f.name else ""), f"[{OF_LEVEL[level]}]{LEVELS[level]}[/]",
-                  size(e.value), f"{size(e.low)} .. {size(e.high)}", f"{f.middle:g}", f"{f.most:g}",
+                  size(e.value), f"{size(e.low)} .. {size(e.high)}", f"{f.middle:g} / {f.most:g}",
                   "-" if at is None else size(at), said.word if said is not None else "-")
     t.caption = "filter clogging: Kintas; spool friction: FSS in N" + ("; * rules" if d.ruling else "")
+    t.caption_justify = "left"
+    return t
+
+
+def methods(rows: Sequence[Row]) -> Table:
+    """What other methods find: error, simulations, time."""
+    t = Table(box=None, pad_edge=False)
+    t.add_column("method", no_wrap=True)
+    for column in ("Kintas", "FSS N", "left", "errors", "right", "runs", "s"):
+        t.add_column(column, justify="right", no_wrap=True)
+    for r in rows:
+        right = " ".join(f"{100 * share:.0f}%" for share in r.right.values()) if r.right else "-"
+        found = [size(x) if x is not None else "-" for x in (r.kintas, r.fss)]
+        found = list((r.levels or {}).values()) if r.kintas is None else found
+        errors = f"{r.error_kintas:.3f} {r.error_fss:.2g}" if r.error_kintas is not None else "-"
+        left = size(r.left) if r.left is not None else "-"
+        t.add_row(r.method, *found, left, errors, right, str(r.simulations), f"{r.seconds:.1f}")
+    t.caption = ("left: RMS of what is left, in floors; errors: RMS, and right: levels,\n"
+                 "both on simulated units that no training saw")
     t.caption_justify = "left"
     return t
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from fdi.compare import sensors
 from fdi.cycles import Cycles
+from fdi.discovery.record import Record
 from fdi.discovery.runs import usable
 from fdi.health import grid as grids
 from fdi.health import levels as rules
@@ -14,6 +15,7 @@ from fdi.health.bands import Judged, judge
 from fdi.health.envelope import Bands, loaded, matches
 from fdi.health.precursors import Precursor, measure
 from fdi.health.refine import COARSE, Refined, refine
+from fdi.health.store import default
 from fdi.health.types import CLOGGING, FAULTS, FRICTION, Estimate, Event, Level
 from fdi.sections import sections
 from fdi.trace import Trace
@@ -44,6 +46,9 @@ class Diagnosis:
     judged: Judged | None  # what the bands say; None: there are none of this command
     others: Mapping[str, Estimate]  # suspects that are off what a healthy unit has, by parameter, SI
     cycles: Cycles
+    record: Record
+    model: Model  # at the cycle of the trace
+    floor: Mapping[str, float]  # what the sensors' noise makes of each signal, RMS SI
     bands: Bands | None
     notes: tuple[str, ...]
 
@@ -89,7 +94,8 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     floor = {name: f.value for name, f in sensors(c, model).items()}
     found = refine(model, record, (*_starts(grid), *COARSE), floor, workers)
     progress("done", STAGES, STAGES)
-    return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, c, bands, tuple(notes)), model)
+    return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, c, record, model, floor, bands,
+                                tuple(notes)))
 
 
 def _banded(c: Cycles, model: Model, bands: Bands | None, notes: list[str]
@@ -106,12 +112,7 @@ def _banded(c: Cycles, model: Model, bands: Bands | None, notes: list[str]
 
 def _own_bands(c: Cycles, notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
-    try:
-        from fdi.health.store import default
-
-        own = default()
-    except (ModuleNotFoundError, FileNotFoundError):
-        return None
+    own = default()
     if loaded(c.load):
         notes.append("no bands: the ram is loaded, and the software's own are of a free one")
         return None
@@ -141,13 +142,13 @@ def _starts(grid: grids.Grid | None) -> list[tuple[float, float]]:
     return [(grid.merged.kintas, grid.merged.fss), *((p.kintas, p.fss) for p in minima)]
 
 
-def _concluded(d: Diagnosis, model: Model) -> Diagnosis:
+def _concluded(d: Diagnosis) -> Diagnosis:
     """Levels, verdict, and what else is off."""
     sizes = _sizes(d.refined)
     levels = {f.name: rules.level(f, sizes[f.name]) for f in FAULTS}
     if not d.refined.reached:
         levels = {name: found if found == Level.ACCEPTABLE else None for name, found in levels.items()}
-    others = {name: e for name, e in d.refined.others.items() if _unhealthy(name, e, model)}
+    others = {name: e for name, e in d.refined.others.items() if _unhealthy(name, e, d.model)}
     return replace(d, levels=levels, sizes=sizes, ruling=rules.ruling(sizes, levels), others=others,
                    verdict=_verdict(levels, d.refined.reached))
 

@@ -10,8 +10,9 @@ from fdi.health.levels import severity
 from fdi.health.types import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level
 
 NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
-LEVELS = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance required", Level.NON_NOMINAL: "non-nominal",
+LEVELS = {Level.ACCEPTABLE: "acceptable", Level.MAINTENANCE: "maintenance", Level.NON_NOMINAL: "non-nominal",
           None: "cannot be judged"}
+NEEDS: Mapping[Level | None, str] = {Level.MAINTENANCE: "requires maintenance", Level.NON_NOMINAL: "is non-nominal"}
 SUSPECTS = {
     "jack.dynamic_friction": ("jack friction", "N", 1.0), "jack.damping": ("viscous drag of the jack", "N s/m", 1.0),
     "jack.mass": ("moving mass", "kg", 1.0), "jack.leakage": ("leakage across the piston", "m3/s/Pa", 1.0),
@@ -33,7 +34,7 @@ def sentence(d: Diagnosis) -> str:
     worst = next(f for f in FAULTS if f.name == d.ruling)
     others = [f for f in FAULTS if f.name != d.ruling]
     rest = "; ".join(f"{NAMES[f.name]} {LEVELS[d.levels[f.name]]}" for f in others)
-    return f"{NAMES[worst.name].capitalize()} is {LEVELS[d.levels[worst.name]]}: {told(worst, d.sizes[worst.name])}; " \
+    return f"{NAMES[worst.name].capitalize()} {NEEDS[d.levels[worst.name]]}: {told(worst, d.sizes[worst.name])}; " \
            f"{rest}." + _besides(d)
 
 

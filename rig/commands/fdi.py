@@ -3,14 +3,16 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rig import options
 
 if TYPE_CHECKING:
     from fdi.health.diagnosis import Diagnosis
     from fdi.health.envelope import Bands
+    from rig.methods import Row
 
 HELP = "judge filter clogging and spool friction from a trace: levels, sizes with intervals, what else is wrong"
 
@@ -22,6 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
     options.add_model(parser)
     add("--bands", metavar="FILE", help="bands to judge by (default: the software's own, of the preflight command)")
+    add("--optimisers", action="store_true",
+        help="also by differential evolution, simulated annealing and a genetic algorithm: error, simulations, time")
+    add("--comparators", action="store_true",
+        help="also by a neural network and a logistic regression, trained on simulated faults ('eha-rig[learn]')")
     add("--learn-bands", nargs="*", metavar="TRACE", help="make bands from a fleet's healthy traces and write them to "
                                                           "--out FILE.toml; without traces, from simulated units")
     add("--command", dest="command_file", metavar="FILE",
@@ -33,28 +39,48 @@ def run(args: argparse.Namespace) -> int:
     if args.learn_bands is not None:
         return learned(args)
     from fdi.health.diagnosis import diagnose
-    from fdi.health.words import to_json
     from fdi.output import write_text
     from fdi.trace import Trace
+    from plant import InputError
     from rig import show_fdi
     from rig.waiting import waiting
 
+    if args.trace is None:
+        raise InputError("rig fdi", "TRACE", "a trace to judge, or --learn-bands")
     answer = places(args)
     model = options.model_of(args)
     with waiting(args.json or args.quiet) as progress:
         found = diagnose(Trace.read(args.trace), model, bands_of(args), progress, str(args.trace))
+        rows = methods_of(args, found, progress)
         if answer is not None and answer.suffix == ".html":
             from fdi.health.page import render
 
             progress("the page", 0, 0)
             write_text(answer, render(found))
         elif answer is not None:
-            write_text(answer, json.dumps(to_json(found)) + "\n")
+            write_text(answer, json.dumps(as_json(found, rows)) + "\n")
     if args.json:
-        print(json.dumps(to_json(found)))
+        print(json.dumps(as_json(found, rows)))
     elif not args.quiet:
-        show_fdi.diagnosis(found, next_command(args, found), [answer] if answer else [])
+        show_fdi.diagnosis(found, next_command(args, found), [answer] if answer else [], rows)
     return 0 if found.passed else 1
+
+
+def methods_of(args: argparse.Namespace, found: Diagnosis, progress: Callable[[str, int, int], None]) -> list[Row]:
+    """What other methods find, as far as they are asked for."""
+    if not (args.optimisers or args.comparators):
+        return []
+    from rig import methods
+
+    rows = list(methods.optimisers(found, args.seed, progress)) if args.optimisers else []
+    return rows + (list(methods.comparators(found, args.seed, progress)) if args.comparators else [])
+
+
+def as_json(found: Diagnosis, rows: Sequence[Row]) -> dict[str, Any]:
+    """The JSON object; with the methods' table if there is one."""
+    from fdi.health.words import to_json
+
+    return to_json(found) | ({"methods": [row._asdict() for row in rows]} if rows else {})
 
 
 def learned(args: argparse.Namespace) -> int:
