@@ -66,3 +66,12 @@ def test_statistics_count_what_was_said() -> None:
     assert "3/402" in (text := out.export_text()) and "NOT met" in text and "95.0 %" in text
     drawn = picture.detection(figures["tolerances"][0])
     assert drawn.startswith("<svg") and "MaxBand" in drawn and "maintenance or worse" in drawn
+
+
+@pytest.mark.parametrize(("good", "of", "least", "most", "met"), [
+    (0, 23, 0.0, 0.005, None), (0, 200, 0.0, 0.005, True), (2, 200, 0.0, 0.005, False), (10, 100, 0.0, 0.005, False),
+    (19, 20, 0.95, 1.0, True), (5, 5, 0.95, 1.0, None), (30, 32, 0.995, 1.0, False), (95, 100, 0.93, 0.97, True),
+    (99, 100, 0.93, 0.97, False), (3, 9, 0.0, 1.0, None), (0, 0, 0.95, 1.0, None)])
+def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, met: bool | None
+                                                  ) -> None:
+    assert summary.Rate("", share(good, of), least, most).met is met

@@ -17,7 +17,7 @@ from rig.campaign.matrix import HEALTHY, label
 OFF_GRID = label({"filter_clogging": 0.17, "spool_friction": 45.0})
 """The paper's second worked case, which no cell of a 21 x 21 grid hits."""
 CLOSE = {CLOGGING.name: 0.05, FRICTION.name: 0.02}  # relative error asked of it
-FEWEST = 20  # cases, of less no rate is judged
+FEWEST = 20  # cases; of less no rate is judged, nor where one case is more than what is allowed
 LEVELS = [level.word for level in Level]
 
 
@@ -31,9 +31,16 @@ class Rate(NamedTuple):
 
     @property
     def met(self) -> bool | None:
-        """Whether it is what was asked for; None where there is too little to count, or nothing asked."""
-        asked = (self.least, self.most) != (0.0, 1.0)
-        return self.least <= self.share.value <= self.most if self.share.of >= FEWEST and asked else None
+        """Whether it is what was asked for; None where nothing is asked, or so few were counted that one would decide.
+
+        Few are enough where even the interval is outside.
+        """
+        if (self.least, self.most) == (0.0, 1.0) or not self.share.of:
+            return None
+        allowed = self.most if self.least == 0.0 else 1.0 - self.least if self.most == 1.0 else self.most - self.least
+        outside = self.share.low > self.most or self.share.high < self.least
+        enough = self.share.of >= max(FEWEST, round(1.0 / allowed))
+        return self.least <= self.share.value <= self.most if enough or outside else None
 
 
 class Point(NamedTuple):
