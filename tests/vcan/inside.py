@@ -18,7 +18,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent.parent
 BUS = "socketcan:vcan0"
-RUN_LIMIT_S = 300
+RUN_LIMIT_S = 500
 RIG = Path(sys.executable).with_name("rig")
 
 
