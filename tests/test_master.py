@@ -74,7 +74,7 @@ def test_bring_up(wire: Wire) -> None:
     wire.wait(lambda: set(master.states.values()) == {127}, 1.0)
     for node in (CONTROLLER, PLANT):
         states = [state for n, state in seen if n == node]
-        assert states[:1] == [0] and states[-2:] == [5, 127]
+        assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
     assert master.errors() == [] and not master.rival(0.0)
 
 
