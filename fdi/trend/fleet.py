@@ -102,7 +102,7 @@ LAWS = FITTED | OTHERS
 
 def unit(law: str, seed: int) -> Unit:
     """A unit whose fault begins in the first third of the traces and ends at MaxBand after 15 to 40 more of them."""
-    rng = np.random.default_rng([seed, 7])
+    rng = np.random.default_rng([seed, 17])
     fault = (CLOGGING, FRICTION)[seed % 2]
     traces = int(rng.integers(15, 41))
     onset = INTERVAL * traces * rng.uniform(0.0, 0.4)
