@@ -1,4 +1,7 @@
-"""Put a campaign's figures into fdi_statistics.md, and its picture beside it: python docs/fdi_statistics.py FOLDER."""
+"""Put a campaign's figures into fdi_statistics.md, and its picture beside it: python docs/fdi_statistics.py FOLDER ..
+
+Of the first campaign all tables, of further ones the rates.
+"""
 from __future__ import annotations
 
 import sys
@@ -7,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.health.types import FAULTS
-from rig.campaign.folder import read_rows
+from rig.campaign.folder import matrix_of, read_rows
 from rig.campaign.picture import detection
 from rig.campaign.show import asked, percent
 from rig.campaign.summary import summary, title
@@ -22,13 +25,18 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines) + "\n"
 
 
+def rates(found: Sequence[Mapping[str, Any]]) -> str:
+    """The table of what is asked for."""
+    return table(("", "count", "share", "95 % interval", "asked", ""),
+                 [(r["name"].strip(), *percent(r["share"]), asked(100 * r["least"], 100 * r["most"]),
+                   "" if r["met"] is None else "met" if r["met"] else "**not met**")
+                  for r in found if r["share"]["of"]])
+
+
 def part(figures: Mapping[str, Any]) -> str:
     """The tables of one tolerance."""
     out = f"## Plants with {100 * figures['tolerance']:g} % scatter: {figures['cases']} cases\n\n"
-    judged = [r for r in figures["rates"] if r["share"]["of"]]
-    out += table(("", "count", "share", "95 % interval", "asked", ""),
-                 [(r["name"].strip(), *percent(r["share"]), asked(100 * r["least"], 100 * r["most"]),
-                   "" if r["met"] is None else "met" if r["met"] else "**not met**") for r in judged])
+    out += rates(figures["rates"])
     for fault in FAULTS:
         points = figures["curves"][fault.name]
         if len(points) > 1:
@@ -51,13 +59,22 @@ def part(figures: Mapping[str, Any]) -> str:
          for e in figures["errors"]])
 
 
-def main(folder: str) -> None:
+def other(folder: str) -> str:
+    """The rates of a further campaign."""
+    figures = summary(read_rows(folder))
+    out = f"## Truth by the {matrix_of(folder).spec['simulator']} simulator: {figures['cases']} cases\n\n"
+    return out + "".join(f"{100 * of['tolerance']:g} % scatter, {of['cases']} cases\n\n{rates(of['rates'])}"
+                         for of in reversed(figures["tolerances"]))
+
+
+def main(folder: str, *others: str) -> None:
     """Write page and picture."""
     figures = summary(read_rows(folder))
     took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
     text = f"{figures['cases']} cases: {status}. Time a trace on one core, beside other work: {took['median']:.1f} s " \
            f"(median), {took['p95']:.1f} s (95 of 100), {took['most']:.1f} s (most).\n\n"
     text += "".join(part(of) for of in reversed(figures["tolerances"]))
+    text += "".join(map(other, others))
     for reason in figures["reasons"]:
         text += f"{reason['status']}: {reason['case']}, seed {reason['seed']}: {reason['reason']}\n\n"
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
@@ -67,4 +84,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])
