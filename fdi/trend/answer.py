@@ -153,7 +153,7 @@ def date(t: float, found: Answer) -> str:
 
 
 def _time(t: float, found: Answer) -> str:
-    return f"{t:.3g} {found.unit}" if t < 100 else f"{t:.0f} {found.unit}"
+    return f"{t:.2g} {found.unit}" if t < 10 else f"{t:.0f} {found.unit}"
 
 
 def _broken(kind: str, point: Point, size: str, up: bool, found: Answer) -> str:
@@ -173,7 +173,7 @@ def _broken(kind: str, point: Point, size: str, up: bool, found: Answer) -> str:
 def interval(e: Estimate, unit: str, sign: bool = False) -> str:
     """A size with its interval, to the digits that its interval warrants."""
     width = max(e.high - e.low, 1e-9)
-    places = max(0, min(4, 1 - math.floor(math.log10(width))))
+    places = max(0, min(4, math.ceil(-math.log10(width / 30.0))))
     words = [f"{x:{'+' if sign else ''}.{places}f}" for x in (e.value, e.low, e.high)]
     tail = "" if unit == "1" else f" {unit}"
     return f"{words[0]} ({words[1]} .. {words[2]}){tail}"

@@ -29,9 +29,12 @@ def render(found: Answer) -> str:
 
 
 def _rows(trend: Trend, found: Answer) -> list[dict[str, Any]]:
-    return [{"name": NAMES[level], "left": left(r, trend, found),
-             "from": date(r.low, found), "at": date(r.value, found), "to": date(r.high, found),
-             "soon": f"{100 * r.within(trend.t[-1] - trend.t[0]):.0f} %"} for level, r in trend.remaining.items()]
+    rows: list[dict[str, Any]] = []
+    for level, r in trend.remaining.items():
+        at = ["–"] * 3 if r.high == 0.0 else [date(t, found) for t in (r.low, r.value, r.high)]
+        rows.append({"name": NAMES[level], "left": left(r, trend, found), "from": at[0], "at": at[1], "to": at[2],
+                     "soon": f"{100 * r.within(trend.t[-1] - trend.t[0]):.0f} %"})
+    return rows
 
 
 def _place(found: Answer, t: float) -> str:
