@@ -43,7 +43,7 @@ def row(name: str, drive: str, trace: Trace) -> str:
 
 
 def spread(kintas: float, fss: float, command: np.ndarray) -> str:
-    """What 1.5 % of scatter in every base parameter makes of the answers: mean and standard deviation of their errors."""
+    """What 1.5 % of scatter in every base parameter makes of the answers: mean and deviation of their errors."""
     nominal, found = Model(), []
     tolerances = [name for name in nominal.names() if nominal.kind.groups[name.split(".")[0]].__name__ not in (
         "Controller", "Sensors") and name not in ("filter.clogging", "filter.law") and "friction" not in name]
