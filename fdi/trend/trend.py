@@ -90,7 +90,8 @@ def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) 
     past = Curve(t[found.first] + span * middle, *(fault.healthy + unit * fitted(found.data, posterior, middle)))
     now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], 0.0)  # neither fault can be less
     return Trend(fault, "TREND" if laws["none"] < DOUBT else "NO_TREND", t, sizes, used, breaks, laws,
-                 _quantiles(now), _quantiles(paths.rate * unit / span), remaining, past, _fan(fault, unit, paths, float(t[-1]), span))
+                 _quantiles(now), _quantiles(paths.rate * unit / span), remaining, past,
+                 _fan(fault, unit, paths, float(t[-1]), span))
 
 
 def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:
