@@ -12,6 +12,7 @@ import hashlib
 import math
 import os
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -24,6 +25,7 @@ import numpy as np
 
 from plant import functions
 
+_ONE = threading.Lock()  # numba's cache folder is a setting of the whole process
 Function = Any  # a plain function, or numba's dispatcher of one
 
 
@@ -57,11 +59,12 @@ def compiled(function: Function, ports: Mapping[str, Function] | None = None) ->
     linked = _link(function, ports or {}, lambda f: numba.njit(f, **INLINED))
     plain = rebind(linked.py_func)
     settings: Any = numba.config
-    before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
-    try:
-        return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
-    finally:
-        settings.CACHE_DIR = before
+    with _ONE:
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
+        try:
+            return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
+        finally:
+            settings.CACHE_DIR = before
 
 
 # no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only
