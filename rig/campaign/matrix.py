@@ -113,6 +113,8 @@ def _checked(model: Model) -> None:
 
 
 def _tolerances(value: Any, where: object) -> list[float]:
+    if value == []:
+        raise InputError(where, "tolerance", "at least one")
     return [_number(where, "tolerance", x, 0.0, 0.2) for x in _listed(value)]
 
 

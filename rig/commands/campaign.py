@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -114,10 +115,11 @@ def _matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
             raise InputError(args.what, "", "no faults or seeds: these are recorded traces")
         return matrix.of_traces(args.what, model, work), _folder(args.out, Path(args.what).absolute().name)
     tables = matrix.read_matrix(args.what) if args.what else {}
-    tables = {**tables, **changed, "case": [*tables.get("case", []), *matrix.parsed(args.fault)]}
+    listed, more = tables.get("case", []), matrix.parsed(args.fault)
+    tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
     if not tables["case"]:
         raise InputError("rig campaign", "", f"a matrix file, {', '.join(matrix.shipped())}, --fault or a folder")
-    return (matrix.matrix(tables, model, work, args.what or "options"),
+    return (matrix.matrix(tables, model, work, args.what or "rig campaign"),
             _folder(args.out, Path(args.what).stem if args.what else "options"))
 
 
@@ -136,11 +138,10 @@ def _numbers(text: str) -> list[float]:
 
 def _jobs(asked: int | None) -> int:
     from plant import InputError
-    from plant.lanes import threads
 
     if asked == 0:
         raise InputError("--jobs", "0", "1 or more")
-    return asked or threads()
+    return asked or len(os.sched_getaffinity(0))
 
 
 @contextmanager
