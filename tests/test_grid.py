@@ -3,9 +3,11 @@ from __future__ import annotations
 
 import time
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from command import rig
 
 from fdi import Trace
 from fdi.cycles import readings
@@ -67,9 +69,14 @@ def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> No
     assert grid.best.rms <= grid.joint.minimum.rms
 
 
-def test_both_worked_cases() -> None:
-    for kintas, fss in ((0.25, 30.0), (0.17, 45.0)):
-        grid = search(trace(kintas, fss))
+@pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0)])
+def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
+    """From runs on the rig, bus and all."""
+    faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
+    settings = [word for name, value in faults.items() for word in ("--set", f"{name}={value!r}")]
+    rig("run", "--quiet", "--seed", "3", *settings, "--out", tmp_path)
+    for measured in (Trace.read(tmp_path), trace(kintas, fss)):  # and with another noise
+        grid = search(measured)
         assert grid.step and grid.ramp
         for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
             assert point.kintas == pytest.approx(kintas, abs=0.051)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fdi.cycles import Cycles, readings
 from fdi.health.types import CLOGGING, FRICTION
 from fdi.replay import ANCHOR, known_start
-from fdi.sections import sections
+from fdi.sections import Section, sections
 from fdi.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -92,7 +92,8 @@ def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats 
     c = measured if isinstance(measured, Cycles) else readings(measured, model)[0]
     if drive not in DRIVES:
         raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
-    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _rows(c, kind)).any()}
+    parts = sections(c.com, c.period)
+    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _rows(c, parts, kind)).any()}
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
     values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
@@ -121,10 +122,10 @@ def _valley(joint: Map, kintas: Floats, fss: Floats) -> Floats:
     return np.column_stack([np.repeat(kintas, len(BETWEEN)), across.reshape(-1)])
 
 
-def _rows(c: Cycles, kind: str) -> Flags:
+def _rows(c: Cycles, parts: list[Section], kind: str) -> Flags:
     """Measured rows of the sections of a kind."""
     chosen = np.zeros(len(c), bool)
-    for s in sections(c.com, c.period):
+    for s in parts:
         chosen[s.start:s.stop] |= s.kind == kind
     return chosen & ~np.isnan(c.measured("xj"))
 
