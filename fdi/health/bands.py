@@ -44,7 +44,7 @@ class Judged(NamedTuple):
     ruling: str | None  # the fault that is further gone; None if both are acceptable
     events: tuple[Event, ...]  # in order of time
     severity: Mapping[str, float]  # furthest lasting excursion, in MidBand limits; above 1 is an event
-    friction: float  # N, what the ramps show and the steps were allowed; FSS / (1 - Kintas)
+    friction: float  # N, what the ramps show: FSS / (1 - Kintas)
     notes: tuple[str, ...]
 
 
@@ -164,15 +164,18 @@ def excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts: list
             continue
         beyond = np.sign(s.rate) * velocity[rows] - abs(s.rate)
         half = float(waver(error))
-        scale = ramp.scale(half, float(lasting_most(beyond)))
-        shown.append(float(np.interp(scale * half, ramp.waver, bands.friction)))
+        fastest = float(lasting_most(beyond))
+        scale = ramp.scale(half, fastest)
+        amount = float(np.interp(scale * half, ramp.waver, bands.friction))
+        shown.append((amount, amount * ramp.sliding(half, fastest)))
         out.append(_ramp("position", s, rows.start, scale * (error - ramp.position.centre), ramp.position))
         out.append(_ramp("speed", s, rows.start, beyond - ramp.speed.centre, ramp.speed))
-    friction = float(np.mean(shown)) if shown else float(bands.friction[0])
+    least = float(bands.friction[0])
+    friction, sliding = np.mean(shown, axis=0).tolist() if shown else (least, least)
     if bands.ramps and not shown:
         notes.append("steps are judged as if the spool had healthy friction: no ramp shows how much there is")
     for step in bands.steps:
-        made = _step(xj, period, bands, step, place[step.section], friction)
+        made = _step(xj, period, bands, step, place[step.section], (friction, sliding))
         if not _lost(xj[made.start:made.start + len(made.departure)], made.section, notes):
             out.append(made)
     return out, friction, notes
@@ -190,15 +193,20 @@ def _ramp(signal: str, s: Section, start: int, departure: Floats, width: Width) 
     return Excursion(signal, s, start, np.abs(departure), middle, most, FRICTION.name)
 
 
-def _step(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section, friction: float) -> Excursion:
-    """Departure towards clogging; on rows where no limit stands it is NaN."""
+def _step(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section, amounts: tuple[float, float]
+          ) -> Excursion:
+    """Departure towards clogging; on rows where no limit stands it is NaN.
+
+    A step is delayed by what slides (FDS) and scatters by what sticks (FSS). So two amounts of friction are allowed,
+    and what is left by either counts.
+    """
     first, stop = round(step.t[0] / period), round(step.t[-1] / period) + 1
     rows = np.arange(first, min(stop, s.stop - s.start))
-    centre, spread = step.centre(friction, bands.friction)
-    middle, most, judged = bands.margins(step, spread)
     at = rows * period
     towards = np.sign(np.interp(at, step.t, step.middle))
-    x = towards * (xj[s.start + rows] - np.interp(at, step.t, centre))
+    centres, spreads = zip(*(step.centre(amount, bands.friction) for amount in amounts), strict=True)
+    middle, most, judged = bands.margins(step, np.max(spreads, axis=0))
+    x = np.min([towards * (xj[s.start + rows] - np.interp(at, step.t, centre)) for centre in centres], axis=0)
     x = np.where(np.interp(at, step.t, judged.astype(float)) > 0.99, x, np.nan)
     return Excursion("position", s, s.start + first, x, np.interp(at, step.t, middle), np.interp(at, step.t, most),
                      CLOGGING.name)

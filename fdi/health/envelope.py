@@ -73,6 +73,11 @@ class RampBand(NamedTuple):
         slip = fastest / half if half > 0.0 else self.slip
         return float(np.clip((1 - self.ease * self.slip) / max(1 - self.ease * slip, 0.1), *SCALED))
 
+    def sliding(self, half: float, fastest: float) -> float:
+        """What 1.5 FDS is of FSS: a slip is as fast as both differ, which is by FSS/3 where it is `slip`."""
+        own = fastest / (self.scale(half, fastest) * half) if half > 0.0 else self.slip
+        return float(np.clip(1.5 * (1 - own / (3 * self.slip)), 0.0, 1.5)) if self.slip > 0.0 else 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Bands:

@@ -177,10 +177,15 @@ def _sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, p
     """Mean and scatter of healthy units, and what a fault of Table 2's lesser size adds, by precursor."""
     found = {word: features(com, x, period, parts) for word, x in tables.items()}
     whole = features(com, healthy, period, parts)
-    with np.errstate(invalid="ignore"):
-        return {name: {"healthy": float(np.nanmean(whole[name])), "noise": float(np.nanstd(whole[name], ddof=1)),
-                       **{word: float(np.nanmean(found[word][name]) - np.nanmean(found["healthy"][name]))
-                          for word in (CLOGGING.name, FRICTION.name)}} for name in whole}
+    return {name: {"healthy": _mean(whole[name]), "noise": float(np.nanstd(whole[name], ddof=1)),
+                   **{word: _mean(found[word][name]) - _mean(found["healthy"][name])
+                      for word in (CLOGGING.name, FRICTION.name)}} for name in whole}
+
+
+def _mean(values: Floats) -> float:
+    """Of what was shown; NaN where most units do not show it."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if 2 * len(known) > len(values) else float("nan")
 
 
 def _facts(parts: Sequence[Section], period: float) -> dict[str, str]:

@@ -33,10 +33,10 @@ def overview(c: Cycles, judged: Judged) -> str:
         ax = figure.subplots()
         ax.plot(*thin(c.t, c.com * MM), color=COMMAND, lw=2.2, label="Com, command")
         ax.plot(*thin(c.t, c.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
+        ax.set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
         _shade(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
         ax.set_xlabel("time [s]")
-        ax.set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
         ax.legend(loc="upper right", ncols=2, frameon=False)
         return svg(figure, "overview")
 
@@ -70,8 +70,8 @@ def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged:
     for limit, colour, label in ((middle, AMBER, "MidBand"), (most, RED, "MaxBand")):
         ax.plot(t, np.where(there, side * limit, np.nan) * UM, color=colour, lw=1.6, label=label)
     ax.plot(t, (xj[rows] - centre) * UM, color=INK, lw=1.0, label="measured")
-    _shade(ax, judged.events, MS, float(c.t[s.start]), "position")
     ax.set_xlim(0.0, float(t[-1]))
+    _shade(ax, judged.events, MS, float(c.t[s.start]), "position")
     ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(c.t[s.start]):.4g} s", fontsize=9)
     ax.set_xlabel("time from the step [ms]")
     ax.set_ylabel("off the healthy\nresponse [µm]")
@@ -102,8 +102,8 @@ def _ramp(axes: Sequence[Axes], c: Cycles, ramp: RampBand, s: Section, judged: J
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
         _widths(ax, width, unit, nearer)
         ax.plot(*thin(c.t[rows], values * unit), color=INK, lw=0.8, label="measured")
-        _shade(ax, judged.events, 1.0, 0.0, name)
         ax.set_xlim(float(c.t[rows.start]), float(c.t[rows.stop - 1]))
+        _shade(ax, judged.events, 1.0, 0.0, name)
     axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(c.t[rows.start]):.4g} s", fontsize=9)
     axes[-1].set_xlabel("time [s]")
 
@@ -126,10 +126,15 @@ def _places(c: Cycles, bands: Bands) -> dict[int, Section]:
 
 
 def _shade(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal: str = "") -> None:
-    for e in events:
-        if signal in ("", e.signal):
-            ax.axvspan((e.t_in - begin) * unit, (e.t_out - begin) * unit, color=SHADES[e.band], alpha=0.18, lw=0,
-                       zorder=-1)
+    """Stays outside over the whole height: one drawing a band, as there may be hundreds."""
+    low, high = ax.get_xlim()
+    for band, colour in SHADES.items():
+        ends = [((e.t_in - begin) * unit, (e.t_out - begin) * unit) for e in events
+                if e.band == band and signal in ("", e.signal)]
+        spans = [(a, b - a) for a, b in ends if b > low and a < high]
+        if spans:
+            ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), color=colour, alpha=0.18, lw=0,
+                           zorder=-1)
 
 
 def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: Judged | None) -> str:
