@@ -16,6 +16,7 @@ from rig.console import console
 
 COLOURS = ("green", "yellow", "red")  # by level
 WIDTH, HEIGHT = 72, 11  # characters of a drawing
+SCORES = 120  # of the table of scores, as wide as it needs
 MARK, STRAY, BAR, COURSE, FAN = "●", "○", "│", "·", "░"
 AHEAD = 0.35  # at least this part of a drawing is future
 
@@ -108,13 +109,14 @@ def scores(found: Scores) -> None:
     """The table of `rig trend --score`."""
     out = console()
     table = Table(box=None, pad_edge=False)
-    table.add_column("true law")
-    marks = " ".join(f"{x:g}" for x in LAMBDAS)
-    for head in ("units", f"alpha-lambda at {marks}", "horizon", "relative accuracy", "95 % to MaxBand", "to MidBand",
-                 "too late", "first trend"):
-        table.add_column(head, justify="right")
+    table.add_column("\ntrue law", no_wrap=True)
+    marks = " ".join(f"{x:g}".lstrip("0") for x in LAMBDAS)
+    for head in ("\nunits", f"alpha-lambda\n{marks}", "\nhorizon", f"relative accuracy\n{marks}", "95 %\nto MaxBand",
+                 "95 %\nto MidBand", "too\nlate", "first\ntrend"):
+        table.add_column(head, justify="right", no_wrap=True)
     for one in found.lines:
         table.add_row(*_cells(one))
+    out.width = max(out.width, SCORES)
     out.print(table)
     out.print(f"\nhealthy units in which a trend was told: {found.told} of {found.healthy}")
 
@@ -123,6 +125,8 @@ def _cells(one: Line) -> list[str]:
     def share(pair: tuple[int, int]) -> str:
         return f"{pair[0]}/{pair[1]} {100 * pair[0] / max(pair[1], 1):.0f} %"
 
-    return [one.law, str(one.units), " ".join(f"{x:.2f}" for x in one.alpha_lambda), f"{one.horizon:.2f}",
-            " ".join(f"{x:.2f}" for x in one.relative), share(one.held), share(one.held_middle), share(one.early),
-            f"{one.latency:.2f}"]
+    def four(values: tuple[float, ...]) -> str:
+        return " ".join(f"{x:.2f}" for x in values)
+
+    return [one.law, str(one.units), four(one.alpha_lambda), f"{one.horizon:.2f}", four(one.relative), share(one.held),
+            share(one.held_middle), share(one.early), f"{one.latency:.2f}"]
