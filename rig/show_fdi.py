@@ -18,6 +18,7 @@ from rig.methods import Row
 COLOURS = {"ACCEPTABLE": "green", "MAINTENANCE": "yellow", "NON_NOMINAL": "red", "SOMETHING_ELSE": "yellow",
            "CANNOT_TELL": "yellow"}
 OF_LEVEL = {Level.ACCEPTABLE: "green", Level.MAINTENANCE: "yellow", Level.NON_NOMINAL: "red", None: "yellow"}
+OUTSIDE = {None: "-", Level.ACCEPTABLE: "within", Level.MAINTENANCE: "MidBand", Level.NON_NOMINAL: "MaxBand"}
 EVENTS = 6  # lines; page and JSON have all
 
 
@@ -56,15 +57,15 @@ def faults(d: Diagnosis) -> Table:
     t = Table(box=None, pad_edge=False)
     t.add_column("fault", no_wrap=True)
     t.add_column("level", no_wrap=True)
-    for column in ("size", "95 % interval", "limits", "grid", "bands"):
+    for column in ("size", "95 %", "limits", "grid", "bands"):
         t.add_column(column, justify="right", no_wrap=True)
     for f in FAULTS:
         e, level = d.sizes[f.name], d.levels[f.name]
         at = getattr(d.grid.merged, f.symbol) if d.grid else None
         said = d.judged.levels.get(f.name) if d.judged else None
         t.add_row(NAMES[f.name] + (" *" if d.ruling == f.name else ""), f"[{OF_LEVEL[level]}]{LEVELS[level]}[/]",
-                  size(e.value), f"{size(e.low)} .. {size(e.high)}", f"{f.middle:g} / {f.most:g}",
-                  "-" if at is None else size(at), said.word if said is not None else "-")
+                  size(e.value), f"{size(e.low)}..{size(e.high)}", f"{f.middle:g}/{f.most:g}",
+                  "-" if at is None else size(at), OUTSIDE[said])
     t.caption = "filter clogging: Kintas; spool friction: FSS in N" + ("; * rules" if d.ruling else "")
     t.caption_justify = "left"
     return t

@@ -5,6 +5,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fdi.compare import sensors
 from fdi.cycles import Cycles
 from fdi.discovery.record import Record
@@ -25,8 +27,10 @@ from plant.model import Model, load_model
 Progress = Callable[[str, int, int], None]
 
 STAGES = 4
+STILL = 2e-4  # m
 TOLERANCE = 0.015  # of a healthy unit's parameters, relative, standard deviation
 HEALTHY = 4.0  # such tolerances, within which a suspect is as it left the works
+SURE = 2.0  # times the 95 % interval
 SMALL = {"null_bias.current": 1.6e-5, "constant_load.force": 50.0}  # A, N: less is not worth a word
 WORDS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
 
@@ -85,6 +89,8 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     progress("reading", 0, STAGES)
     model, record, c = usable(trace, model, None, source)
     assert c is not None
+    if float(np.ptp(c.com)) < STILL and float(np.ptp(record.position[~np.isnan(record.position)])) < STILL:
+        raise InputError(source, "com", f"a ram that moves {1e3 * STILL:g} mm or more: at rest it shows neither fault")
     notes = list(c.notes)
     progress("bands", 1, STAGES)
     bands, judged, seen = _banded(c, model, bands, notes)
@@ -174,7 +180,8 @@ def _verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
 
 
 def _unhealthy(name: str, e: Estimate, model: Model) -> bool:
-    """Whether a suspect is surely off what a healthy unit has."""
+    """Whether a suspect is surely off what a healthy unit has: there are many of them, so by more than 95 %."""
+    e = Estimate(e.value, e.value - SURE * (e.value - e.low), e.value + SURE * (e.high - e.value))
     if name in SMALL:
         return (e.low > 0.0 or e.high < 0.0) and abs(e.value) > SMALL[name]
     usual, way = model[name], math.exp(HEALTHY * TOLERANCE)
