@@ -49,9 +49,14 @@ def test_maps_are_rms_of_the_monitor() -> None:
     step = np.r_[500:4001]  # the sections of the preflight
     ramp = np.r_[4001:6001, 6501:8501]
     assert grid.step and grid.ramp
-    for made, rows in ((grid.step, step), (grid.ramp, ramp), (grid.joint, np.r_[step, ramp])):
+    variances = {}
+    for made, rows in ((grid.step, step), (grid.ramp, ramp)):
+        variances[len(rows)] = np.var((c.xj - run)[rows])
+        assert made.rms[row, column] == pytest.approx(np.sqrt(variances[len(rows)]), rel=1e-9)
+    both = sum(n * v for n, v in variances.items()) / sum(variances)
+    assert grid.joint.rms[row, column] == pytest.approx(np.sqrt(both), rel=1e-9)
+    for made in (grid.step, grid.ramp, grid.joint):
         assert made.rms.shape == (21, 21)
-        assert made.rms[row, column] == pytest.approx(np.sqrt(np.mean((c.xj - run)[rows] ** 2)), rel=1e-9)
         assert made.minimum.rms == made.rms.min()
         where = np.argwhere(made.rms == made.rms.min())[0]
         assert made.minimum[:2] == (KINTAS[where[0]], FSS[where[1]])
@@ -110,6 +115,18 @@ def test_a_command_with_one_kind_of_section(which: str) -> None:
     np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
     assert grid.merged[:2] == there.minimum[:2] and grid.merged.weight == float(which == "step")
     assert there.minimum.fss == pytest.approx(40.0, abs=18.0)
+
+
+@pytest.mark.parametrize(("kintas", "fss"), [(0.0, 5.0), (0.25, 30.0)])
+@pytest.mark.parametrize("other", ["load", "null bias", "jack friction"])
+def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: float, other: str) -> None:
+    changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
+               "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
+    faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
+    load = np.full(len(PREFLIGHT.command), 3e3 * (other == "load"))
+    found = search(of(simulate(Model().replace(faults | changed), PREFLIGHT.command, load)), sliding=(2.0 / 3.0,)).best
+    assert found.kintas == pytest.approx(kintas, abs=0.126)
+    assert found.fss == pytest.approx(fss, abs=4.5)
 
 
 def test_gaps_are_left_out() -> None:

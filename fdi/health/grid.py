@@ -1,9 +1,9 @@
 """The RMS grid: the monitor run for every pair of fault sizes, held against the measured ram (the paper's Figs. 13-15).
 
 One map is of the step sections, one of the ramp sections, one of both. The monitor is driven by the measured current
-and its ram drawn to the measured one at ANCHOR. In closed loop, as in the paper, the maps of this plant have no use:
-with spool friction the loop limit-cycles, two runs differ in phase, and a monitor that does not oscillate at all is
-nearer to the trace than the right one (`drive="command"` shows it).
+and its ram drawn to the measured one at ANCHOR; an offset does not count. In closed loop, as in the paper, the maps of
+this plant have no use: with spool friction the loop limit-cycles, two runs differ in phase, and a monitor that does not
+oscillate at all is nearer to the trace than the right one (`drive="command"` shows it).
 """
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Point(NamedTuple):
 
 
 class Map(NamedTuple):
-    """RMS of XJ, measured less monitor, over the sections of one kind, at each cell."""
+    """RMS of XJ, measured less monitor, about its mean, over the sections of one kind, at each cell."""
 
     rms: Floats  # (kintas, fss), m
     minimum: Point
@@ -132,11 +132,12 @@ def _rows(c: Cycles, parts: list[Section], kind: str) -> Flags:
 
 def _rms(c: Cycles, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]
          ) -> dict[str, Floats]:
-    """RMS of XJ, measured less monitor, by kind of section; (m,) m each."""
+    """RMS of XJ, measured less monitor, about its mean, by kind of section; (m,) m each."""
     def reduced(runs: Floats) -> Floats:
         found = []
         for chosen in rows.values():
             left = runs[:, 0].T[chosen] - c.xj[chosen, None]
+            left -= left.mean(axis=0)  # a load, a null bias: against the pull to the measured ram they end as an offset
             found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
         return np.stack(found, -1)
 
