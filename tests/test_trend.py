@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,14 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal
 
 from fdi.health.types import CLOGGING, FRICTION, Estimate
+from fdi.trace import Trace
 from fdi.trend import bayes, fleet, gather, life
 from fdi.trend.dates import Row, days, in_name, iso, read_table, row_of
 from fdi.trend.laws import basis, shapes
 from fdi.trend.score import Prediction, score, told_without_reason
 from fdi.trend.trend import Trend, follow
-from plant import InputError, load_model
+from plant import InputError, load_model, simulate
+from rig.recorder.provenance import provenance
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)
@@ -275,10 +276,21 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         gathered("flights")
 
 
-def test_a_real_log_is_diagnosed_once(preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(preflight, tmp_path / "unit" / "first")
+def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    t = 1e-3 * np.arange(2000)
+    command = np.where((t > 0.2) & (t < 1.0), 1e-3, 0.0) + 5e-4 * np.clip(t - 1.0, 0.0, 0.8)
+    made = simulate(load_model(), command, seed=4)
+    (tmp_path / "unit").mkdir()
+    there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.of(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
+    monkeypatch.setattr(gather, "cache_folder", lambda: tmp_path / "cache")
     first = rig("trend", tmp_path / "unit", "--json")
     assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"
-    assert first.json["points"][0]["date"][:2] == "20" and first.json["points"][0]["fss"]["low"] < 5.0
+    assert first.json["points"][0]["date"] == "2026-01-05" and first.json["points"][0]["fss"]["low"] < 5.0
+    assert sorted(path.name for path in (tmp_path / "unit").iterdir()) == ["2026-01-05.csv"]
     monkeypatch.setattr("fdi.health.diagnosis.diagnose", lambda *a, **k: pytest.fail("a second time"))
     assert rig("trend", tmp_path / "unit", "--json").json == first.json
+
+
+def test_a_log_of_the_rig_tells_its_date() -> None:
+    assert days(provenance()["started"]) > days("2026-01-01")
