@@ -1,0 +1,43 @@
+"""The tables of docs/bands.md: `python docs/bands_statistics.py` judges fresh units by the shipped bands (ten minutes)."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdi.health.bands import judge_columns
+from fdi.health.montecarlo import Kind, runs
+from fdi.health.precursors import shown
+from fdi.health.store import default
+from fdi.health.types import FAULTS, Level
+from fdi.sections import sections
+from plant import load_model
+from rig.sequences import load_sequence
+
+NAN, LOW = math.nan, 10 / 3  # N, healthy dynamic friction
+UNITS = (("healthy", Kind("healthy"), 1008, 2026), ("healthy, others", Kind("healthy"), 416, 99),
+         *((f"Kintas {k:.3g}", Kind("", k), 208, 77) for k in (0.1, 0.15, 0.2, 0.225, 0.25, 0.3, 0.35)),
+         *((f"FSS {f} N", Kind("", NAN, f), 208, 77) for f in (20, 28, 30, 32, 35, 70)),
+         *((f"FSS {f} N, FDS 3.3 N", Kind("", NAN, f, LOW / f), 208, 77) for f in (35, 70)),
+         *((f"Kintas {k}, FSS {f} N", Kind("", k, f), 208, 77) for k, f in ((0.25, 30), (0.17, 45), (0.3, 70))))
+
+
+def main() -> None:
+    """Print both tables."""
+    com = load_sequence("preflight").main_profile().command
+    parts, bands, model = sections(com), default(), load_model()
+    for name, kind, count, seed in UNITS:
+        x = runs(model, com, np.zeros_like(com), kind, count, seed)
+        found = [judge_columns(com, row, 1e-3, bands, parts=parts) for row in x]
+        shares = [100 * np.mean([j.levels.get(f.name, Level.ACCEPTABLE) >= level for j in found])
+                  for f in FAULTS for level in (Level.MAINTENANCE, Level.NON_NOMINAL)]
+        print(f"| {name} | {count} |", " | ".join(f"{share:.1f} %" for share in shares), "|", flush=True)
+    for name, known in bands.precursors.items():
+        cells = [shown(known[key], name) for key in ("healthy", "noise")]
+        for fault in FAULTS:
+            cells += [shown(known[fault.name], name), f"{known[fault.name] / known['noise']:+.1f}"]
+        print("|", " | ".join([name, *cells]), "|")
+
+
+if __name__ == "__main__":
+    main()
