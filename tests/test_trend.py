@@ -241,23 +241,27 @@ def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
         assert said.status == 2 and said.err.count("\n") == 1, words
 
 
-def known(sizes: dict[str, Any]) -> Any:
+def diagnosed(file: Path, model: Any, again: bool = False) -> dict[str, Any]:
     """In place of the diagnosis."""
-    def diagnosed(file: Path, model: Any, again: bool = False) -> dict[str, Any]:
-        if file.name not in sizes:
-            raise InputError(file, "xj", "a position")
-        return {"started": sizes[file.name], "note": "",
-                "sizes": {"filter_clogging": [0.0, 0.0, 0.1], "spool_friction": [5.0, 4.0, 6.0]}}
-    return diagnosed
+    if file.name == "dead.csv":
+        raise InputError(file, "xj", "a sensor that lives")
+    return {"note": "", "sizes": {"filter_clogging": [0.0, 0.0, 0.1], "spool_friction": [5.0, 4.0, 6.0]}}
+
+
+def started(file: Path, model: Any, again: bool = False) -> str:
+    """In place of a look into the log."""
+    if file.name == "broken.csv":
+        raise InputError(file, "xj", "a position")
+    return "2026-01-10T00:00:00+00:00" if file.name == "own.mcap" else ""
 
 
 def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "unit"
     (folder / "2026-02-01").mkdir(parents=True)
-    for name in ("own.mcap", "2026-02-01/named.csv", "table.csv", "broken.csv"):
+    for name in ("own.mcap", "2026-02-01/named.csv", "2026-02-01/dead.csv", "table.csv", "broken.csv"):
         (folder / name).write_text("")
-    logs = {"own.mcap": "2026-01-10T00:00:00+00:00", "named.csv": "", "table.csv": ""}
-    monkeypatch.setattr(gather, "diagnosed", known(logs))
+    monkeypatch.setattr(gather, "diagnosed", diagnosed)
+    monkeypatch.setattr(gather, "started", started)
 
     def gathered(axis: str | None = None) -> gather.Gathered:
         return gather.gather(folder, load_model(), gather.Options(axis), lambda what, done, total: None)
@@ -265,11 +269,11 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match=r"table.csv: date: expected .*dates.csv"):
         gathered()
     (folder / "dates.csv").write_text("file,date,hours\ntable.csv,2026-01-20,30\nown.mcap,,10\n"
-                                      "named.csv,,20\nold.csv,,\n")
+                                      "named.csv,,20\ndead.csv,,25\nold.csv,,\n")
     found = gathered()
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [iso(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
-    assert any("broken.csv left out" in note for note in found.notes)
+    assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
     assert any("old.csv stands in dates.csv" in note for note in found.notes)
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
     with pytest.raises(InputError, match="flights"):

@@ -55,28 +55,33 @@ def gather(folder: Path, model: Model, options: Options, progress: Progress) -> 
     Raises:
         InputError: no folder, no traces, no axis on which all of them stand, or none that can be judged.
     """
-    files, notes = traces(folder), []
     place = options.table or folder / TABLE
     table = read_table(place) if options.table or place.is_file() else {}
-    known: list[tuple[str, Row, Mapping[str, Any]]] = []
-    for i, file in enumerate(files):
-        progress(f"trace {i + 1} of {len(files)}", i, len(files))
+    notes: list[str] = []
+    rows: dict[Path, Row] = {}
+    for file in traces(folder):
+        name = file.relative_to(folder).as_posix()
+        try:
+            rows[file] = _row(folder, name, started(file, model, options.again), row_of(table, name))
+        except InputError as error:
+            notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
+    axis = _axis(folder, rows, options.axis)  # before the work: a trace without a date is refused at once
+    notes += [f"{key} stands in {place.name}, but there is no such trace" for key, row in table.items()
+              if row not in [row_of(table, file.relative_to(folder).as_posix()) for file in rows]]
+    points = []
+    for i, (file, row) in enumerate(rows.items()):
+        progress(f"trace {i + 1} of {len(rows)}", i, len(rows))
         name = file.relative_to(folder).as_posix()
         try:
             told = diagnosed(file, model, options.again)
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
-        known.append((name, _row(folder, name, told, row_of(table, name)), told))
-    progress("trend", len(files), len(files))
-    if not known:
+        sizes = {f.name: Estimate(*told["sizes"][f.name]) for f in FAULTS}
+        points.append(Point(name, row[list(AXES).index(axis)], sizes, told["note"]))
+    progress("trend", len(rows), len(rows))
+    if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
-    axis = _axis(folder, known, options.axis)
-    notes += [f"{key} stands in {place.name}, but there is no such trace" for key, row in table.items()
-              if row not in [row_of(table, name) for name, _, _ in known]]
-    column = list(AXES).index(axis)
-    points = [Point(name, row[column], {f.name: Estimate(*told["sizes"][f.name]) for f in FAULTS}, told["note"])
-              for name, row, told in known]
     return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes))
 
 
@@ -91,27 +96,38 @@ def traces(folder: Path) -> list[Path]:
     return found
 
 
-def _row(folder: Path, name: str, told: Mapping[str, Any], row: Row | None) -> Row:
+def _row(folder: Path, name: str, own: str, row: Row | None) -> Row:
     """Where a trace stands: by the table, else by its own start time, else by its name."""
     row = row or Row(math.nan, math.nan, math.nan)
     if not math.isnan(row.date):
         return row
-    own = days(told["started"])
-    return row._replace(date=own if not math.isnan(own) else in_name(Path(folder.resolve().name) / name))
+    day = days(own)
+    return row._replace(date=day if not math.isnan(day) else in_name(Path(folder.resolve().name) / name))
 
 
-def _axis(folder: Path, known: list[tuple[str, Row, Mapping[str, Any]]], wanted: str | None) -> str:
+def _axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
     """The axis asked for, or the first on which every trace stands."""
-    without = {axis: [name for name, row, _ in known if math.isnan(row[i])] for i, axis in enumerate(AXES)}
+    without = {axis: [file for file, row in rows.items() if math.isnan(row[i])] for i, axis in enumerate(AXES)}
     for axis in (wanted,) if wanted else AXES:
         if not without[axis]:
             return axis
-    missing = without[wanted or "date"]
-    where = folder / missing[0]
+    missing = without[wanted or "date"][0]
     if (wanted or "date") == "date":
-        raise InputError(where, "date", "a start time in the log, an ISO date in the name of file or folder "
-                                        f"(2026-01-31), or a line in {folder / TABLE} (file,date)")
-    raise InputError(where, str(wanted), f"a line in {folder / TABLE} with a column {wanted}")
+        raise InputError(missing, "date", "a start time in the log, an ISO date in the name of file or folder "
+                                          f"(2026-01-31), or a line in {folder / TABLE} (file,date)")
+    raise InputError(missing, str(wanted), f"a line in {folder / TABLE} with a column {wanted}")
+
+
+def started(file: Path, model: Model, again: bool = False) -> str:
+    """When the log says that it began, "" if it does not say.
+
+    Raises:
+        InputError: a file that is no trace.
+    """
+    place = _kept(file, model)
+    if place.is_file() and not again:
+        return str(json.loads(place.read_text(encoding="utf-8"))["started"])
+    return Trace.read(file).provenance.get("started", "")
 
 
 def diagnosed(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
