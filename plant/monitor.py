@@ -78,7 +78,7 @@ class Drive(NamedTuple):
 
 
 def decay(x: float) -> float:
-    """e^x for -1 <= x <= 0, to 4e-11, and at the usual -0.25 to 1e-16: Taylor's series for a quarter, squared twice."""
+    """e^x for -1 <= x <= 0, to 4e-11, and at the usual -0.25 to 1e-15: Taylor's series for a quarter, squared twice."""
     x = 0.25 * x
     y = 1.0 + x * (1.0 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720 + x * (
         1 / 5040 + x * (1 / 40320))))))))
