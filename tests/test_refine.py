@@ -7,8 +7,9 @@ from recordings import recorded
 
 from fdi.discovery.record import record
 from fdi.health.levels import level, ruling, severity
-from fdi.health.refine import Refined, estimate, free_parameters, problem_of, refine, start_of
+from fdi.health.refine import Refined, estimate, problem_of, refine
 from fdi.health.types import CLOGGING, FRICTION, Estimate, Level
+from fdi.health.unknowns import free_parameters, start_of
 from fdi.health.valley import flats, relaxed, sloped
 from plant import Model, load_model
 from rig.trial import cases, truth

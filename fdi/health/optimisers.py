@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from fdi.discovery.fit import misfit
 from fdi.discovery.record import Record
-from fdi.health.refine import COARSE, Counted, free_parameters, problem_of, refine, start_of
+from fdi.health.refine import COARSE, Counted, problem_of, refine
+from fdi.health.unknowns import free_parameters, start_of
 from plant.model import Model
 
 Floats = NDArray[np.float64]

@@ -7,21 +7,19 @@ is the tolerances that decide how wide the intervals are.
 """
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery import noise as noises
 from fdi.discovery.fit import Fit, misfit
-from fdi.discovery.known import free_of
-from fdi.discovery.problem import Free, Problem, quiet, unknowns
+from fdi.discovery.problem import Free, Problem, quiet
 from fdi.discovery.record import NOISE, Record
 from fdi.health.types import CLOGGING, FRICTION, Estimate
+from fdi.health.unknowns import MOST, SUSPECTS, free_parameters, start_of, values
 from fdi.health.valley import descended, first_widths, flats
 from plant.effects import CATALOGUE
 from plant.model import Model
@@ -34,58 +32,9 @@ FINE = 20  # steps a cycle of the last fit
 EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
 SETTLING = 4  # rounds of the last fit
-LEAST, LARGEST = 0.05, 1000.0  # N, friction of the spool
-MOST = 0.95  # Kintas
-UNKNOWN = 150.0  # 1.5 % each: faults may be of any size; where nothing shows them, this is what is known
 REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
 COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
 CLOSER = ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03))  # steps of Kintas and factors of FSS around the best start
-SLIDING = 1.5  # FSS over FDS in a start (nominal.toml)
-
-
-class Suspect(NamedTuple):
-    """Something else that ages or is set up wrongly: its parameter, and how far off it is thought possible."""
-
-    effect: str
-    parameter: str
-    spread: float  # standard deviation known beforehand, as wide as what is typical: SI, or of the logarithm
-    ratio: bool = False  # True: of the logarithm
-
-
-SUSPECTS = (
-    Suspect("jack_friction", "jack.dynamic_friction", 0.5, True),
-    Suspect("viscous_drag", "jack.damping", 0.7, True),
-    Suspect("moving_mass", "jack.mass", 0.5, True),
-    Suspect("internal_leakage", "jack.leakage", 2.0, True),
-    Suspect("null_bias", "null_bias.current", 1.6e-4),
-    Suspect("constant_load", "constant_load.force", 3e3),
-)
-
-
-class Ratio(Free):
-    """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
-
-    __slots__ = ()
-
-    def value(self, x: float) -> float:
-        """SI."""
-        return math.exp(super().value(x))
-
-
-class Over(Ratio):
-    """Static friction by its ratio to the dynamic one of the same body, which comes before it."""
-
-    __slots__ = ()
-
-
-class Open(Free):
-    """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
-
-    __slots__ = ()
-
-    def value(self, x: float) -> float:
-        """Kintas."""
-        return 1.0 - math.exp(super().value(x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,50 +76,11 @@ class Counted(Problem):
         return super().all_signals(names, values, r)
 
 
-def values(free: Sequence[Free], x: Floats) -> Floats:
-    """Parameters in SI units, (p,), of scaled unknowns (p,)."""
-    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
-    names = [f.name for f in free]
-    for k, f in enumerate(free):
-        if isinstance(f, Over):
-            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
-    i, j = names.index("spool.static_friction"), names.index("spool.dynamic_friction")
-    found[j] = min(found[i], found[j])
-    return found
-
-
 def problem_of(model: Model, record: Record, floor: Mapping[str, float] | None = None, workers: int = 2) -> Counted:
     """The model with the suspects ready in it, and the run to hold it against; `floor` RMS noise by signal, SI."""
     level = {name: floor[name] if floor else model[NOISE[name]] for name in record.signals}
     ready = quiet(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
     return Counted(ready, record, tuple(noises.white(level[name]) for name in record.signals), workers=workers)
-
-
-def free_parameters(model: Model) -> tuple[Free, ...]:
-    """What a fit may change: the faults first, then the suspects, then the tolerances."""
-    clogging = Open(CLOGGING.parameter, 0.0, 0.015, UNKNOWN, math.log(1.0 - MOST), 0.0, 1.0)
-    friction = [Ratio(f"spool.{kind}_friction", math.log(model[f"spool.{kind}_friction"]), 0.015, UNKNOWN,
-                      math.log(LEAST), math.log(LARGEST), 1.0) for kind in ("static", "dynamic")]
-    suspects = [_suspected(s, model) for s in SUSPECTS]
-    usual = math.log(model["jack.static_friction"] / model["jack.dynamic_friction"])
-    over = Over("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
-    taken = {f.name for f in (clogging, *friction, *suspects, over)}
-    return (clogging, *friction, *suspects, over, *(_ratio(f) for f in free_of(model) if f.name not in taken))
-
-
-def _suspected(s: Suspect, model: Model) -> Free:
-    own = next(u for u in unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
-    usual = model.values.get(s.parameter, own.centre)
-    if s.ratio:
-        return Ratio(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual), 0.02)
-    return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
-
-
-def _ratio(f: Free) -> Free:
-    """A tolerance as one of the logarithm."""
-    if f.low <= 0.0:
-        return f
-    return Ratio(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
 
 
 def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] = COARSE,
@@ -261,14 +171,6 @@ def offsets_of(problem: Problem) -> dict[str, float]:
         pressure = r.measured[r.signals.index("p12")]
         found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(r.load.mean())
     return found
-
-
-def start_of(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None) -> Floats:
-    """Scaled unknowns, (p,), of a plant that has the two faults and `offsets`, and is nominal otherwise."""
-    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), MOST)),
-            FRICTION.parameter: math.log(max(fss, LEAST)),
-            "spool.dynamic_friction": math.log(max(fss, LEAST) / SLIDING), **(offsets or {})}
-    return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
 
 
 def _with_noise(problem: Counted, found: Fit) -> Counted:
