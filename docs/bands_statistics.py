@@ -1,4 +1,4 @@
-"""The tables of docs/bands.md: `python docs/bands_statistics.py` judges fresh units by the shipped bands (ten minutes)."""
+"""The tables of docs/bands.md: `python docs/bands_statistics.py` judges fresh units by the shipped bands."""
 from __future__ import annotations
 
 import math

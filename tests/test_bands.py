@@ -1,7 +1,6 @@
 """Bands: what leaves them and what does not, limits from Table 2's faults, files, other commands, a fleet's own."""
 from __future__ import annotations
 
-import json
 import math
 from functools import cache
 from pathlib import Path
@@ -12,9 +11,8 @@ import pytest
 from fdi.health import bands as judging
 from fdi.health.bands import Judged, judge, judge_columns
 from fdi.health.envelope import LASTING, Bands, check_command, matches, stays
-from fdi.health.fleet import learn
 from fdi.health.learn import build
-from fdi.health.montecarlo import Kind, runs, sensor_noise
+from fdi.health.montecarlo import Kind, runs
 from fdi.health.store import default, load, parse, save, text
 from fdi.health.types import Level
 from fdi.sections import Section, sections
@@ -22,7 +20,6 @@ from fdi.trace import Trace
 from plant import InputError, load_model, simulate
 from plant.profile import build as profile
 from plant.segments import Hold, Ramp, Step
-from rig.cli import main
 from rig.sequences import load_sequence
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"
@@ -47,11 +44,6 @@ def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5
 
 def judged(x: np.ndarray, bands: Bands | None = None) -> Judged:
     return judge_columns(command(), x, 1e-3, bands or default(), parts=parts())
-
-
-def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
-    com = command() if com is None else com
-    return Trace.of({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})
 
 
 def levels(found: list[Judged], fault: str) -> list[Level | None]:
@@ -236,77 +228,8 @@ def test_a_wrong_file_is_refused(wrong: str | None, word: str, tmp_path: Path) -
         load(tmp_path / "none.toml")
 
 
-def test_a_fleet_of_its_own() -> None:
-    """Another design's response, learned from healthy traces, is healthy then; its faults are still found."""
-    model = load_model().replace({"pilot.flow_gain": 0.069 * 0.88})
-    com = command()
-
-    def fleet(kind: Kind, count: int, seed: int) -> list[Trace]:
-        return [trace(x) for x in runs(model, com, np.zeros_like(com), kind, count, seed)]
-
-    healthy = fleet(Kind(""), 32, 7)
-    strange = [judge(t, default()) for t in healthy]
-    assert np.mean([j.severity[CLOGGING] for j in strange]) > 0.3
-    own = learn(healthy)
-    assert own.provenance["made"].startswith("from 32 healthy traces")
-    fresh = [judge(t, own) for t in fleet(Kind(""), 16, 8)]
-    assert [j.events for j in fresh] == [()] * 16
-    assert np.mean([j.severity[CLOGGING] for j in fresh]) < 0.2
-    faulty = [judge(t, own) for t in fleet(Kind("", 0.4), 8, 9)]
-    assert {j.ruling for j in faulty} == {CLOGGING}
-    assert own.precursors["overshoot_5mm"]["healthy"] != default().precursors["overshoot_5mm"]["healthy"]
-
-
-def test_a_fleet_that_cannot_be_learned_from() -> None:
-    """Too few, another command in one of them, holes."""
-    own = [trace(x) for x in units()[:6]]
-    with pytest.raises(InputError, match="at least 5"):
-        learn(own[:3])
-    other = command().copy()
-    other[500:1500] = 4e-3
-    with pytest.raises(InputError, match=r"odd\.csv: com"):
-        learn([*own, trace(units()[7], other)], names=[*"abcdef", "odd.csv"])
-    holed = units()[7].copy()
-    holed[3000:4000] = np.nan
-    with pytest.raises(InputError, match="missing"):
-        learn([*own, trace(holed)])
-    doubtful = learn([*own, trace(units(0.5)[0])], names=[*"abcdef", "clogged.csv"])
-    assert doubtful.provenance["doubtful"].endswith(": clogged.csv")
-
-
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`rig fdi --learn-bands` writes a file, from a command or from traces; without a place for it, one line."""
-    com = profile((Hold(time=0.1), Step(to=2e-3, time=0.15), Ramp(to=2.5e-3, time=0.9))).command
-    rows = "\n".join(f"{k / 1000:.3f},{value:.9g}" for k, value in enumerate(com))
-    (tmp_path / "c.csv").write_text("t,com\n" + rows + "\n")
-    out = str(tmp_path / "b.toml")
-    assert main(["fdi", "--learn-bands", "--command", str(tmp_path / "c.csv"), "--out", out, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["judges"] == [CLOGGING, FRICTION]
-    assert load(out).provenance["command"].endswith("c.csv")
-    assert main(["fdi", "--learn-bands"]) == 2
-    assert main(["fdi"]) == 2
-    assert capsys.readouterr().err.count("\n") == 2
-
-
-def test_noise_of_the_units() -> None:
-    """As large as the sensor's, of different colours, with hum: what false alarms are counted with."""
-    drawn = [sensor_noise(np.random.default_rng(k), load_model(), 4000) for k in range(40)]
-    sizes = np.array([x.std() for x in drawn])
-    colours = np.array([np.corrcoef(x[:-1], x[1:])[0, 1] for x in drawn])
-    assert sizes.min() > 1.6e-6 and sizes.max() < 3e-6
-    assert colours.min() < 0.2 and colours.max() > 0.7
-
-
 @pytest.mark.slow
 def test_false_alarms() -> None:
     """At most 0.5 % of a thousand healthy units."""
     alarms = sum(bool(judged(x).events) for x in units(count=1008))
     assert alarms <= 5
-
-
-@pytest.mark.slow
-def test_the_shipped_bands_are_what_the_command_makes(tmp_path: Path) -> None:
-    """Byte for byte, on this kind of machine."""
-    out = tmp_path / "b.toml"
-    assert main(["fdi", "--learn-bands", "--out", str(out), "--quiet"]) == 0
-    assert out.read_text() == text(default())
