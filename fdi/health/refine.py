@@ -27,7 +27,7 @@ from plant.model import Model
 Floats = NDArray[np.float64]
 
 WIDTH = 1.96  # standard deviations of a 95 % interval
-ROUGH = 1.08  # times the interval of FSS: what stick-slip and the solver add (219 cases: 1.08 standard deviations)
+ROUGH = 1.1  # times the interval of FSS: what stick-slip and the solver add (320 cases: 1.14 standard deviations)
 FINE = 20  # steps a cycle of the last fit
 EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
