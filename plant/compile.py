@@ -12,7 +12,6 @@ import hashlib
 import math
 import os
 import tempfile
-import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -20,12 +19,12 @@ from typing import Any
 
 import numba
 import numba.core.cgutils
+import numba.core.compiler_lock
 import numba.extending
 import numpy as np
 
 from plant import functions
 
-_ONE = threading.Lock()  # numba's cache folder is a setting of the whole process
 Function = Any  # a plain function, or numba's dispatcher of one
 
 
@@ -59,7 +58,7 @@ def compiled(function: Function, ports: Mapping[str, Function] | None = None) ->
     linked = _link(function, ports or {}, lambda f: numba.njit(f, **INLINED))
     plain = rebind(linked.py_func)
     settings: Any = numba.config
-    with _ONE:
+    with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
         try:
             return numba.njit(plain, cache=True, nogil=True, error_model="numpy")

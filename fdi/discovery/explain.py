@@ -144,12 +144,13 @@ def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool
 
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
                holdout: Record | None) -> Explanation:
-    search.refine(FINE, TRUEST)
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
         depth = 1
+    depth = _pruned(search, levels, depth)
+    search.refine(FINE, TRUEST)
     base = search.settle(levels[0][0], 2 if depth or levels[0][0].reached else LONG)  # nothing helps: beyond doubt
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
     close = sorted((search.settle(h) for h in close), key=lambda h: h.cost + h.repeat_cost)
@@ -171,6 +172,17 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     blind = sensitivity(search.problem, (close[0] if close and verdict == "EXPLAINED" else base).fit, search.effects)
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
                        blind, search)
+
+
+def _pruned(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:
+    """The depth, after what was added first and is no longer wanted has gone: a later effect may do alone."""
+    while depth > 1:
+        best = search.lighter(levels[depth][0])[0]
+        if _significant(best, levels[depth][0], CONVINCING):
+            break
+        depth -= 1
+        levels[depth] = _distinct([best, *levels[depth]])
+    return depth
 
 
 def _parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypothesis:

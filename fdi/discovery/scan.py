@@ -23,6 +23,13 @@ TOGETHER = 64  # runs at a time
 THINNED = 5  # every so many samples, for the linear shift alone
 
 
+# effects that other unknowns can make up for, all but a little: powers of 1 - value that these then go with. A clogged
+# filter weakens what pushes the spool, so a fit without it has found too much friction and too little flow; friction
+# cannot give way linearly, a hundred stops of the spool would move
+GOES_WITH: Mapping[str, Mapping[str, float]] = {"filter_clogging": {
+    "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.flow_gain": -0.5}}
+
+
 class Trial(NamedTuple):
     """An effect at one start on top of a fit: `cost` after the fit's unknowns, (p,), have moved to `x`."""
 
@@ -30,6 +37,7 @@ class Trial(NamedTuple):
     start: Start
     cost: float
     x: Floats
+    along: bool = False  # what goes with the effect has moved first
 
 
 class Prospect(NamedTuple):
@@ -48,11 +56,12 @@ def scan(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Prospect]:
     take up what they can. Further passes try sizes around the best start, closer each time.
     """
     effects = list(effects)
-    first = [(name, start) for name in effects for start in (*CATALOGUE[name].starts, *tones(problem, fit, name))]
+    first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
+             for start in (*CATALOGUE[name].starts, *tones(problem, fit, name))]
     best = _best(_tried(problem, fit, first))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
-        near = [(t.effect, start) for t in promising for start in _near(problem, t, factors)]
+        near = [(t.effect, start, t.along) for t in promising for start in _near(problem, t, factors)]
         best = _best([*best.values(), *_tried(problem, fit, near)])
     return sorted((_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
@@ -119,20 +128,30 @@ def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
     return best
 
 
-def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start]]) -> list[Trial]:
-    """The starts simulated at the fit's values, side by side."""
+def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]) -> list[Trial]:
+    """The starts simulated at the fit's values, or with what goes with them, side by side."""
     if not starts:
         return []
-    names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start in starts for n in start]))
-    usual = [fit.values.get(n, problem.model.values[n]) for n in names]
-    rows = np.array([[start.get(n, v) for n, v in zip(names, usual, strict=True)] for _, start in starts])
+    names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
+    begun = [_moved(fit, effect, start) if along else fit.x for effect, start, along in starts]
+    at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
+          for x, (_, start, _) in zip(begun, starts, strict=True)]
+    rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
     trials, steep = [], slope(fit)
     for part in np.array_split(np.arange(len(rows)), -(-len(rows) // TOGETHER)):
         white = problem.whitened(problem.left(problem.predict(names, rows[part])))
         for i, r in zip(part, white, strict=True):
-            effect, start = starts[i]
-            trials.append(Trial(effect, start, *absorbed(fit, steep, r, set(start))))
+            effect, start, along = starts[i]
+            trials.append(Trial(effect, start, *absorbed(fit, steep, r, set(start), begun[i]), along))
     return trials
+
+
+def _moved(fit: Fit, effect: str, start: Start) -> Floats:
+    """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
+    left = 1.0 - next(iter(start.values()))
+    powers = GOES_WITH[effect]
+    return np.array([(min(max(f.value(float(v)) * left ** powers.get(f.name, 0.0), f.low), f.high) - f.centre) / f.scale
+                     for f, v in zip(fit.free, fit.x, strict=True)])
 
 
 class Slope(NamedTuple):
@@ -152,20 +171,22 @@ def slope(fit: Fit) -> Slope:
                  np.array([f.prior**-2 for f in fit.free]), low, high)
 
 
-def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str]) -> tuple[float, Floats]:
+def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Floats) -> tuple[float, Floats]:
     """Cost of a whitened residual (s, n) after the fit's unknowns, but for those `held`, have shifted linearly.
+
+    `begun`: the unknowns, (p,), at which the residual was simulated.
 
     Twice, as what can be fitted is known only after the first time; not at all where that is worse than to stay.
     """
     move = np.array([f.name not in held for f in fit.free])
     prior = np.where(move, s.prior, 1e30)  # what is held does not move
-    flat, left, x = s.thin.reshape(len(fit.x), -1), white, fit.x
+    flat, left, x = s.thin.reshape(len(begun), -1), white, begun
     few = white[:, ::THINNED].reshape(-1)
     for _ in range(2):
         heavy = (THINNED * s.thin * weights(left)[:, ::THINNED]).reshape(flat.shape)
         hessian = heavy @ flat.T + np.diag(prior + 1e-9)
-        gradient = heavy @ few + s.prior * fit.x * move
-        x = np.where(move, np.clip(fit.x - cho_solve(cho_factor(hessian), gradient), s.low, s.high), fit.x)
-        left = white + ((x - fit.x) @ s.whole).reshape(white.shape)
-    costs = misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, fit.x)]
-    return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), fit.x)
+        gradient = heavy @ few + s.prior * begun * move
+        x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), s.low, s.high), begun)
+        left = white + ((x - begun) @ s.whole).reshape(white.shape)
+    costs = misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, begun)]
+    return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), begun)

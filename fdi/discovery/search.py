@@ -128,6 +128,19 @@ class Search:
             ranked[0] = self.retried(ranked[0], [np.where(settled & (np.abs(x) > 1.0), 0.0, x)])
         return ranked
 
+    def lighter(self, h: Hypothesis) -> list[Hypothesis]:
+        """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
+        usual, found = {f.name: f for f in free_of(self.model)}, []
+        for gone in h.effects:
+            own = set(CATALOGUE[gone].fitted)
+            free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
+            kept = [f for f in free if f is not None]
+            x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
+            inside = np.array([v if f.name not in own or f.low < h.fit.values[f.name] < f.high else 0.0
+                               for f, v in zip(kept, x, strict=True)])
+            found.append(self.judged(tuple(e for e in h.effects if e != gone), fit(self.problem, kept, inside)))
+        return sorted(found, key=lambda each: each.cost)
+
     def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else improved(self.problem, each[1], rounds)
 
