@@ -7,6 +7,7 @@ is the tolerances that decide how wide the intervals are.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -32,6 +33,7 @@ FINE = 20  # steps a cycle of the last fit
 EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
 SETTLING = 4  # rounds of the last fit
+LONG = 8  # further ones, where these were not enough
 REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
 COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
 CLOSER = ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03))  # steps of Kintas and factors of FSS around the best start
@@ -104,7 +106,10 @@ def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] =
         first = _further(problem, first, factor, rounds)
     problem = _with_noise(problem, first)
     fine = replace(problem, steps=FINE, _lanes={})
-    return _refined(descended(fine, first, SETTLING, flats(problem, free, first.x)), problem)
+    last = descended(fine, first, SETTLING, flats(problem, free, first.x))
+    if not _reached(problem, last):
+        last = descended(fine, last, LONG, flats(problem, free, last.x))
+    return _refined(last, problem)
 
 
 def _eased(problem: Counted, free: Sequence[Free], x: Floats) -> Fit:
@@ -144,16 +149,22 @@ def begun(free: Sequence[Free], x: Floats) -> Fit:
 def _best_start(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
     """The start, (p,) scaled, that leaves least, looked at ever closer."""
     loud, offsets = _louder(problem, EASED[0][0]), offsets_of(problem)
+    usual = problem.model["spool.dynamic_friction"]
 
-    def least(tried: Sequence[tuple[float, float]]) -> tuple[float, float]:
-        x = np.array([start_of(free, *s, offsets) for s in tried])
-        return tried[int(np.argmin(misfit(loud.whitened(loud.residuals(free, x)))))]
+    def least(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
+        x = np.array([start_of(free, *s, offsets, sliding) for s in tried])
+        costs = misfit(loud.whitened(loud.residuals(free, x)))
+        k = int(np.argmin(costs))
+        return float(costs[k]), tried[k], x[k]
 
-    best = least(starts)
-    for k, f in CLOSER:
-        best = least([(min(max(best[0] + i * k, 0.0), MOST), best[1] * f**j)
-                      for i, j in product(range(-2, 3), repeat=2)])
-    return start_of(free, *best, offsets)
+    found = []
+    for sliding in (math.inf, usual):  # dynamic friction goes with the static one, or has stayed what it was
+        best = least(starts, sliding)
+        for k, f in CLOSER:
+            best = least([(min(max(best[1][0] + i * k, 0.0), MOST), best[1][1] * f**j)
+                          for i, j in product(range(-2, 3), repeat=2)], sliding)
+        found.append(best)
+    return min(found, key=lambda each: each[0])[2]
 
 
 def offsets_of(problem: Problem) -> dict[str, float]:

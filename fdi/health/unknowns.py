@@ -109,9 +109,13 @@ def _ratio(f: Free) -> Free:
     return Ratio(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
 
 
-def start_of(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None) -> Floats:
-    """Scaled unknowns, (p,), of a plant that has the two faults and `offsets`, and is nominal otherwise."""
+def start_of(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None,
+             sliding: float = math.inf) -> Floats:
+    """Scaled unknowns, (p,), of a plant that has the two faults and `offsets`, and is nominal otherwise.
+
+    FDS goes with FSS, but not beyond `sliding` N.
+    """
     logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), MOST)),
             FRICTION.parameter: math.log(max(fss, LEAST)),
-            "spool.dynamic_friction": math.log(max(fss, LEAST) / SLIDING), **(offsets or {})}
+            "spool.dynamic_friction": math.log(min(max(fss, LEAST) / SLIDING, sliding)), **(offsets or {})}
     return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
