@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.fit import DAMPINGS, ENOUGH, Fit, _stepped, misfit, weights
+from fdi.discovery.level import relaxed, tangents, without_slope
 from fdi.discovery.problem import Free, Problem
 
 Floats = NDArray[np.float64]
@@ -33,30 +34,36 @@ def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | 
 
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.
     """
-    now, idle = fit, 0
+    now, idle = relaxed(problem, fit), 0
+    _, flat = tangents(slopes or problem, now.free, now.x)
     for _ in range(rounds):
-        here = along(problem, now.free, now.x, now.covariance, slopes or problem)
+        here = along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
         there = _better(problem, here)
         idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
         now = there
         if idle >= PATIENCE:
             break
-    return replace(now, converged=True)
+    return replace(relaxed(problem, now), converged=True)
 
 
-def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem) -> Fit:
-    """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p)."""
+def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem, flat: Floats) -> Fit:
+    """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p).
+
+    Along `flat` (p, k) there is no slope.
+    """
     directions = _principal(covariance)
     moves = np.array([_inside(free, x, d) for d in directions.T])
     near = slopes.whitened(slopes.residuals(free, np.vstack([x, x + moves])))
     residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
-    flat = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
+    steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
+    jacobian = without_slope(steep.reshape(len(x), *white[0].shape), flat)
     prior = np.diag([f.prior**-2 for f in free])
-    heavy = (flat.reshape(len(x), *white[0].shape) * weights(white[0])).reshape(len(x), -1)
+    heavy = (jacobian * weights(white[0])).reshape(len(x), -1)
     held = float(misfit(white)[0])
-    return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ flat.T + prior), residuals[0],
-               white[0], flat.reshape(len(x), *white[0].shape))
+    hessian = heavy @ jacobian.reshape(len(x), -1).T + prior
+    known = np.asarray(np.linalg.pinv(hessian), np.float64)
+    return Fit(tuple(free), x, held + float(x @ prior @ x), held, known, residuals[0], white[0], jacobian)
 
 
 def _principal(covariance: Floats) -> Floats:

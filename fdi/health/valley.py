@@ -8,32 +8,24 @@ are taken across the valley only, and along it they are nought by construction, 
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.discovery import level
 from fdi.discovery.fit import ENOUGH, Fit, misfit, weights
+from fdi.discovery.level import LEVEL, LOAD, TRIED
 from fdi.discovery.problem import Free, Problem
 from fdi.discovery.settle import PATIENCE, WIDTH, _better, _inside
 
 Floats = NDArray[np.float64]
 
-TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
-LEVEL = 500.0  # sum of squares in whitened units, that this way may change; what shows makes more
 ACROSS = 1e-3  # of the logarithms: the first differences across
 NARROWEST, WIDEST = 1e-12, 9.0  # variances of scaled unknowns, within which a direction across is taken
-LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
-# Logarithms that move together, by their parameters; the first of each is the one that is left out across.
-FLAT: tuple[Mapping[str, float], ...] = (
-    {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
-    {"spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.pressure_gain": 1.0, "supply.pressure": 1.0},
-    {"torque_motor.gain": 1.0, "feedback_spring.stiffness": 1.0, "flapper.stiffness": 1.0, "flapper.damping": 1.0,
-     "flapper.inertia": 1.0},
-    {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.mass": 1.0, "jack.damping": 1.0, "jack.dynamic_friction": 1.0,
-     "jack.leakage": 1.0},
-)
+# static friction of the jack is known here by its ratio to the dynamic one, which stays
+FLAT = tuple({name: power for name, power in flat.items() if name != "jack.static_friction"} for flat in level.FLAT)
 
 
 def flats(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
