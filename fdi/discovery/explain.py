@@ -85,7 +85,7 @@ def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: 
     levels, beam = [[base]], [base]
     for count in range(1, MOST + 1):
         progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
-        tried = []
+        tried: list[Hypothesis] = []
         for parent in beam:
             tried = _distinct([*tried, *search.add_one(parent, 8 if count == 1 else 4)])
             if tried and tried[0].reached:
