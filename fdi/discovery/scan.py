@@ -148,7 +148,7 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
 
 def _moved(fit: Fit, effect: str, start: Start) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
-    left = 1.0 - next(iter(start.values()))
+    left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
     powers = GOES_WITH[effect]
     return np.array([(min(max(f.value(float(v)) * left ** powers.get(f.name, 0.0), f.low), f.high) - f.centre) / f.scale
                      for f, v in zip(fit.free, fit.x, strict=True)])
