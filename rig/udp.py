@@ -46,12 +46,12 @@ class LoopbackBus(can.BusABC):
             self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
             self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             self._tx.bind(("127.0.0.1", 0))
+            self._turn = _lock(f"eha-rig-{group}-{port}.lock")
         except OSError as error:
             self._rx.close()
             self._tx.close()
             raise can.CanInitializationError(f"{group}: {error.strerror}") from error
         self._own = self._tx.getsockname()
-        self._turn = _lock(f"eha-rig-{group}-{port}.lock")
         super().__init__(channel=group)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -90,7 +90,8 @@ def _lock(name: str) -> IO[bytes]:
     """A file of this name that processes of all users may lock."""
     path = Path(tempfile.gettempdir()) / name
     if not path.exists():
-        path.touch(0o444)
+        path.touch()
+        path.chmod(0o444)  # whatever the umask
     return path.open("rb")
 
 

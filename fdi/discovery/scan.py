@@ -27,7 +27,7 @@ THINNED = 5  # every so many samples, for the linear shift alone
 # filter weakens what pushes the spool, so a fit without it has found too much friction and too little flow; friction
 # cannot give way linearly, a hundred stops of the spool would move
 GOES_WITH: Mapping[str, Mapping[str, float]] = {"filter_clogging": {
-    "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.flow_gain": -0.5}}
+    "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.flow_gain": -0.5}}  # that of the filter's law
 
 
 class Trial(NamedTuple):
@@ -133,7 +133,8 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     if not starts:
         return []
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
-    begun = [_moved(fit, effect, start) if along else fit.x for effect, start, along in starts]
+    law = problem.model.values.get("filter.law", 0.5)
+    begun = [_moved(fit, effect, start, law) if along else fit.x for effect, start, along in starts]
     at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
           for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
@@ -146,10 +147,10 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     return trials
 
 
-def _moved(fit: Fit, effect: str, start: Start) -> Floats:
+def _moved(fit: Fit, effect: str, start: Start, law: float) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
+    powers = {**GOES_WITH[effect], "pilot.flow_gain": -law}
     left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
-    powers = GOES_WITH[effect]
     return np.array([(min(max(f.value(float(v)) * left ** powers.get(f.name, 0.0), f.low), f.high) - f.centre) / f.scale
                      for f, v in zip(fit.free, fit.x, strict=True)])
 

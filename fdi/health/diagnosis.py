@@ -13,12 +13,13 @@ from fdi.discovery.record import Record
 from fdi.discovery.runs import usable
 from fdi.health import grid as grids
 from fdi.health import levels as rules
-from fdi.health.bands import Judged, judge
+from fdi.health.bands import Judged, judge, same_plant
 from fdi.health.envelope import Bands, loaded, matches
 from fdi.health.precursors import Precursor, measure
 from fdi.health.refine import COARSE, Refined, refine
 from fdi.health.store import default
 from fdi.health.types import CLOGGING, FAULTS, FRICTION, Estimate, Event, Level
+from fdi.health.unknowns import LARGEST, MOST, positive
 from fdi.sections import sections
 from fdi.trace import Trace
 from plant.errors import InputError
@@ -108,7 +109,7 @@ def _banded(c: Cycles, model: Model, bands: Bands | None, notes: list[str]
             ) -> tuple[Bands | None, Judged | None, dict[str, Precursor]]:
     """Bands, what they say, and the precursors."""
     if bands is None:
-        bands = _own_bands(c, notes)
+        bands = _own_bands(c, model, notes)
     judged = None
     if bands is not None:
         judged = judge(c, bands, model)
@@ -116,9 +117,12 @@ def _banded(c: Cycles, model: Model, bands: Bands | None, notes: list[str]
     return bands, judged, measure(c, bands)
 
 
-def _own_bands(c: Cycles, notes: list[str]) -> Bands | None:
+def _own_bands(c: Cycles, model: Model, notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
     own = default()
+    if not same_plant(model):
+        notes.append("no bands: the software's own are of the nominal unit; rig fdi --learn-bands makes others")
+        return None
     if loaded(c.load):
         notes.append("no bands: the ram is loaded, and the software's own are of a free one")
         return None
@@ -163,10 +167,11 @@ def _sizes(found: Refined) -> dict[str, Estimate]:
     """The sizes of both faults; where more than noise is left, their intervals are wider by as much."""
     wider = 1.0 if found.reached else max(found.ratio.values())
 
-    def widened(e: Estimate, lowest: float) -> Estimate:
-        return Estimate(e.value, max(lowest, e.value - wider * (e.value - e.low)), e.value + wider * (e.high - e.value))
+    def widened(e: Estimate, most: float) -> Estimate:
+        low, high = e.value - wider * (e.value - e.low), e.value + wider * (e.high - e.value)
+        return Estimate(e.value, max(low, 0.0), min(high, most))
 
-    return {CLOGGING.name: widened(found.kintas, 0.0), FRICTION.name: widened(found.fss, 0.0)}
+    return {CLOGGING.name: widened(found.kintas, MOST), FRICTION.name: widened(found.fss, LARGEST)}
 
 
 def _verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
@@ -184,5 +189,5 @@ def _unhealthy(name: str, e: Estimate, model: Model) -> bool:
     e = Estimate(e.value, e.value - SURE * (e.value - e.low), e.value + SURE * (e.high - e.value))
     if name in SMALL:
         return (e.low > 0.0 or e.high < 0.0) and abs(e.value) > SMALL[name]
-    usual, way = model[name], math.exp(HEALTHY * TOLERANCE)
+    usual, way = positive(model, name), math.exp(HEALTHY * TOLERANCE)
     return e.low > usual * way or e.high < usual / way

@@ -1,8 +1,8 @@
 """From the size of a fault, with its interval, to one of the paper's three levels; and which of two faults rules.
 
 A limit of Table 2 counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the
-healthy size, for MidBand) is excluded. So a fault exactly at a limit is found in 97.5 % of all tests, however wide
-the interval; and an interval that holds the healthy size and MidBand both cannot be judged.
+healthy size, for MidBand) is excluded. So a fault exactly at a limit is found in 97.5 % of all tests, as long as the
+interval excludes the limit before it; and an interval that holds the healthy size and MidBand both cannot be judged.
 """
 from __future__ import annotations
 

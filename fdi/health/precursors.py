@@ -39,17 +39,17 @@ class Precursor(NamedTuple):
     @property
     def departure(self) -> float:
         """From the healthy mean, in healthy standard deviations."""
-        return (self.value - self.healthy) / self.noise
+        return (self.value - self.healthy) / self.noise if self.noise > 0.0 else math.nan
 
     @property
     def clogging_ratio(self) -> float:
         """Signal to noise: what Kintas 0.25 does, in healthy standard deviations."""
-        return self.clogging / self.noise
+        return self.clogging / self.noise if self.noise > 0.0 else math.nan
 
     @property
     def friction_ratio(self) -> float:
         """Signal to noise: what FSS 35 N does, in healthy standard deviations."""
-        return self.friction / self.noise
+        return self.friction / self.noise if self.noise > 0.0 else math.nan
 
 
 def measure(source: Trace | Cycles, bands: Bands | None = None) -> dict[str, Precursor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -102,7 +102,7 @@ def parse(content: str, where: object) -> Bands:
         return _bands(table)
     except KeyError as error:
         raise InputError(where, str(error.args[0]), "a file of bands, which has this key") from error
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         raise InputError(where, "", f"a file of bands as rig fdi --learn-bands writes it ({error})") from error
 
 
@@ -113,20 +113,23 @@ def _bands(table: Mapping[str, Any]) -> Bands:
     parts = tuple(Section(kind, int(a), int(b), first / UM, last / UM, rate / UM)
                   for kind, a, b, first, last, rate in provenance.pop("sections"))
     friction = np.array(head["friction_N"], float)
-    steps = tuple(_step(step, period, len(friction), len(parts)) for step in table.get("step", ()))
-    ramps = tuple(_ramp(ramp, len(friction), len(parts)) for ramp in table.get("ramp", ()))
+    if not (np.diff(friction) > 0.0).all():
+        raise ValueError("friction_N: rising values")
+    kinds = {kind: [i for i, part in enumerate(parts) if part.kind == kind] for kind in ("step", "ramp")}
+    steps = tuple(_step(step, period, len(friction), kinds["step"]) for step in table.get("step", ()))
+    ramps = tuple(_ramp(ramp, len(friction), kinds["ramp"]) for ramp in table.get("ramp", ()))
     return Bands(parts, period, friction, steps, ramps, float(head["middle_share"]), float(head["most_share"]),
                  {key: str(value) for key, value in provenance.items()},
                  {name: {key: float(value) for key, value in numbers.items()}
                   for name, numbers in table.get("precursors", {}).items()})
 
 
-def _step(step: Mapping[str, Any], period: float, amounts: int, parts: int) -> StepBand:
+def _step(step: Mapping[str, Any], period: float, amounts: int, parts: Container[int]) -> StepBand:
     healthy, spread, shift, middle, most = (np.array(step[key], float) / UM for key in LISTS)
     rows = np.arange(len(healthy))
     coarse = rows[::COARSE]
-    if spread.shape != (amounts, len(coarse)) or shift.shape != spread.shape or not 0 <= step["section"] < parts:
-        raise ValueError(f"step of section {step['section']}: lists of other lengths")
+    if spread.shape != (amounts, len(coarse)) or shift.shape != spread.shape or step["section"] not in parts:
+        raise ValueError(f"step of section {step['section']}: no step of the command, or lists of other lengths")
 
     def fine(values: Floats) -> Floats:
         return np.interp(rows, coarse, values)
@@ -137,10 +140,10 @@ def _step(step: Mapping[str, Any], period: float, amounts: int, parts: int) -> S
                     fine(most))
 
 
-def _ramp(ramp: Mapping[str, Any], amounts: int, parts: int) -> RampBand:
+def _ramp(ramp: Mapping[str, Any], amounts: int, parts: Container[int]) -> RampBand:
     waver = np.array(ramp["waver_um"], float) / UM
-    if waver.shape != (amounts,) or not 0 <= ramp["section"] < parts:
-        raise ValueError(f"ramp of section {ramp['section']}: lists of other lengths")
+    if waver.shape != (amounts,) or ramp["section"] not in parts:
+        raise ValueError(f"ramp of section {ramp['section']}: no ramp of the command, or lists of other lengths")
     position, speed = (Width(*(float(ramp[key][word]) / scale for word in Width._fields))
                        for key, scale in (("position_um", UM), ("speed_mm_s", 1e3)))
     return RampBand(int(ramp["section"]), position, speed, waver, float(ramp["slip"]), float(ramp["ease"]))

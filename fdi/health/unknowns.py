@@ -82,13 +82,18 @@ def values(free: Sequence[Free], x: Floats) -> Floats:
     return found
 
 
+def positive(model: Model, name: str) -> float:
+    """A parameter of the model as a logarithm can take it: nought is a thousandth of the nominal value."""
+    return max(model[name], 1e-3 * model.kind.nominal[name])
+
+
 def free_parameters(model: Model) -> tuple[Free, ...]:
     """What a fit may change: the faults first, then the suspects, then the tolerances."""
     clogging = Open(CLOGGING.parameter, 0.0, 0.015, UNKNOWN, math.log(1.0 - MOST), 0.0, 1.0)
-    friction = [Ratio(f"spool.{kind}_friction", math.log(model[f"spool.{kind}_friction"]), 0.015, UNKNOWN,
+    friction = [Ratio(f"spool.{kind}_friction", math.log(positive(model, f"spool.{kind}_friction")), 0.015, UNKNOWN,
                       math.log(LEAST), math.log(LARGEST), 1.0) for kind in ("static", "dynamic")]
     suspects = [_suspected(s, model) for s in SUSPECTS]
-    usual = math.log(model["jack.static_friction"] / model["jack.dynamic_friction"])
+    usual = math.log(positive(model, "jack.static_friction") / positive(model, "jack.dynamic_friction"))
     over = Over("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
     taken = {f.name for f in (clogging, *friction, *suspects, over)}
     return (clogging, *friction, *suspects, over, *(_ratio(f) for f in free_of(model) if f.name not in taken))
@@ -96,7 +101,7 @@ def free_parameters(model: Model) -> tuple[Free, ...]:
 
 def _suspected(s: Suspect, model: Model) -> Free:
     own = next(u for u in unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
-    usual = model.values.get(s.parameter, own.centre)
+    usual = positive(model, s.parameter) if s.ratio else model.values.get(s.parameter, own.centre)
     if s.ratio:
         return Ratio(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual), 0.02)
     return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)

@@ -94,6 +94,8 @@ def read(path: Path) -> Gathered:
             f.name: Estimate(*(float(p[f.symbol][name]) for name in Estimate._fields)) for f in FAULTS},
             str(p.get("note", ""))) for p in told["points"])
         axis = str(told["axis"])
+        if not all(math.isfinite(p.t) and all(e.low <= e.value <= e.high for e in p.sizes.values()) for p in points):
+            raise ValueError("times and sizes that are numbers, each within its interval")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(path, "", f"an answer of rig trend ({type(error).__name__}: {error})") from error
     if axis not in AXES or not points:

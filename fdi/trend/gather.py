@@ -13,6 +13,7 @@ from fdi.health.types import FAULTS, Estimate
 from fdi.trace import Trace
 from fdi.trend.dates import AXES, TABLE, Row, days, in_name, read_table, row_of
 from plant.compile import cache_folder
+from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model
 
@@ -160,7 +161,9 @@ def _kept(file: Path, model: Model) -> Path:
         content = file.read_bytes()
     except OSError as error:
         raise InputError(file, "", f"a readable file ({error.strerror})") from error
-    text = json.dumps([sorted(model.values.items()), model.effects, model.plant, _code()])
+    theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
+    own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
+    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, _code()])
     return cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
 
 
@@ -168,8 +171,8 @@ def _kept(file: Path, model: Model) -> Path:
 def _code() -> str:
     """A hash of the physics and of what judges a trace."""
     digest = hashlib.sha256()
-    for folder in ("plant", "fdi", "fdi/discovery", "fdi/health"):
-        for path in sorted((ROOT / folder).glob("*.*")):
+    for folder in ("plant", "fdi"):
+        for path in sorted((ROOT / folder).rglob("*")):
             if path.suffix in (".py", ".toml", ".npz", ".json"):
                 digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.health import levels
 from fdi.health.types import Estimate, Fault, Level
 from fdi.trend import life
 from fdi.trend.bayes import Posterior, Scaled, regress
@@ -66,7 +67,10 @@ class Trend:
 
     @property
     def level(self) -> Level:
-        """Of the size now."""
+        """Of the size now, by the rule of `rig fdi`; where the interval cannot tell, by the value."""
+        found = levels.level(self.fault, self.now)
+        if found is not None:
+            return found
         return Level((self.now.value >= self.fault.middle) + (self.now.value >= self.fault.most))
 
 

@@ -85,8 +85,10 @@ def find_work(name: str) -> Work:
     module, _, function = name.partition(":")
     try:
         found: Work = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise InputError("--work", name, f"module:function of a judgement ({error})") from None
+    if not callable(found):
+        raise InputError("--work", name, "module:function of a judgement")
     return found
 
 

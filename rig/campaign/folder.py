@@ -141,11 +141,14 @@ def arrow() -> tuple[Any, Any]:
 def replaced(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
     part = path.with_name(path.name + PART)
-    with part.open("wb") as out:
-        out.write(data)
-        out.flush()
-        os.fsync(out.fileno())
-    part.replace(path)
+    try:
+        with part.open("wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        part.replace(path)
+    except PermissionError as error:
+        raise InputError(path, "", f"a place that can be written ({error.strerror})") from None
 
 
 def _known(folder: Path) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fdi.trend.gather import traces
 from plant.effects import Effect
 from plant.errors import InputError
 from plant.model import Model, entry
@@ -38,7 +39,6 @@ DEFAULTS: dict[str, Any] = {
     "hum": 0.7e-6,  # m, of the mains on it
     "signals": "xj,p12,xs",  # measured
 }
-TRACES = (".mcap", ".csv", ".csv.gz")
 
 
 class Case(NamedTuple):
@@ -179,9 +179,7 @@ def of_traces(folder: str | Path, model: Model, work: str) -> Matrix:
         InputError: no such folder, or no trace in it.
     """
     root = Path(folder).absolute()
-    found = sorted(path for path in root.rglob("*") if path.is_file() and path.name.endswith(TRACES))
-    if not found:
-        raise InputError(folder, "", f"a folder with traces ({', '.join(TRACES)})")
+    found = traces(root)
     names = {path.relative_to(root).as_posix(): path for path in found}
     digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
     spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work}

@@ -34,6 +34,8 @@ def run(args: argparse.Namespace) -> int:
     from plant import InputError
 
     if args.score:
+        if not args.units:
+            raise InputError("--units", "0", "1 or more")
         return _score(args)
     if args.folder is None:
         raise InputError("FOLDER", "", "a folder of dated traces, or --score")
