@@ -214,6 +214,17 @@ def test_the_file(tmp_path: Path) -> None:
     assert text(parse(text(some), "")) == text(some)
 
 
+@pytest.mark.parametrize(("old", "new", "word"), [
+    ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
+    ("friction_N = [5.0, ", "friction_N = [500.0, ", "rising"),
+    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "no ramp of the command")])
+def test_a_file_edited_wrongly_is_refused(old: str, new: str, word: str) -> None:
+    content = text(default())
+    assert old in content
+    with pytest.raises(InputError, match=word):
+        parse(content.replace(old, new), "b.toml")
+
+
 @pytest.mark.parametrize(("wrong", "word"), [("[bands", "TOML"), ("x = 1\n", "bands"), (None, "of other lengths"),
                                              ("[bands]\nperiod_ms = 1\n", "key")])
 def test_a_wrong_file_is_refused(wrong: str | None, word: str, tmp_path: Path) -> None:

@@ -196,6 +196,8 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "healthy", "--set", "controller.period=2e-3"), "--set: controller.period: expected 0.001 s"),
     (("--fault", "healthy", "--jobs", "0"), "--jobs: 0: expected 1 or more"),
     (("--fault", "healthy", "--work", "nothing:here"), "--work: nothing:here: expected module:function"),
+    (("--fault", "healthy", "--work", ".:x"), "--work: .:x: expected module:function"),
+    (("--fault", "healthy", "--work", "math:pi"), "--work: math:pi: expected module:function"),
     (("--fault", "healthy", "--scheduler", "tcp://127.0.0.1:1"), "--scheduler: tcp://127.0.0.1:1: expected the addr"),
     (("--fault", "healthy", "--scheduler", "nowhere"), "--scheduler: nowhere: expected the address"),
     ((), "expected a matrix file, statistics, --fault or a folder"),

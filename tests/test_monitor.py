@@ -179,7 +179,7 @@ def test_replay_follows_the_measured_ram() -> None:
 
 
 def test_several_times_cheaper_than_the_reference() -> None:
-    """Against the fewest steps at which the reference may be used for fits; it is some 13 times."""
+    """Against the fewest steps at which the reference may be used for fits; docs/worked_cases.md has the figure."""
     values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (64, 2))
     monitor, reference = Monitor(QUIET, workers=1), Lanes(QUIET, FAULTS, 10, 1)
     none = np.zeros_like(PREFLIGHT)

@@ -235,7 +235,11 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
 def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("{}")
     (tmp_path / "empty").mkdir()
-    for words in ([], [tmp_path / "bad.json"], [tmp_path / "none"], [tmp_path / "empty"],
+    told = json.loads(points(tmp_path / "nan.json", LINE).read_text())
+    told["points"][0]["t"] = float("nan")
+    (tmp_path / "nan.json").write_text(json.dumps(told))
+    for words in ([], [tmp_path / "bad.json"], [tmp_path / "nan.json"], ["--score", "--units", "0"],
+                  [tmp_path / "none"], [tmp_path / "empty"],
                   [tmp_path / "bad.json", "--out", "x.txt"]):
         said = rig("trend", *words)
         assert said.status == 2 and said.err.count("\n") == 1, words
