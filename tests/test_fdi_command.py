@@ -127,10 +127,10 @@ def test_what_it_cannot_use_is_said_in_a_line(folder: Path, words: tuple[str, ..
 
 
 def test_a_unit_without_leakage_is_judged_and_not_by_the_bands_of_another(folder: Path) -> None:
-    """What the model says is nought has no logarithm; and shipped own are of the nominal unit."""
+    """What the model says is nought has no logarithm; and shipped bands are of the nominal unit."""
     said = rig("fdi", folder / "healthy.csv", "--set", "jack.leakage=0", "--json")
     assert said.status in (0, 1) and said.json["events"] == [], said.err
-    assert any("bands are of the nominal unit" in note for note in said.json["notes"])
+    assert any("own are of the nominal unit" in note for note in said.json["notes"])
 
 
 def test_a_gap_is_told(folder: Path, tmp_path: Path) -> None:
