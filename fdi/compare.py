@@ -90,7 +90,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
         InputError: a trace, a repeat or a signal that cannot be used, in one line.
     """
     progress("reading", 0, STAGES)
-    c, model = _best_reading(trace, model, signals, source)
+    c, model = best_reading(trace, model, signals, source)
     c, found = _in_step(c, model, answer.controller(c, model))
     others = [matching(c, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1, STAGES)
@@ -153,7 +153,7 @@ def _spread(floor: Floor, samples: int) -> float:
     return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
 
 
-def _best_reading(trace: Trace, model: Model, signals: Sequence[str] | None, source: str) -> tuple[Cycles, Model]:
+def best_reading(trace: Trace, model: Model, signals: Sequence[str] | None, source: str) -> tuple[Cycles, Model]:
     """Of several ways to read the rows, the one that the model's replay fits best, and the model at its cycle."""
     best: tuple[float, Cycles, Model] | None = None
     ways = readings(trace, model, signals, source)

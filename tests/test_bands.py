@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -212,6 +213,14 @@ def test_the_file(tmp_path: Path) -> None:
     assert (tmp_path / "b.toml").stat().st_size < 40_000
     some = short_bands()
     assert text(parse(text(some), "")) == text(some)
+
+
+def test_a_file_of_any_command_is_read_again(tmp_path: Path) -> None:
+    """A step of no whole number of mm, too."""
+    some = short_bands()
+    odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
+    save(odd, tmp_path / "b.toml")
+    assert load(tmp_path / "b.toml").precursors.keys() == odd.precursors.keys()
 
 
 @pytest.mark.parametrize(("old", "new", "word"), [

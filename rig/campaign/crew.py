@@ -146,6 +146,6 @@ def _distributed() -> Any:
     try:
         import distributed
     except ImportError:
-        raise InputError("rig campaign", "distributed", "the extra: pip install 'eha-rig[fleet]'") from None
+        raise InputError("distributed", "", "the extra: pip install 'eha-rig[fleet]'") from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told once, in one line
     return distributed

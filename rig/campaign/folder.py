@@ -134,7 +134,7 @@ def arrow() -> tuple[Any, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError("rig campaign", "pyarrow", "the extra: pip install 'eha-rig[fleet]'") from None
+        raise InputError("pyarrow", "", "the extra: pip install 'eha-rig[fleet]'") from None
     return pyarrow, pyarrow.parquet
 
 

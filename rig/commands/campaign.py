@@ -118,8 +118,8 @@ def _matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     listed, more = tables.get("case", []), matrix.parsed(args.fault)
     tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
     if not tables["case"]:
-        raise InputError("rig campaign", "", f"a matrix file, {', '.join(matrix.shipped())}, --fault or a folder")
-    return (matrix.matrix(tables, model, work, args.what or "rig campaign"),
+        raise InputError("CAMPAIGN", "", f"a matrix file, {', '.join(matrix.shipped())}, --fault or a folder")
+    return (matrix.matrix(tables, model, work, args.what or "--fault"),
             _folder(args.out, Path(args.what).stem if args.what else "options"))
 
 

@@ -38,15 +38,18 @@ def run(args: argparse.Namespace) -> int:
     """Diagnose a trace; exit status 0 if both faults are acceptable, 1 otherwise. Or learn bands."""
     if args.learn_bands is not None:
         return learned(args)
+    from plant import InputError
+
+    if args.command_file is not None:
+        raise InputError("--command", str(args.command_file), "--learn-bands beside it; a trace has its own command")
     from fdi.health.diagnosis import diagnose
     from fdi.output import write_text
     from fdi.trace import Trace
-    from plant import InputError
     from rig import show_fdi
     from rig.waiting import waiting
 
     if args.trace is None:
-        raise InputError("rig fdi", "TRACE", "a trace to judge, or --learn-bands")
+        raise InputError("TRACE", "", "a trace to judge, or --learn-bands")
     answer = places(args)
     model = options.model_of(args)
     with waiting(args.json or args.quiet) as progress:
@@ -91,8 +94,10 @@ def learned(args: argparse.Namespace) -> int:
     from rig.commands.simulate import command_of
     from rig.waiting import waiting
 
-    if args.trace is not None or not args.out or Path(args.out).suffix != ".toml":
-        raise InputError("--learn-bands", str(args.trace or args.out), "traces behind it, and --out FILE.toml")
+    if args.trace is not None:
+        raise InputError("--learn-bands", str(args.trace), "traces behind it, not before it")
+    if not args.out or Path(args.out).suffix != ".toml":
+        raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
     model = options.model_of(args)
     com, _, name = command_of(args.command_file, model["controller.period"])
     with waiting(args.json or args.quiet) as progress:
