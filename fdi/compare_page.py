@@ -6,6 +6,7 @@ from typing import Any
 from fdi import compare_figures as figures
 from fdi.compare import Comparison
 from fdi.compare_text import SHOWN, amount, block_word, digits, lines, sentence
+from fdi.output import rendered
 
 MOODS = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 ELSEWHERE = ("where", "note")  # labels of lines that have a place of their own on the page
@@ -13,10 +14,8 @@ ELSEWHERE = ("where", "note")  # labels of lines that have a place of their own 
 
 def render(found: Comparison) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader
-
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return pages.get_template("compare.html").render(
+    return rendered(
+        "compare.html",
         title=found.source, verdict=found.verdict, mood=MOODS[found.verdict], why=sentence(found),
         facts=_facts(found), signals=[_signal(found, name) for name in found.signals],
         blocks=[_block(found, name) for name in found.blocks],

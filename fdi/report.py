@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fdi import figures
-from fdi.output import writable
+from fdi.output import rendered, writable
 from fdi.trace import Check, Trace
 from fdi.verdict import verdict
 from plant.errors import InputError
@@ -33,11 +33,9 @@ def write_report(source: str | Path, out: str | Path) -> None:
 
 def render(trace: Trace) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader
-
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     word, why = verdict(trace)
-    return pages.get_template("report.html").render(
+    return rendered(
+        "report.html",
         title=trace.provenance.get("sequence", trace.provenance.get("source", "trace")),
         verdict=word, mood=WORDS.get(word, "neutral"), why=why,
         facts=_facts(trace), checks=[_row(check) for check in trace.checks], notes=_notes(trace),

@@ -11,6 +11,7 @@ from fdi.discovery.pattern import Pattern
 from fdi.discovery.refit import Refit
 from fdi.discovery.runs import Source
 from fdi.discovery.words import SHOWN, UNITS, amount, chance, interval, ratio, spoken
+from fdi.output import rendered
 
 MOODS = {"NOTHING_MISSING": "good", "EXPLAINED": "good", "PARTLY": "doubtful", "AMBIGUOUS": "doubtful",
          "NOT_RESOLVABLE": "doubtful", "UNEXPLAINED": "bad"}
@@ -64,10 +65,7 @@ def ledger(r: Refit, p: Provenance, intervals: Mapping[str, Value], title: str, 
 
 
 def _page(**content: Any) -> str:
-    from jinja2 import Environment, PackageLoader
-
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return pages.get_template("story.html").render(**{"rows": [], **content})
+    return rendered("story.html", **{"rows": [], **content})
 
 
 def _runs(sources: Sequence[Source], held: bool) -> list[tuple[str, str]]:

@@ -12,6 +12,7 @@ from fdi.health.paper_figures import maps
 from fdi.health.precursors import shown
 from fdi.health.types import FAULTS, Event, Fault, Level
 from fdi.health.words import LEVELS, NAMES, besides, sentence, size
+from fdi.output import rendered
 
 MOODS = {"ACCEPTABLE": "good", "MAINTENANCE": "doubtful", "NON_NOMINAL": "bad"}
 OF_LEVEL = {Level.ACCEPTABLE: "within", Level.MAINTENANCE: "near", Level.NON_NOMINAL: "over", None: "muted"}
@@ -20,11 +21,9 @@ FAR = 4.0  # healthy standard deviations
 
 def render(d: Diagnosis) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader
-
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     drawn = d.judged is not None and d.bands is not None
-    return pages.get_template("fdi.html").render(
+    return rendered(
+        "fdi.html",
         title=d.source, verdict=d.verdict, mood=MOODS.get(d.verdict, "doubtful"), why=sentence(d), facts=_facts(d),
         notes=d.notes, faults=[_fault(d, f) for f in FAULTS], correlation=f"{d.refined.correlation:+.2f}",
         others=[besides(name, e) for name, e in d.others.items()],

@@ -4,6 +4,7 @@ from __future__ import annotations
 from typing import Any
 
 from fdi.health.types import FAULTS
+from fdi.output import rendered
 from fdi.trend.answer import NAMES, Answer, date, interval, left, sentences
 from fdi.trend.dates import iso
 from fdi.trend.figure import drawing
@@ -14,13 +15,12 @@ MOODS = ("good", "doubtful", "bad")
 
 def render(found: Answer) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader
-
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     g = found.gathered
-    return pages.get_template("trend.html").render(
-        title=g.source, verdict=found.level.name.replace("_", " "), mood=MOODS[found.level], traces=len(g.points),
-        first=_place(found, g.points[0].t), last=_place(found, g.points[-1].t), notes=g.notes, picture=drawing(found),
+    return rendered(
+        "trend.html",
+        heading="Trend", title=g.source, verdict=found.level.name.replace("_", " "), mood=MOODS[found.level],
+        why=f"{len(g.points)} traces, {_place(found, g.points[0].t)} to {_place(found, g.points[-1].t)}",
+        notes=g.notes, picture=drawing(found),
         faults=[{"name": t.fault.name.replace("_", " "), "verdict": t.verdict.replace("_", " "),
                  "lines": sentences(t, found), "rows": _rows(t, found)} for t in found.trends],
         symbols=[f.symbol for f in FAULTS],
