@@ -1,6 +1,7 @@
 """What came of a run: verdict, checks, timing. For the table, for verdict.json and for the exit status."""
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi.output import write_text
 from plant.segments import Array
 from rig.history import History
 from rig.job import Job
@@ -72,6 +74,10 @@ class Outcome:
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 "events": [_plain(event._asdict()) for event in self.events],
                 "run": self.job.settings(), "fdi": self.fdi}
+
+    def save(self) -> None:
+        """Write verdict.json."""
+        write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
 
 
 def timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:

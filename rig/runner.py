@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -56,7 +55,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
             counters=_counters(history), speed=len(history) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
                                       "overruns": str(loop.overruns)})
-    (folder / "verdict.json").write_text(json.dumps(outcome.to_json(), indent=1) + "\n", encoding="utf-8")
+    outcome.save()
     return outcome
 
 

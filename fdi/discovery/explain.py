@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.fingerprints import Fingerprint, comb, firmware
-from fdi.discovery.fit import BLOCK, blocks
+from fdi.discovery.fit import typical
 from fdi.discovery.nulls import SEEN, Sensitivity, sensitivity
 from fdi.discovery.problem import Problem
 from fdi.discovery.record import Record
@@ -31,7 +31,6 @@ BETTER = 0.8  # times the error before: what counts as a part of the explanation
 FAIR = 0.1  # of the excess cost that an effect has to take away if another one is to be looked for on top of it
 DOUBTFUL = 500.0  # gain up to which it may be what the base's own fit has left lying about
 HELD_OUT = 1.2  # times the floor, in the typical block of a run with another command
-TYPICAL = 0.85  # of the blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,11 +239,3 @@ def _unseen(search: Search, h: Hypothesis, record: Record) -> Floats:
     problem: Problem = replace(search.problem, record=record, steps=TRUEST, also=(), _lanes={})
     left: Floats = problem.residuals(h.fit.free, h.fit.x[None])[0]
     return left
-
-
-def typical(residuals: Floats) -> Floats:
-    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
-    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
-    kept = squares[:, :max(1, round(TYPICAL * squares.shape[1]))]
-    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
-    return rms

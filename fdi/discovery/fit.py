@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.discovery.problem import Free, Problem
+from fdi.discovery.problem import Free, Problem, ends
 
 Floats = NDArray[np.float64]
 
 BLOCK = 100  # cycles
 FITTED = 2.0  # mean square of a block up to which it counts as fitted: noise alone gives 1 +- 0.14
+TYPICAL = 0.85  # of the blocks
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 WIDTH = 3.0  # of a difference, in standard deviations of a parameter: wide enough for stick-slip, narrow at the end
 NARROWEST = 0.01  # times the first width
@@ -75,6 +76,14 @@ def weights(white: Floats) -> Floats:
     sums = blocks(white)
     each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
     return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
+
+
+def typical(residuals: Floats) -> Floats:
+    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
+    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
+    kept = squares[:, :max(1, round(TYPICAL * squares.shape[1]))]
+    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
+    return rms
 
 
 def fit(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
@@ -150,8 +159,7 @@ def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
 
 def _stepped(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
     """A damped Gauss-Newton step within the bounds: what runs into one stays there, and the rest is solved again."""
-    low = np.array([(f.low - f.centre) / f.scale for f in fit.free])
-    high = np.array([(f.high - f.centre) / f.scale for f in fit.free])
+    low, high = ends(fit.free)
     damped = hessian + np.diag(damping * np.diag(hessian) + 1e-12 * np.trace(hessian) + 1e-12)
     x, open_ = fit.x.copy(), np.ones(len(fit.x), bool)
     for _ in range(len(x)):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.fit import Fit, misfit
-from fdi.discovery.problem import Free, Problem
+from fdi.discovery.problem import Free, Problem, ends
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Ma
     """
     if problem.model.plant != "eha":
         return [], np.empty((len(x), 0))
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    low, high = ends(free)
     names, found, trials = {f.name for f in free}, [], []
     for said in powers(problem):
         if next(iter(said)) not in names:
@@ -94,7 +94,7 @@ def relaxed(problem: Problem, found: Fit) -> Fit:
     if not said:
         return found
     prior = np.array([f.prior**-2 for f in free])
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    low, high = ends(free)
     for _ in range(ROUNDS):  # Gauss-Newton on the priors alone, along the curved directions
         ways = np.array([(scaled(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
         step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]

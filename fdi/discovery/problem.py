@@ -40,6 +40,12 @@ class Free(NamedTuple):
         return min(max(self.centre + self.scale * x, self.low), self.high)
 
 
+def ends(free: Sequence[Free]) -> tuple[Floats, Floats]:
+    """The least and the most that scaled unknowns, (p,), can be."""
+    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    return low, high
+
+
 def tolerances(model: Model) -> tuple[Free, ...]:
     """The parameters in which one healthy unit differs from another, each with its tolerance as prior."""
     usual = model.kind.nominal

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.discovery.fit import Fit, misfit, weights
-from fdi.discovery.problem import Free, Problem, unknowns
+from fdi.discovery.level import powers, scaled
+from fdi.discovery.problem import Free, Problem, ends, unknowns
 from plant.effects import CATALOGUE
 
 Floats = NDArray[np.float64]
@@ -23,11 +24,10 @@ TOGETHER = 64  # runs at a time
 THINNED = 5  # every so many samples, for the linear shift alone
 
 
-# effects that other unknowns can make up for, all but a little: powers of 1 - value that these then go with. A clogged
-# filter weakens what pushes the spool, so a fit without it has found too much friction and too little flow; friction
-# cannot give way linearly, a hundred stops of the spool would move
-GOES_WITH: Mapping[str, Mapping[str, float]] = {"filter_clogging": {
-    "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.flow_gain": -0.5}}  # that of the filter's law
+# effects that other unknowns can make up for, all but a little: directions of level.FLAT by which these then go with
+# 1 - value. A clogged filter weakens what pushes the spool, so a fit without it has found too much friction and too
+# little flow; friction cannot give way linearly, a hundred stops of the spool would move
+GOES_WITH: Mapping[str, tuple[int, ...]] = {"filter_clogging": (0, 1)}
 
 
 class Trial(NamedTuple):
@@ -133,8 +133,8 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     if not starts:
         return []
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
-    law = problem.model.values.get("filter.law", 0.5)
-    begun = [_moved(fit, effect, start, law) if along else fit.x for effect, start, along in starts]
+    ways = powers(problem)
+    begun = [_moved(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
     at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
           for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
@@ -147,12 +147,14 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     return trials
 
 
-def _moved(fit: Fit, effect: str, start: Start, law: float) -> Floats:
+def _moved(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
-    powers = {**GOES_WITH[effect], "pilot.flow_gain": -law}
     left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
-    return np.array([(min(max(f.value(float(v)) * left ** powers.get(f.name, 0.0), f.low), f.high) - f.centre) / f.scale
-                     for f, v in zip(fit.free, fit.x, strict=True)])
+    low, high = ends(fit.free)
+    x = fit.x
+    for way in GOES_WITH[effect]:
+        x = scaled(fit.free, x, ways[way], float(np.log(left)))
+    return np.clip(x, low, high)
 
 
 class Slope(NamedTuple):
@@ -167,7 +169,7 @@ class Slope(NamedTuple):
 
 def slope(fit: Fit) -> Slope:
     """Prepared once for many residuals."""
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in fit.free]) for end in ("low", "high"))
+    low, high = ends(fit.free)
     return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::THINNED]),
                  np.array([f.prior**-2 for f in fit.free]), low, high)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fdi.discovery.fit import DAMPINGS, ENOUGH, Fit, _stepped, misfit, weights
 from fdi.discovery.level import relaxed, tangents, without_slope
-from fdi.discovery.problem import Free, Problem
+from fdi.discovery.problem import Free, Problem, ends
 
 Floats = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def _principal(covariance: Floats) -> Floats:
 
 def _inside(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
     """The move, or its opposite, cut off at the bounds: whichever is longer then."""
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    low, high = ends(free)
     ways = [np.clip(x + way, low, high) - x for way in (move, -move)]
     return max(ways, key=lambda way: float(way @ way))
 

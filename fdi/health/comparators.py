@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fdi.cycles import Cycles, held
 from fdi.health.features import features
+from fdi.health.levels import of_value
 from fdi.health.montecarlo import Kind, Tell, runs, silent
 from fdi.health.types import CLOGGING, FAULTS, FRICTION, Fault, Level
 from fdi.sections import sections
@@ -101,8 +102,8 @@ def neural_network(data: Lesson, seed: int = 0) -> Learnt:
     own_k, own_f = (float(v[0]) for v in told(data.own))
     right = {CLOGGING.name: _share(CLOGGING, k, data.kintas[data.unseen]),
              FRICTION.name: _share(FRICTION, f, data.fss[data.unseen])}
-    return Learnt("neural network", own_k, own_f, {CLOGGING.name: _level(CLOGGING, own_k),
-                                                   FRICTION.name: _level(FRICTION, own_f)},
+    return Learnt("neural network", own_k, own_f, {CLOGGING.name: of_value(CLOGGING, own_k),
+                                                   FRICTION.name: of_value(FRICTION, own_f)},
                   _rms(k - data.kintas[data.unseen]), _rms(f - data.fss[data.unseen]), right, len(data.x))
 
 
@@ -113,7 +114,7 @@ def logistic_regression(data: Lesson, seed: int = 0) -> Learnt:
 
     levels, right = {}, {}
     for fault, sizes in zip(FAULTS, (data.kintas, data.fss), strict=True):
-        true = np.array([int(_level(fault, s)) for s in sizes])
+        true = np.array([int(of_value(fault, s)) for s in sizes])
         told = _scaled(PolynomialFeatures(2, include_bias=False), StandardScaler(),
                        LogisticRegression(C=1.0, max_iter=300, random_state=seed))
         told.fit(data.x[~data.unseen], true[~data.unseen])
@@ -133,12 +134,8 @@ def _scaled(*steps: Any) -> Any:
     return make_pipeline(StandardScaler(), *steps)
 
 
-def _level(fault: Fault, value: float) -> Level:
-    return Level(int(value >= fault.middle) + int(value >= fault.most))
-
-
 def _share(fault: Fault, told: Floats, true: Floats) -> float:
-    return float(np.mean([_level(fault, a) == _level(fault, b) for a, b in zip(told, true, strict=True)]))
+    return float(np.mean([of_value(fault, a) == of_value(fault, b) for a, b in zip(told, true, strict=True)]))
 
 
 def _rms(x: Floats) -> float:

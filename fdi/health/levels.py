@@ -27,6 +27,11 @@ def level(fault: Fault, size: Estimate) -> Level | None:
     return Level.MAINTENANCE
 
 
+def of_value(fault: Fault, value: float) -> Level:
+    """The class of a size by Table 2 of the paper alone; a size at a limit is beyond it."""
+    return Level(int(value >= fault.middle) + int(value >= fault.most))
+
+
 def severity(fault: Fault, value: float) -> float:
     """How far a fault has gone: 0 healthy, 1 at MidBand, 2 at MaxBand, straight lines between and beyond."""
     if value <= fault.middle:

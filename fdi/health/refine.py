@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery import noise as noises
-from fdi.discovery.explain import typical
-from fdi.discovery.fit import Fit, misfit
+from fdi.discovery.fit import Fit, misfit, typical
 from fdi.discovery.problem import Free, Problem, quiet
 from fdi.discovery.record import NOISE, Record
 from fdi.health.types import CLOGGING, FRICTION, Estimate
@@ -53,7 +52,6 @@ class Refined:
     errors: Mapping[str, float]  # RMS residual by signal, SI
     floor: Mapping[str, float]  # what the sensors' noise leaves of it
     simulations: int
-    typical: Mapping[str, float]  # error over floor without the worst blocks, by signal
     method: str = "least squares"
 
     @property
@@ -64,7 +62,9 @@ class Refined:
     @property
     def reached(self) -> bool:
         """True when nothing but noise is left, but for a few stops of the ram that were made or missed by a hair."""
-        return max(self.typical.values()) <= REACHED and max(self.ratio.values()) <= FURTHEST
+        usual = typical(self.fit.residuals)
+        near = all(float(t) <= REACHED * floor for t, floor in zip(usual, self.floor.values(), strict=True))
+        return near and max(self.ratio.values()) <= FURTHEST
 
 
 @dataclass
@@ -200,14 +200,13 @@ def _refined(last: Fit, problem: Counted) -> Refined:
     record = problem.record
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(record.signals, problem.noise, strict=True)}
-    usual = typical(last.residuals)
     names = [f.name for f in last.free]
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
     return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter, ROUGH), correlation,
                    {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
-                   problem.count[0], {s: float(t) / floor[s] for s, t in zip(record.signals, usual, strict=True)})
+                   problem.count[0])
 
 
 def estimate(found: Fit, name: str, wider: float = 1.0) -> Estimate:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi.discovery import level
 from fdi.discovery.fit import ENOUGH, Fit, misfit, weights
 from fdi.discovery.level import LEVEL, LOAD, TRIED
-from fdi.discovery.problem import Free, Problem
+from fdi.discovery.problem import Free, Problem, ends
 from fdi.discovery.settle import PATIENCE, WIDTH, _better, _inside
 
 Floats = NDArray[np.float64]
@@ -95,7 +95,7 @@ def first_widths(free: Sequence[Free]) -> Floats:
 def relaxed(found: Fit, flat: Floats) -> Fit:
     """The fit moved along the flat directions to where the priors want it, within the bounds: no residual changes."""
     prior = np.array([f.prior**-2 for f in found.free])
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in found.free]) for end in ("low", "high"))
+    low, high = ends(found.free)
     x = found.x
     for _ in range(len(flat.T) + 1):
         pull = flat.T @ (prior * x)

@@ -97,7 +97,7 @@ def covariance(data: Scaled, noise: int, wander: int) -> Floats:
     jumps = _jumps(data)
     own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
     out: Floats = (np.diag(own * sigma ** 2) + OFFSET ** 2
-                   + STEP ** 2 * jumps.T @ jumps + _wander(wander, data.u))
+                   + STEP ** 2 * jumps.T @ jumps + wandering(wander, data.u, data.u))
     out[data.loose, data.loose] += LOOSE ** 2
     return out
 
@@ -118,13 +118,14 @@ def _jumps(data: Scaled) -> Floats:
     return np.array([np.arange(len(data.u)) >= row for row in data.steps], dtype=float).reshape(-1, len(data.u))
 
 
-def _wander(wander: int, u: Floats) -> Floats:
+def wandering(wander: int, a: Floats, b: Floats) -> Floats:
+    """Covariance of the wander at times a with that at times b, (len(a), len(b))."""
     kind, strength = WANDERS[wander]
-    first = np.minimum(u[:, None], u)
+    first = np.minimum(a[:, None], b)
     if kind == "integrated":
-        grown: Floats = 3.0 * (first ** 3 / 3 + np.abs(u[:, None] - u) * first ** 2 / 2)
-        return strength ** 2 * grown
-    return strength ** 2 * first
+        first = 3.0 * (first ** 3 / 3 + np.abs(a[:, None] - b) * first ** 2 / 2)
+    out: Floats = strength ** 2 * first
+    return out
 
 
 def _part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:

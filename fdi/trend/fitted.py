@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.trend.bayes import OFFSET, STEP, WANDERS, Posterior, Scaled, covariance
+from fdi.trend.bayes import OFFSET, STEP, Posterior, Scaled, covariance, wandering
 from fdi.trend.laws import basis
 
 Floats = NDArray[np.float64]
@@ -29,10 +29,7 @@ def fitted(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
 
 def _between(data: Scaled, wander: int, a: Floats, b: Floats) -> Floats:
     """Covariance of the level without the rise at times a with that at times b, (len(a), len(b))."""
-    kind, strength = WANDERS[wander]
-    first = np.minimum(a[:, None], b)
-    grown = first ** 3 + 1.5 * np.abs(a[:, None] - b) * first ** 2 if kind == "integrated" else first
-    out = OFFSET ** 2 + strength ** 2 * grown
+    out = OFFSET ** 2 + wandering(wander, a, b)
     for row in data.steps:
         out = out + STEP ** 2 * np.outer(a >= data.u[row], b >= data.u[row])
     return out

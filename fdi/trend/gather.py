@@ -5,11 +5,11 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.health.types import FAULTS, Estimate
+from fdi.sources import digest
 from fdi.trace import Trace
 from fdi.trend.dates import AXES, TABLE, Row, days, in_name, read_table, row_of
 from plant.compile import cache_folder
@@ -21,7 +21,6 @@ Progress = Callable[[str, int, int], None]
 Keep = Path | None
 
 ENDINGS = (".mcap", ".csv", ".csv.gz")
-ROOT = Path(__file__).parents[2]
 
 
 class Point(NamedTuple):
@@ -163,16 +162,5 @@ def _kept(file: Path, model: Model) -> Path:
         raise InputError(file, "", f"a readable file ({error.strerror})") from error
     theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
-    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, _code()])
+    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, digest("plant", "fdi")])
     return cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
-
-
-@cache
-def _code() -> str:
-    """A hash of the physics and of what judges a trace."""
-    digest = hashlib.sha256()
-    for folder in ("plant", "fdi"):
-        for path in sorted((ROOT / folder).rglob("*")):
-            if path.suffix in (".py", ".toml", ".npz", ".json"):
-                digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()

@@ -69,9 +69,7 @@ class Trend:
     def level(self) -> Level:
         """Of the size now, by the rule of `rig fdi`; where the interval cannot tell, by the value."""
         found = levels.level(self.fault, self.now)
-        if found is not None:
-            return found
-        return Level((self.now.value >= self.fault.middle) + (self.now.value >= self.fault.most))
+        return levels.of_value(self.fault, self.now.value) if found is None else found
 
 
 def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:

@@ -1,20 +1,16 @@
 """One case of a campaign: the run, simulated or read, and what the judgement makes of it, as one flat row."""
 from __future__ import annotations
 
-import hashlib
-import importlib
 import platform
 import tomllib
 import zlib
 from collections.abc import Callable, Mapping
-from functools import cache
-from importlib.resources import files
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.sources import digest, named
 from fdi.trace import Trace
 from plant import Model, simulate
 from plant.errors import InputError, RigError
@@ -31,7 +27,7 @@ Work = Callable[[Trace, Model], Row]
 """What judges a run: trace and healthy model to a flat row of JSON values."""
 
 OK, REFUSED, FAILED = "ok", "refused", "failed"
-MAKERS = ("campaign/case.py", "campaign/judge.py", "campaign/matrix.py", "trial/")  # of rig, what a row depends on
+MAKERS = ("rig/campaign/case.py", "rig/campaign/judge.py", "rig/campaign/matrix.py", "rig/trial")
 
 
 class Drawn(NamedTuple):
@@ -74,22 +70,6 @@ def told(case: Case, spec: Mapping[str, Any]) -> Row:
 
 def _model(spec: Mapping[str, Any]) -> Model:
     return parse_model(tomllib.loads(spec["model"]), "campaign")
-
-
-def find_work(name: str) -> Work:
-    """The judgement "module:function".
-
-    Raises:
-        InputError: there is no such thing.
-    """
-    module, _, function = name.partition(":")
-    try:
-        found: Work = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise InputError("--work", name, f"module:function of a judgement ({error})") from None
-    if not callable(found):
-        raise InputError("--work", name, "module:function of a judgement")
-    return found
 
 
 def run(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
@@ -156,15 +136,15 @@ def _independent(case: Case, model: Model, com: Array, chance: Drawn) -> dict[st
                              "xs": made.xs + cases.FLOORS["xs"] * chance.noise[:, 2]}
 
 
-@cache
+def find_work(name: str) -> Work:
+    """The judgement "module:function".
+
+    Raises:
+        InputError: there is no such thing.
+    """
+    return named(name, "--work", "a judgement")
+
+
 def sources() -> str:
     """A hash of all code and data that a row depends on."""
-    digest = hashlib.sha256()
-    for package in ("plant", "fdi", "rig"):
-        root = Path(str(files(package)))
-        for path in sorted(root.rglob("*")):
-            name = path.relative_to(root).as_posix()
-            counts = path.suffix not in (".pyc", ".html", "") and (package != "rig" or name.startswith(MAKERS))
-            if counts and path.is_file():
-                digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+    return digest("plant", "fdi", *MAKERS)

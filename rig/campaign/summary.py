@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.binomial import Share, share
+from fdi.health.levels import of_value
 from fdi.health.types import CLOGGING, FAULTS, FRICTION, Fault, Level
 from rig.campaign.case import FAILED, OK, REFUSED, Row
 from rig.campaign.judge import CANNOT_TELL
@@ -170,11 +171,6 @@ def truth(row: Row, fault: Fault) -> float:
     return float(row[f"true_{fault.symbol}"])
 
 
-def true_level(size: float, fault: Fault) -> Level:
-    """The class of a size by Table 2 of the paper; a size at a limit is beyond it."""
-    return Level(int(size >= fault.middle) + int(size >= fault.most))
-
-
 def curve(rows: Sequence[Row], fault: Fault) -> list[Point]:
     """Detection by size, small to large; the first point is the healthy plant."""
     of = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK] + single(rows, fault)
@@ -191,7 +187,7 @@ def levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]:
     for row in rows:
         if not others(row):
             said = row[f"level_{fault.name}"] if row["status"] == OK else row["status"]
-            table[true_level(truth(row, fault), fault).word][said] += 1
+            table[of_value(fault, truth(row, fault)).word][said] += 1
     return table
 
 
@@ -216,7 +212,7 @@ def _having(row: Row) -> str:
     names = [part.partition("=")[0] for part in row["label"].split()]
     if len(names) == 1 and not others(row):
         fault = next(fault for fault in FAULTS if fault.name == names[0])
-        return f"{names[0]}, {true_level(truth(row, fault), fault).word}"
+        return f"{names[0]}, {of_value(fault, truth(row, fault)).word}"
     return " and ".join(names)
 
 

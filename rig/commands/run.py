@@ -65,11 +65,8 @@ def run(args: argparse.Namespace) -> int:
 
 def diagnosed(outcome: Outcome, progress: Callable[[str, int, int], None]) -> Outcome:
     """The outcome with what `rig fdi` says of its trace, in verdict.json as well; the run's own verdict stays."""
-    import json
-
     from fdi.health.diagnosis import diagnose
     from fdi.health.words import to_json
-    from fdi.output import write_text
     from fdi.trace import Trace
     from plant import InputError
 
@@ -78,7 +75,7 @@ def diagnosed(outcome: Outcome, progress: Callable[[str, int, int], None]) -> Ou
     except InputError as error:  # a sequence too short to tell, say
         found = {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
     told = replace(outcome, fdi=found)
-    write_text(outcome.folder / "verdict.json", json.dumps(told.to_json(), indent=1) + "\n")
+    told.save()
     return told
 
 

@@ -5,19 +5,16 @@ Each finished case is one line of results.jsonl. A line counts only for the sour
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import importlib
 import json
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from functools import cache
-from importlib.resources import files
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fdi.sources import digest, named
 from plant.errors import InputError
 from rig.clock import WallClock
 from rig.trial import cases, truth
@@ -26,7 +23,8 @@ Explain = Callable[[Path, Path, Sequence[Path], Sequence[str]], dict[str, Any]]
 """est, holdout, repeats, signals -> the JSON of `rig explain`."""
 
 RESULTS = "results.jsonl"
-TRIAL = ("truth.c", "truth.py", "command.py", "hidden.py", "cases.py")  # what makes a case
+# what makes a case
+TRIAL = tuple(f"rig/trial/{name}" for name in ("truth.c", "truth.py", "command.py", "hidden.py", "cases.py"))
 KEPT = 5  # candidates kept of an answer
 
 
@@ -45,12 +43,7 @@ def load_explain(name: str) -> Explain:
     Raises:
         InputError: there is no such thing.
     """
-    module, _, function = name.partition(":")
-    try:
-        found: Explain = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError):
-        raise InputError("the blind trial", name, "module:function of an explanation") from None
-    return found
+    return named(name, "the blind trial", "an explanation")
 
 
 def run(explain: str, seeds: Sequence[int], folder: Path, jobs: int = 2,
@@ -116,7 +109,7 @@ def one(explain: str, seed: int, folder: Path) -> dict[str, Any]:
 
 def prepared(seed: int, folder: Path) -> Path:
     """The folder with the case of a seed, made if it is not there."""
-    target = folder / f"cases-{_digest(('rig', 'trial'), TRIAL)[:8]}" / f"{seed:05d}"
+    target = folder / f"cases-{digest(*TRIAL)[:8]}" / f"{seed:05d}"
     if not target.exists():
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
@@ -148,16 +141,6 @@ def _lines(path: Path) -> list[dict[str, Any]]:
     return found
 
 
-@cache
 def sources() -> str:
     """A hash of all that an answer depends on."""
-    parts = [_digest((package,), None) for package in ("plant", "fdi")]
-    return hashlib.sha256(" ".join([*parts, _digest(("rig", "trial"), TRIAL)]).encode()).hexdigest()[:16]
-
-
-def _digest(place: tuple[str, ...], names: Sequence[str] | None) -> str:
-    """A hash of the files of a package: those named, or all of its sources."""
-    root = Path(str(files(place[0]).joinpath(*place[1:])))
-    paths = [root / name for name in names] if names else sorted(
-        path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".c"))
-    return hashlib.sha256(b"\0".join(path.read_bytes() for path in paths)).hexdigest()
+    return digest("plant", "fdi", *TRIAL)

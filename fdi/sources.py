@@ -1,0 +1,43 @@
+"""Code by name and by content: what judges a run, and whether it is still the code that judged another one."""
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from plant.errors import InputError
+
+COUNTS = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; not pages and caches
+
+
+def named(name: str, field: str, expected: str) -> Callable[..., Any]:
+    """The callable "module:function".
+
+    Raises:
+        InputError: there is no such thing; it names `field` and says what was `expected`.
+    """
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise InputError(field, name, f"module:function of {expected} ({error})") from None
+    if not callable(found):
+        raise InputError(field, name, f"module:function of {expected}")
+    return found  # type: ignore[no-any-return]
+
+
+@cache
+def digest(*places: str) -> str:
+    """A hash of all code and data in packages and files, "plant", "rig/trial", "rig/trial/truth.c": 16 digits."""
+    known = hashlib.sha256()
+    for place in places:
+        package, *rest = place.split("/")
+        path = Path(str(files(package).joinpath(*rest)))
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.suffix in COUNTS:
+                known.update(f"{place}/{file.relative_to(path).as_posix()}\0".encode() + file.read_bytes() + b"\0")
+    return known.hexdigest()[:16]
