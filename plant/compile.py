@@ -13,6 +13,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
@@ -133,6 +134,7 @@ def called(function: Function) -> set[str]:
     return set(below).union(*(called(g) for g in below.values()))
 
 
+@cache
 def costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
     plain: Any = getattr(function, "py_func", function)

@@ -1,9 +1,7 @@
 """Many runs of one model that differ in a few parameters: fits, Jacobians, null simulations, grids."""
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -16,16 +14,11 @@ from plant.compile import Function, costly
 from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
 from plant.model import Model, bare
+from plant.threads import mapped, threads
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
 FEW = 6  # effects that a model may have and still get one kernel for all its runs
-
-
-def threads() -> int:
-    """One a core, or as many as OMP_NUM_THREADS says: how a cluster tells its workers to share a machine."""
-    said = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
 
 
 class Lanes:
@@ -92,12 +85,7 @@ class Lanes:
             run, buffer, rows = task
             run(buffer, *inputs, rows, out)
 
-        if min(self.workers, len(work)) < 2:
-            for task in work:
-                do(task)
-        else:
-            with ThreadPoolExecutor(self.workers) as pool:
-                list(pool.map(do, work))
+        mapped(do, work, self.workers)
         return out[:-1].transpose(0, 2, 1)
 
     def _shared_out(self, values: Array) -> list[tuple[Rung, NDArray[np.int64]]]:

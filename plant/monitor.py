@@ -11,7 +11,6 @@ reference model takes 20 to 100. Many runs stand side by side, as in `plant.bloc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from math import ceil
 from typing import Any, NamedTuple
@@ -24,9 +23,9 @@ from plant.controller import Loop, answer
 from plant.errors import InputError
 from plant.flat import lane_packers
 from plant.friction import clip, soften
-from plant.lanes import threads
 from plant.model import Model
 from plant.parameters import Controller
+from plant.threads import mapped, threads
 
 Array = NDArray[np.float64]
 Reduction = Callable[[Array], Array]
@@ -274,8 +273,7 @@ class Monitor:
             run(block[1], *inputs, out)
             return reduced(out[:, :, :block[0]].transpose(2, 0, 1))
 
-        with ThreadPoolExecutor(self.workers) as pool:
-            return np.concatenate(list(pool.map(do, self._blocks(values, period / steps))))
+        return np.concatenate(mapped(do, self._blocks(values, period / steps), self.workers))
 
     def _blocks(self, values: Array, h: float) -> Iterator[tuple[int, Array]]:
         """The runs WIDTH at a time: how many they are, and the buffer at the start; idle lanes repeat the last run."""

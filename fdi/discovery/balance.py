@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from fdi.discovery.record import SIGNALS
 from fdi.discovery.search import Hypothesis, Search
@@ -72,7 +71,7 @@ def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
         noise = float(np.sqrt(np.mean([_square(n[place] - own[place]) for n in noisy])))
         rms = float(np.sqrt(_square(missing)))
         found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0))
-    states = States(replay[0] if np.isnan(measured[0]).all() else savgol_filter(measured[0], SPEED_WINDOW, 3),
+    states = States(replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW),
                     _speed(measured[0], problem.model.values["controller.period"]), measured[1], measured[2], before,
                     record.trace.t)
     return sorted(found, key=lambda b: -b.ratio), states
@@ -85,23 +84,30 @@ def _square(x: Floats) -> float:
 
 
 def _speed(x: Floats, period: float) -> Floats:
-    speed: Floats = savgol_filter(x, SPEED_WINDOW, 3, deriv=1, delta=period)
-    return speed
+    return _smooth(x, SPEED_WINDOW, deriv=1, delta=period)
+
+
+def _smooth(x: Floats, window: int, **derivative: float) -> Floats:
+    """Cubics through the samples of a window, or their derivative (Savitzky and Golay)."""
+    from scipy.signal import savgol_filter  # here, as it takes a second to import
+
+    smooth: Floats = savgol_filter(x, window, 3, **derivative)
+    return smooth
 
 
 def _terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float) -> dict[str, Floats]:
     """Left side minus right side of the equations of motion (of the reference model, or of a pump), from (3, n)."""
     x, p12, xs = signals
     v = _speed(x, period)
-    a = savgol_filter(x, ACCELERATION_WINDOW, 3, deriv=2, delta=period)
-    smooth = savgol_filter(p12, ACCELERATION_WINDOW, 3)
+    a = _smooth(x, ACCELERATION_WINDOW, deriv=2, delta=period)
+    smooth = _smooth(p12, ACCELERATION_WINDOW)
     sliding = np.clip(v / 2e-4, -1.0, 1.0) * p["jack.dynamic_friction"]
     force = p["jack.area"] * smooth - p["jack.damping"] * v - load - sliding - p["jack.mass"] * a
     if "pump.displacement" in p:
-        return {"force": force, "flow": _pumped(current, v, savgol_filter(p12, SPEED_WINDOW, 3), p)}
-    spool = savgol_filter(xs, SPEED_WINDOW, 3)
+        return {"force": force, "flow": _pumped(current, v, _smooth(p12, SPEED_WINDOW), p)}
+    spool = _smooth(xs, SPEED_WINDOW)
     conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
-    flow = p["valve.flow_gain"] * spool - conductance * savgol_filter(p12, SPEED_WINDOW, 3) - p["jack.area"] * v
+    flow = p["valve.flow_gain"] * spool - conductance * _smooth(p12, SPEED_WINDOW) - p["jack.area"] * v
     flapper = p["spool.end_area"] * _speed(xs, period) / p["pilot.flow_gain"]
     torque = p["flapper.stiffness"] * flapper + p["feedback_spring.stiffness"] * spool
     return {"force": force, "flow": flow, "current": current - torque / p["torque_motor.gain"]}

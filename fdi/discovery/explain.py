@@ -93,8 +93,9 @@ def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: 
             break
         if count == 1 and not base.reached:
             search.learn_noise(tried[0])
-            tried = sorted((search.again(h) for h in tried[:4]), key=lambda h: h.cost) + tried[4:]
-            levels[0] = [search.without(search.again(base), tried[:1])]
+            base, *best = search.each(search.again, [base, *tried[:4]])
+            tried = sorted(best, key=lambda h: h.cost) + tried[4:]
+            levels[0] = [search.without(base, tried[:1])]
         levels.append(tried)
         if tried[0].reached or not _significant(levels[-2][0], tried[0]):
             break
@@ -155,7 +156,7 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     search.refine(FINE, TRUEST)
     base = search.settle(levels[0][0], 2 if depth or levels[0][0].reached else LONG)  # nothing helps: beyond doubt
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
-    close = sorted((search.settle(h) for h in close), key=lambda h: h.cost + h.repeat_cost)
+    close = sorted(search.each(search.settle, close), key=lambda h: h.cost + h.repeat_cost)
     if close and base.cost - close[0].cost < DOUBTFUL:
         base = search.settle(search.without(base, close[:1]), LONG)
         if depth == 1 and not _significant(base, close[0]):

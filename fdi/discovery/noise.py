@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 Floats = NDArray[np.float64]
 
@@ -32,12 +31,19 @@ class Noise(NamedTuple):
         """Residuals, (.., n), time last, as white noise of variance 1; NaN (nothing measured) gives 0."""
         missing = np.isnan(residual)
         x = np.where(missing, 0.0, residual)
-        white: Floats = x / self.innovation if len(self.filter) == 1 else \
-            lfilter(self.filter, [self.innovation], x)
+        white: Floats = x / self.innovation if len(self.filter) == 1 else _through(self.filter / self.innovation, x)
         if missing.any():
-            missing = lfilter(np.ones(len(self.filter)), [1.0], missing.astype(float)) > 0.5
+            missing = _through(np.ones(len(self.filter)), missing.astype(float)) > 0.5
             white = np.where(missing, 0.0, white)
         return white
+
+
+def _through(weights: Floats, x: Floats) -> Floats:
+    """Weighted sums of each value, (.., n), and those before it, as scipy.signal.lfilter has them.
+
+    Without it, as that takes longer to import than all else here together.
+    """
+    return np.apply_along_axis(lambda row: np.convolve(weights, row)[:len(row)], -1, x)
 
 
 def white(level: float) -> Noise:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from fdi.discovery.fit import Fit
 from fdi.discovery.problem import Problem
@@ -62,7 +62,7 @@ def p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> 
     draws = rng.standard_normal((DRAWS, len(weight))) @ (vectors * np.sqrt(np.maximum(weight, 0.0))).T
     best = (np.maximum(draws, 0.0) ** 2).max(axis=1)
     simulated = float(np.mean(best >= gain))
-    bound = len(set(s.names)) * float(chi2.sf(max(gain, 0.0), parameters))
+    bound = len(set(s.names)) * float(chdtrc(parameters, max(gain, 0.0)))
     return simulated if simulated > 10.0 / DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / DRAWS))
 
 

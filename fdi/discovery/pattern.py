@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lombscargle
 
 from fdi.discovery.balance import EDGE, Balance, States, balances
 from fdi.discovery.search import Hypothesis, Search
@@ -115,6 +114,8 @@ def curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Fl
 
 def wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, float], float]:
     """The best wave over x: (amplitude, length, phase), and the share of y it explains."""
+    from scipy.signal import lombscargle  # here, as it takes a second to import
+
     y = np.clip(y, *np.percentile(y, [0.5, 99.5]))
     span = float(np.ptp(x)) or 1.0
     if (np.diff(x) > 0.0).all():  # time: evenly spaced, and many more periods than a stroke has

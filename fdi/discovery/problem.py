@@ -14,6 +14,7 @@ from fdi.discovery.record import Record
 from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
 from plant.model import Model, meaning, offered
+from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +90,8 @@ class Problem:
 
     def predict(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
-        runs = [self.all_signals(names, values, r)[:, r.columns] for r in (self.record, *self.also)]
+        runs = mapped(lambda r: self.all_signals(names, values, r)[:, r.columns], (self.record, *self.also),
+                      self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
     def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:

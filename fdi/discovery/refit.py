@@ -1,9 +1,7 @@
 """Effects put into a model one after the other: everything fitted anew each time, and the error after each step."""
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,9 +93,10 @@ def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequenc
     marks = _marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
-    search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed)
+    search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
+                    workers)
     model = lean(search.model, replayed)
-    search.problem = replace(search.problem, model=model, workers=workers or os.cpu_count() or 1)
+    search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
     progress("fitting the model as it is", 0.1)
     chain = [search.judged(tuple(first), _started(search, first, begin or {}))]
@@ -198,9 +197,8 @@ def _with(search: Search, before: Hypothesis, name: str) -> Hypothesis:
 def _fitted(search: Search, begun: Sequence[Fit]) -> Fit:
     """The best of some fits, taken on side by side."""
     alone = replace(search.problem, workers=1, _lanes={})
-    with ThreadPoolExecutor(search.problem.workers) as pool:
-        fits = pool.map(lambda fit: settled(alone, improved(alone, fit, FIRST), THEN), begun)
-        return min(fits, key=lambda fit: fit.cost)
+    fits = search.each(lambda fit: settled(alone, improved(alone, fit, FIRST), THEN), begun)
+    return min(fits, key=lambda fit: fit.cost)
 
 
 def _begun(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:

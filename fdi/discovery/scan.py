@@ -12,6 +12,7 @@ from fdi.discovery.fit import Fit, misfit, weights
 from fdi.discovery.level import powers, scaled
 from fdi.discovery.problem import Free, Problem, ends, unknowns
 from plant.effects import CATALOGUE
+from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 Start = Mapping[str, float]
@@ -49,8 +50,8 @@ class Prospect(NamedTuple):
     x: Floats  # (p,), those of the fit scanned from first
 
 
-def scan(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Prospect]:
-    """Expected cost of each effect on top of `fit`, best first.
+def scan(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -> list[Prospect]:
+    """Expected cost of each effect on top of `fit`, best first, by so many threads.
 
     Every start of an effect is simulated; the fit's own unknowns then move linearly, within their bounds and priors, to
     take up what they can. Further passes try sizes around the best start, closer each time.
@@ -58,11 +59,11 @@ def scan(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Prospect]:
     effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
              for start in (*CATALOGUE[name].starts, *tones(problem, fit, name))]
-    best = _best(_tried(problem, fit, first))
+    best = _best(_tried(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
         near = [(t.effect, start, t.along) for t in promising for start in _near(problem, t, factors)]
-        best = _best([*best.values(), *_tried(problem, fit, near)])
+        best = _best([*best.values(), *_tried(problem, fit, near, workers)])
     return sorted((_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
 
@@ -128,7 +129,7 @@ def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
     return best
 
 
-def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]) -> list[Trial]:
+def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int) -> list[Trial]:
     """The starts simulated at the fit's values, or with what goes with them, side by side."""
     if not starts:
         return []
@@ -138,13 +139,15 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
           for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
-    trials, steep = [], slope(fit)
-    for part in np.array_split(np.arange(len(rows)), -(-len(rows) // TOGETHER)):
+    steep = slope(fit)
+
+    def trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whitened(problem.left(problem.predict(names, rows[part])))
-        for i, r in zip(part, white, strict=True):
-            effect, start, along = starts[i]
-            trials.append(Trial(effect, start, *absorbed(fit, steep, r, set(start), begun[i]), along))
-    return trials
+        return [Trial(starts[i][0], starts[i][1], *absorbed(fit, steep, r, set(starts[i][1]), begun[i]), starts[i][2])
+                for i, r in zip(part, white, strict=True)]
+
+    parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
+    return [trial for several in mapped(trials, parts, workers) for trial in several]
 
 
 def _moved(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:

@@ -1,11 +1,10 @@
 """Which effects are missing: scan, fit, look at what is left, and once more for the next effect."""
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,11 @@ from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.settle import settled
 from plant.effects import CATALOGUE
 from plant.model import Model
+from plant.threads import mapped, threads
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
+R = TypeVar("R")
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
@@ -60,7 +62,7 @@ class Search:
 
     def __init__(self, model: Model, record: Record, repeats: Sequence[Record], effects: Iterable[str],
                  workers: int | None = None) -> None:
-        self.workers = workers or os.cpu_count() or 1
+        self.workers = workers or threads()
         self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
@@ -75,7 +77,7 @@ class Search:
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
         free = free_of(self.model)
-        fits = [fit(self.problem, free, x) for x in (None, self.eased(free))]
+        fits = self.each(lambda ease: fit(self.problem, free, self.eased(free) if ease else None), (False, True))
         first = self.judged((), min(fits, key=lambda f: f.cost))
         return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
@@ -89,8 +91,7 @@ class Search:
 
     def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
-        for x in starts:
-            other = fit(self.problem, h.fit.free, x)
+        for other in self.each(partial(fit, self.problem, h.fit.free), starts):
             if other.cost < h.cost - 1.0:
                 h = self.judged(h.effects, other)
         return h
@@ -110,18 +111,17 @@ class Search:
     def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
         effects = [e for e in self.effects if e not in start.effects and not self._excluded(e, start.effects)]
-        prospects = scan(self.problem, start.fit, effects)
+        prospects = scan(self.problem, start.fit, effects, self.workers)
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
             nominal = linearised(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
-            prospects = _merged(prospects, scan(self.problem, nominal, effects))
+            prospects = _merged(prospects, scan(self.problem, nominal, effects, self.workers))
         worth = [p for p in prospects if p.cost < start.cost - WORTH][:fitted]
-        with ThreadPoolExecutor(self.workers) as pool:
-            fits = list(zip([p.effect for p in worth], pool.map(self._begun, worth), strict=True))
-            for rounds, kept in RACE:
-                fits.sort(key=lambda each: each[1].cost)
-                fits[:kept] = pool.map(partial(self._further, rounds), fits[:kept])
-            done = pool.map(lambda each: self.judged((*start.effects, each[0]), each[1]), fits)
-            ranked = sorted(done, key=lambda h: h.cost)
+        fits = list(zip([p.effect for p in worth], self.each(self._begun, worth), strict=True))
+        for rounds, kept in RACE:
+            fits.sort(key=lambda each: each[1].cost)
+            fits[:kept] = self.each(partial(self._further, rounds), fits[:kept])
+        done = self.each(lambda each: self.judged((*start.effects, each[0]), each[1]), fits)
+        ranked = sorted(done, key=lambda h: h.cost)
         if ranked and not ranked[0].reached:
             x = ranked[0].fit.x
             settled = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
@@ -130,16 +130,22 @@ class Search:
 
     def lighter(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
-        usual, found = {f.name: f for f in free_of(self.model)}, []
-        for gone in h.effects:
+        usual = {f.name: f for f in free_of(self.model)}
+
+        def left_out(gone: str) -> Hypothesis:
             own = set(CATALOGUE[gone].fitted)
             free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
             kept = [f for f in free if f is not None]
             x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
             inside = np.array([v if f.name not in own or f.low < h.fit.values[f.name] < f.high else 0.0
                                for f, v in zip(kept, x, strict=True)])
-            found.append(self.judged(tuple(e for e in h.effects if e != gone), fit(self.problem, kept, inside)))
-        return sorted(found, key=lambda each: each.cost)
+            return self.judged(tuple(e for e in h.effects if e != gone), fit(self.problem, kept, inside))
+
+        return sorted(self.each(left_out, h.effects), key=lambda each: each.cost)
+
+    def each(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
+        """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""
+        return mapped(do, items, self.workers)
 
     def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else improved(self.problem, each[1], rounds)
@@ -203,7 +209,8 @@ class Search:
 
     def refine(self, steps: int, finest: int) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
-        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.record for p in self.repeats))
+        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.record for p in self.repeats),
+                               workers=self.workers)
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
 

@@ -137,7 +137,7 @@ def _row(future: Any, case: Case, spec: Mapping[str, Any]) -> Row:
 
 
 def _on_worker(case: Case, spec: Mapping[str, Any], code: str) -> Row:
-    """One of several processes on its machine: no threads beside its own (see `plant.lanes.threads`)."""
+    """One of several processes on its machine: no threads beside its own (see `plant.threads.threads`)."""
     os.environ["OMP_NUM_THREADS"] = "1"
     return one(case, spec, code)
 

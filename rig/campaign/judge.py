@@ -7,7 +7,7 @@ from typing import Any
 from fdi.health.types import FAULTS, Level
 from fdi.trace import Trace
 from plant import Model
-from plant.lanes import threads
+from plant.threads import threads
 
 WORKS: Mapping[str, str] = {"fdi": "rig.campaign.judge:fdi"}
 """Short names of judgements."""

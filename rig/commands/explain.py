@@ -72,15 +72,18 @@ def places(args: argparse.Namespace) -> tuple[Path | None, Path | None]:
 def worked_out(found: Explanation, seed: int, effect_file: str | None) -> tuple[Answer, Pattern | None]:
     """All that is told: the shape of what is left, what would split a set, and the effect file if one is wanted."""
     from fdi.discovery.answer import told
-    from fdi.discovery.pattern import pattern, write_effect
-    from fdi.discovery.separate import separate
 
-    left = found.ledger[-1]
-    shape = pattern(found.search, left) if found.verdict in LEFT_OVER or effect_file else None
-    if effect_file and shape is not None:
-        write_effect(shape, effect_file)
+    shape = None
+    if found.verdict in LEFT_OVER or effect_file:
+        from fdi.discovery.pattern import pattern, write_effect  # takes half a second to import
+
+        shape = pattern(found.search, found.ledger[-1])
+        if effect_file:
+            write_effect(shape, effect_file)
     split: dict[str, Any] = {}
     if found.verdict == "AMBIGUOUS":
+        from fdi.discovery.separate import separate
+
         equal = [h for h in found.ranked if h.reached and set(h.effects) <= set(found.effects)]
         separation = separate(found.search, equal)
         split = separation._asdict() if separation else {}
