@@ -57,7 +57,7 @@ class Objective:
 
     def found(self, method: str, point: Sequence[float]) -> Attempt:
         """The answer at a point; looking at it once more counts no simulation."""
-        spent = self.problem.count[0]
+        spent = sum(self.problem.counts)
         white = self._white(np.asarray(point, float)[None])
         left = float(np.sqrt(np.mean(white**2)))
         return Attempt(method, float(point[0]), math.exp(float(point[1])), left, spent, False)

@@ -24,6 +24,7 @@ from fdi.health.unknowns import MOST, SUSPECTS, free_parameters, start_of, value
 from fdi.health.valley import descended, first_widths, flats
 from plant.effects import CATALOGUE
 from plant.model import Model
+from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +35,11 @@ EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
 SETTLING = 4  # rounds of the last fit
 LONG = 8  # further ones, where these were not enough
+RESTARTS = 3  # at most, where nothing of that has left noise alone
+BACK = (1.0, 0.5)  # where they begin: parts of the way back to a unit without deviations
+HOPELESS = 4.0  # times the noise: something else is wrong, no other start mends it
+WORTHWHILE = 0.9  # times the cost before: what a round of them has to get down to if there is to be another
+FAULTY = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
 FURTHEST = 5.0  # times the floor, that a few missed stops may leave in all
 REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
 COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
@@ -71,13 +77,13 @@ class Refined:
 class Counted(Problem):
     """A problem that counts the runs it makes, and knows static friction by its ratio."""
 
-    count: list[int] = field(default_factory=lambda: [0])  # shared by the problem's copies
+    counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
 
     def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         return self.left(self.predict([f.name for f in free], np.array([values(free, row) for row in x])))
 
     def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:
-        self.count[0] += len(values)
+        self.counts.append(len(values))
         return super().all_signals(names, values, r)
 
 
@@ -101,10 +107,15 @@ def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] =
     """
     problem = problem_of(model, record, floor, workers)
     free = free_parameters(model)
-    first = _eased(problem, free, _best_start(problem, free, starts))
-    if not _reached(problem, first) or _blamed(first):  # before a fault is blamed a healthy unit gets its chance
-        healthy = start_of(free, CLOGGING.healthy, FRICTION.healthy, offsets_of(problem))
-        first = min(first, _eased(problem, free, healthy), key=lambda f: f.cost)
+    alone = replace(problem, workers=1, _lanes={})
+    found = [_best_start(problem, free, starts)]
+    healthy = start_of(free, CLOGGING.healthy, FRICTION.healthy, offsets_of(problem))
+    if _blamed(free, found[0]):  # before a fault is blamed a healthy unit gets its chance
+        found.append(healthy)
+    fits = mapped(lambda x: _eased(alone, free, x), found, workers)
+    if len(fits) == 1 and (not _reached(problem, fits[0]) or _blamed(free, fits[0].x)):
+        fits.append(_eased(problem, free, healthy))
+    first = min(fits, key=lambda f: f.cost)
     for factor, rounds in AGAIN if not _reached(problem, first) else ():
         first = _further(problem, first, factor, rounds)
     problem = _with_noise(problem, first)
@@ -112,7 +123,31 @@ def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] =
     last = descended(fine, first, SETTLING, flats(problem, free, first.x))
     if not _reached(problem, last):
         last = descended(fine, last, LONG, flats(problem, free, last.x))
+    for _ in range(RESTARTS):
+        if _reached(problem, last) or max(_over(problem, last)) > HOPELESS:
+            break
+        before, last = last, _restarted(problem, last, workers)
+        if last.cost > WORTHWHILE * before.cost:
+            break
     return _refined(last, problem)
+
+
+def _restarted(problem: Counted, found: Fit, workers: int) -> Fit:
+    """The best of a fit and some that begin on the way from it to a unit with these faults and no other deviation.
+
+    Stops of the ram make ridges: tolerances that lie behind one of them are found from the other side, or never.
+    """
+    free = found.free
+    home = start_of(free, 0.0, FRICTION.healthy, offsets_of(problem))
+    faults = [f.name in FAULTY for f in free]
+    home[faults] = found.x[faults]
+    alone = replace(problem, workers=1, _lanes={})
+
+    def fitted(part: float) -> Fit:
+        begun = _eased(alone, free, found.x + part * (home - found.x))
+        return descended(replace(alone, steps=FINE, _lanes={}), begun, LONG, flats(alone, free, begun.x))
+
+    return min(found, *mapped(fitted, BACK, workers), key=lambda f: f.cost)
 
 
 def _eased(problem: Counted, free: Sequence[Free], x: Floats) -> Fit:
@@ -128,15 +163,20 @@ def _further(problem: Counted, found: Fit, factor: float, rounds: int) -> Fit:
     return descended(_louder(problem, factor), start, rounds, flats(problem, found.free, found.x))
 
 
-def _blamed(found: Fit) -> bool:
-    """Whether a fit holds one of the faults for far gone."""
-    kintas, fss = found.values[CLOGGING.parameter], found.values[FRICTION.parameter]
+def _blamed(free: Sequence[Free], x: Floats) -> bool:
+    """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
+    known = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
+    kintas, fss = known[CLOGGING.parameter], known[FRICTION.parameter]
     return kintas > 0.5 * CLOGGING.middle or fss > 0.5 * FRICTION.middle
 
 
 def _reached(problem: Problem, found: Fit) -> bool:
-    return all(float(np.sqrt(np.nanmean(r**2))) <= REACHED * n.level
-               for r, n in zip(found.residuals, problem.noise, strict=True))
+    return max(_over(problem, found)) <= REACHED
+
+
+def _over(problem: Problem, found: Fit) -> list[float]:
+    """RMS residual over the noise, signal by signal."""
+    return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
 
 
 def _louder(problem: Counted, factor: float) -> Counted:
@@ -151,7 +191,7 @@ def begun(free: Sequence[Free], x: Floats) -> Fit:
 
 def _best_start(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
     """The start, (p,) scaled, that leaves least, looked at ever closer."""
-    loud, offsets = _louder(problem, EASED[0][0]), offsets_of(problem)
+    loud, offsets = _louder(replace(problem, workers=1, _lanes={}), EASED[0][0]), offsets_of(problem)
     usual = problem.model["spool.dynamic_friction"]
 
     def least(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
@@ -160,14 +200,15 @@ def _best_start(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[f
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
-    found = []
-    for sliding in (math.inf, usual):  # dynamic friction goes with the static one, or has stayed what it was
+    def closest(sliding: float) -> tuple[float, Floats]:
         best = least(starts, sliding)
         for k, f in CLOSER:
             best = least([(min(max(best[1][0] + i * k, 0.0), MOST), best[1][1] * f**j)
                           for i, j in product(range(-2, 3), repeat=2)], sliding)
-        found.append(best)
-    return min(found, key=lambda each: each[0])[2]
+        return best[0], best[2]
+
+    # dynamic friction goes with the static one, or has stayed what it was
+    return min(mapped(closest, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
 
 
 def offsets_of(problem: Problem) -> dict[str, float]:
@@ -206,7 +247,7 @@ def _refined(last: Fit, problem: Counted) -> Refined:
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
     return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter, ROUGH), correlation,
                    {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
-                   problem.count[0])
+                   sum(problem.counts))
 
 
 def estimate(found: Fit, name: str, wider: float = 1.0) -> Estimate:
