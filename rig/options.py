@@ -30,7 +30,16 @@ def whole(text: str) -> int:
     return value
 
 
+def counted(text: str) -> int:
+    """A whole number from 1, for argparse."""
+    value = whole(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
 whole.__name__ = "whole number from 0"
+counted.__name__ = "whole number from 1"
 
 
 def changes(pairs: list[str]) -> dict[str, str]:

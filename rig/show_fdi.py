@@ -11,7 +11,7 @@ from rich.table import Table
 
 from fdi.health.diagnosis import Diagnosis
 from fdi.health.types import FAULTS, Level
-from fdi.health.words import LEVELS, NAMES, SHOWN, besides, left_over, sentence, size
+from fdi.health.words import LEVELS, NAMES, SHOWN, besides, left_over, overruled, sentence, size
 from rig.console import console
 from rig.methods import Row
 
@@ -63,7 +63,8 @@ def faults(d: Diagnosis) -> Table:
         e, level = d.sizes[f.name], d.levels[f.name]
         at = getattr(d.grid.merged, f.symbol) if d.grid else None
         said = d.judged.levels.get(f.name) if d.judged else None
-        t.add_row(NAMES[f.name] + (" *" if d.ruling == f.name else ""), f"[{OF_LEVEL[level]}]{LEVELS[level]}[/]",
+        word = "not judged" if level is None else LEVELS[level]
+        t.add_row(NAMES[f.name] + (" *" if d.ruling == f.name else ""), f"[{OF_LEVEL[level]}]{word}[/]",
                   size(e.value), f"{size(e.low)}..{size(e.high)}", f"{f.middle:g}/{f.most:g}",
                   "-" if at is None else size(at), OUTSIDE[said])
     t.caption = "filter clogging: Kintas; spool friction: FSS in N" + ("; * rules" if d.ruling else "")
@@ -74,7 +75,7 @@ def faults(d: Diagnosis) -> Table:
 def methods(rows: Sequence[Row]) -> Table:
     """What other methods find: error, simulations, time."""
     t = Table(box=None, pad_edge=False)
-    t.add_column("method", no_wrap=True)
+    t.add_column("method")
     for column in ("Kintas", "FSS N", "left", "errors", "right", "runs", "s"):
         t.add_column(column, justify="right", no_wrap=True)
     for r in rows:
@@ -112,6 +113,7 @@ def lines(d: Diagnosis) -> list[tuple[str, str]]:
                               f"{e.t_in:.3f} .. {e.t_out:.3f} s, {e.section}"))
     if len(d.events) > EVENTS:
         said.append(("", f"and {len(d.events) - EVENTS} more events"))
+    said += [("bands", text) for text in overruled(d)]
     r = d.refined
     fits = ", ".join(f"{SHOWN[s]} {ratio:.3g}" for s, ratio in r.ratio.items())
     said.append(("fit", f"leaves {fits} times the noise; {r.simulations} simulations; "

@@ -74,6 +74,18 @@ def test_another_command_is_judged_without_bands(other_command: Diagnosis) -> No
     assert other_command.sizes[FRICTION.name].value == pytest.approx(45.0, rel=0.06)
 
 
+def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: Path) -> None:
+    """A null bias moves the response out of the bands of clogging; the fit knows better, and that is said."""
+    recorded({"null_bias.current": 2.4e-4}).write_csv(tmp_path / "biased.csv")
+    said = rig("fdi", tmp_path / "biased.csv", "--out", tmp_path / "biased.html")
+    page = (tmp_path / "biased.html").read_text()
+    assert said.status == 0 and said.out.startswith("ACCEPTABLE")
+    for words in ("call filter clogging non-nominal", "finds it acceptable, beside null bias 0.24 mA"):
+        assert words in " ".join(said.out.split()) and words in page
+    assert "step to 0 mm" in page and page.count("<td>step to 0 mm</td>") > 1  # two steps, two lines
+    assert "eha-rig" in page
+
+
 def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     """Spool and ram see a lag of the transducer that no fault and no tolerance explains."""
     found = diagnose(recorded({"sensor_lag.time": 3e-3}, SHORT))

@@ -13,6 +13,8 @@ from fdi.health.types import CLOGGING, FRICTION, Estimate, Level
 from fdi.health.unknowns import LARGEST, MOST, free_parameters, start_of
 from fdi.health.valley import flats, relaxed, sloped
 from plant import Model, load_model
+from rig.campaign.case import run
+from rig.campaign.matrix import matrix
 from rig.trial import cases, truth
 
 MODEL = load_model()
@@ -117,3 +119,13 @@ def test_a_model_with_a_known_effect_keeps_it() -> None:
     model: Model = MODEL.replace({"null_bias.current": 5e-5})
     assert "null_bias.current" in {f.name for f in free_parameters(model)}
     assert next(f for f in free_parameters(model) if f.name == "null_bias.current").centre == 5e-5
+
+
+@pytest.mark.parametrize("seed", [8, 10])
+def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side(seed: int) -> None:
+    """Strongly clogged units with scatter, which a first descent leaves at up to 3.5 times the noise."""
+    drawn = matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": seed}, MODEL, "", "test")
+    found = diagnose(run(drawn.cases[0], drawn.spec, MODEL))
+    assert found.refined.reached and found.levels[CLOGGING.name] == Level.NON_NOMINAL
+    assert found.refined.kintas.low < 0.35 < found.refined.kintas.high
+    assert found.levels[FRICTION.name] == Level.ACCEPTABLE

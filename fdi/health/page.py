@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Any
 
 from fdi.health import pictures
@@ -11,12 +12,13 @@ from fdi.health.features import MEANINGS, kind_of
 from fdi.health.paper_figures import maps
 from fdi.health.precursors import shown
 from fdi.health.types import FAULTS, Event, Fault, Level
-from fdi.health.words import LEVELS, NAMES, besides, sentence, size
+from fdi.health.words import LEVELS, NAMES, besides, overruled, sentence, size
 from fdi.output import rendered
 
 MOODS = {"ACCEPTABLE": "good", "MAINTENANCE": "doubtful", "NON_NOMINAL": "bad"}
 OF_LEVEL = {Level.ACCEPTABLE: "within", Level.MAINTENANCE: "near", Level.NON_NOMINAL: "over", None: "muted"}
 FAR = 4.0  # healthy standard deviations
+APART = 0.5  # s; what comes later is of another section, though it may have the same name
 
 
 def render(d: Diagnosis) -> str:
@@ -25,7 +27,8 @@ def render(d: Diagnosis) -> str:
     return rendered(
         "fdi.html",
         title=d.source, verdict=d.verdict, mood=MOODS.get(d.verdict, "doubtful"), why=sentence(d), facts=_facts(d),
-        notes=d.notes, faults=[_fault(d, f) for f in FAULTS], correlation=f"{d.refined.correlation:+.2f}",
+        notes=[*(f"The bands {text}." for text in overruled(d)), *d.notes], faults=[_fault(d, f) for f in FAULTS],
+        correlation=f"{d.refined.correlation:+.2f}",
         others=[besides(name, e) for name, e in d.others.items()],
         estimates=pictures.estimates(d.sizes, d.grid, d.judged),
         overview=pictures.overview(d.cycles, d.judged) if d.judged is not None else "",
@@ -41,7 +44,12 @@ def _facts(d: Diagnosis) -> list[tuple[str, str]]:
     left = ", ".join(f"{name.upper()} {ratio:.2f}" for name, ratio in r.ratio.items())
     return [("trace", f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"),
             ("signals", ", ".join(name.upper() for name in c.signals)), ("left over noise", left),
-            ("method", f"{r.method}, {r.simulations} simulations")]
+            ("method", f"{r.method}, {r.simulations} simulations"), ("model", " ".join([d.model.name, *_changes(d)])),
+            ("software", f"eha-rig {version('eha-rig')}")]
+
+
+def _changes(d: Diagnosis) -> list[str]:
+    return [f"{name}={value:g}" for name, value in sorted(d.model.differences().items())]
 
 
 def _fault(d: Diagnosis, f: Fault) -> dict[str, Any]:
@@ -57,10 +65,14 @@ def _fault(d: Diagnosis, f: Fault) -> dict[str, Any]:
 
 def _stays(events: Sequence[Event]) -> list[dict[str, str]]:
     """A row a band, signal and section: how many stays outside, from when to when, how long in all, how far."""
-    rows: dict[tuple[str, str, str], list[Event]] = {}
+    rows: list[list[Event]] = []
     for e in events:
-        rows.setdefault((e.band, e.signal, e.section), []).append(e)
-    return [_row(own) for own in rows.values()]
+        own = next((row for row in reversed(rows) if row[-1][:3] == e[:3]), None)
+        if own is None or e.t_in - own[-1].t_out > APART:
+            rows.append([e])
+        else:
+            own.append(e)
+    return [_row(own) for own in rows]
 
 
 def _row(own: Sequence[Event]) -> dict[str, str]:

@@ -44,6 +44,18 @@ def left_over(d: Diagnosis) -> str:
     return f"the best fit leaves {found} times what noise explains"
 
 
+def overruled(d: Diagnosis) -> list[str]:
+    """Why a fault is judged better than the bands say, fault by fault."""
+    said = []
+    for f in FAULTS:
+        banded, level = d.judged.levels.get(f.name) if d.judged else None, d.levels[f.name]
+        if banded is not None and level is not None and banded > level:
+            why = "; ".join(besides(name, e) for name, e in d.others.items())
+            said.append(f"call {NAMES[f.name]} {LEVELS[banded]}; the fit, which knows more of the plant, finds it "
+                        f"{LEVELS[level]}" + (f", beside {why}" if why else ""))
+    return said
+
+
 def _besides(d: Diagnosis) -> str:
     """What is off besides the two faults."""
     if not d.others:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--summary", action="store_true", help="do nothing more; the statistics of what is there")
     add("--scheduler", metavar="ADDRESS", help="a Dask cluster, tcp://HOST:PORT, in place of processes of our own")
     add("--jobs", type=options.whole, metavar="N", help="processes on this machine (default: one a core)")
-    add("--most", type=options.whole, metavar="N", help="stop after the first N cases, a fair sample of all")
+    add("--most", type=options.counted, metavar="N", help="stop after the first N cases, a fair sample of all")
     add("--again", action="store_true", help="do failed cases once more")
     add = parser.add_argument_group("the matrix").add_argument
     add("--fault", action="append", default=[], metavar="EFFECT=SIZE,..",
@@ -65,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
 def _concluded(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Namespace) -> int:
     """Statistics to files and terminal; 1 if a case failed or a rate that is asked for is not reached."""
     from rig.campaign import show
+    from rig.campaign.folder import matrix_of
     from rig.campaign.summary import summary
     from rig.console import console
 
@@ -76,6 +78,8 @@ def _concluded(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Name
     elif not args.quiet:
         show.summary(figures, console())
         if folder.is_dir():
+            if left := len(matrix_of(folder).cases) - len(rows):
+                print(f"left      {left} cases, with which rig campaign {shlex.quote(str(folder))} goes on")
             print(f"results   {folder}/ " + ", ".join(sorted(file.name for file in folder.iterdir()
                                                              if file.suffix in (".parquet", ".json", ".svg"))))
     missed = [rate for part in figures["tolerances"] for rate in part["rates"] if rate["met"] is False]
