@@ -47,14 +47,14 @@ def left_over(run: str, repeat: str, model: Model) -> str:
         for ax, (name, _, scale) in zip(axes, SIGNALS, strict=True):
             for side in (-2, 2):
                 ax.axhline(side * floor[name].floor.value * scale, color=pictures.FLOOR, lw=0.8, ls=":")
-        axes[0].legend(loc="upper right", ncols=2, frameon=False)
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
         return svg(figure, run)
 
 
 def smaller(text: str) -> str:
-    """The same drawing with one decimal of a point."""
-    return re.sub(r"(\d+\.\d)\d+", r"\1", text)
+    """The same drawing with one decimal of a point in its lines."""
+    return re.sub(r'(?<= d=")[^"]*', lambda line: re.sub(r"(\d+\.\d)\d+", r"\1", line[0]), text)
 
 
 def main(folder: str) -> None:

@@ -46,7 +46,7 @@ def table(a: Answer) -> Table:
     t.add_column("")
     for column in [*(SHOWN[s] for s in signals), *(["held out"] if held else []), "evidence", "p"]:
         t.add_column(column, justify="right")
-    for c in a.candidates[:ROWS]:
+    for c in a.explanations[:ROWS]:
         t.add_row(*_row(a, c, signals, held))
     before = a.explanation.base.ratio
     unseen = [_worst(a, a.baseline["holdout"])] if held else []
@@ -59,7 +59,7 @@ def table(a: Answer) -> Table:
 
 def _row(a: Answer, c: Candidate, signals: Sequence[str], held: bool) -> list[str]:
     colour = WORDS.get(c.word, "dim")
-    name = " + ".join([*(f"[dim]{x}[/]" for x in c.beside), f"[bold]{c.effect}[/]" if colour != "dim" else c.effect])
+    name = " + ".join(f"[bold]{x}[/]" if colour != "dim" else x for x in (*c.beside, c.effect))
     shown = [ratio(c.ratios[s]) if s in c.ratios else "-" for s in signals]
     return [name, f"[{colour}]{c.word}[/]", *shown, *([_worst(a, c.holdout)] if held else []), f"{c.evidence:.0f}",
             chance(c.p_value)]

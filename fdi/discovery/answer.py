@@ -98,6 +98,16 @@ class Answer:
         e = self.explanation
         return e.ledger[-1] if len(e.ledger) > 1 else e.base
 
+    @property
+    def explanations(self) -> tuple[Candidate, ...]:
+        """The candidates, each set of effects once, with the parameters of all its effects that are candidates."""
+        found: dict[frozenset[str], Candidate] = {}
+        for c in self.candidates:
+            effects = frozenset((*c.beside, c.effect))
+            first = found.get(effects, c)
+            found[effects] = first._replace(parameters={**first.parameters, **c.parameters})
+        return tuple(found.values())
+
 
 def told(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
@@ -125,6 +135,9 @@ def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
             half = NORMAL * math.hypot(ROUGH * fit.spread(f.name), SYSTEMATIC * size)
             found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
                                   entry.parameters[f.name].unit)
+    for name, v in found.items():  # dynamic friction is not above static friction, nor is its interval
+        static = found.get(name.replace("dynamic", "static"), v)
+        found[name] = v._replace(high=max(min(v.high, static.high), v.value))
     return found
 
 

@@ -32,7 +32,7 @@ PUMPED = ("current", "x - ({0}) / p.pump.displacement")  # a flow, where a pump 
 
 
 class Pattern(NamedTuple):
-    """What is missing, as a curve: `height` (k,) in `unit` at `at` (k,) of `state`; or a wave over the position."""
+    """What is missing, as a curve: `height` (k,) in `unit` at `at` (k,) of `state`, of a wave within one period."""
 
     place: str
     unit: str
@@ -86,6 +86,7 @@ def _shape(best: Balance, states: States) -> Pattern:
     over = max(waves, key=lambda n: waves[n][1])
     if waves[over][1] > max(share + 0.05, FOLLOWS):
         shape, share = waves[over]
+        _, at, height, doubt = curve(missing, np.mod(seen[over], shape[1]), best.noise)
         return Pattern(best.place, best.unit, best.size, over, share, at, height, doubt, shape, best.missing)
     state = name if share >= FOLLOWS else ""
     return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, None, best.missing)

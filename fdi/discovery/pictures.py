@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fdi.discovery.answer import Candidate
 from fdi.discovery.ledger import Row
-from fdi.discovery.pattern import STATES, Pattern
+from fdi.discovery.pattern import Pattern
 from fdi.discovery.record import Record
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.words import SHOWN
@@ -20,6 +20,8 @@ from fdi.sections import sections
 
 Floats = NDArray[np.float64]
 
+AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar"), "spool": (1e6, "µm"),
+        "current": (1e3, "mA"), "time": (1.0, "s")}
 SCALES = {"xj": (1e6, "µm"), "p12": (1e-5, "bar"), "xs": (1e6, "µm")}
 BEFORE, AFTER, HELD, FLOOR = "#c9ced6", "#1f6feb", "#d9730d", "#2b8a3e"
 TWICE = 2.0  # floors: noise stays within for 95 % of the time
@@ -45,7 +47,7 @@ def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floo
                 ax.axhline(side * TWICE * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
                            label="twice the floor" if side > 0 else None)
             ax.set_ylabel(f"{SHOWN[name]} [{unit}]")
-        axes[1].legend(loc="upper right", ncols=3, frameon=False)
+        axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
         for ax in axes:
             _shaded(ax, record)
         axes[-1].set_xlabel("time [s]")
@@ -114,9 +116,16 @@ def shape(p: Pattern, t: Floats) -> str:
         figure = Figure(figsize=(11, 3.0), layout="constrained")
         over, along = figure.subplots(1, 2, width_ratios=[1.0, 1.6])
         if len(p.at):
-            over.errorbar(p.at, p.height, yerr=2.0 * p.doubt, color=HELD, lw=1.2, elinewidth=0.8)
+            state = p.state or "position"
+            scale, unit = AXES[state]
+            over.errorbar(scale * p.at, p.height, yerr=2.0 * p.doubt, color=HELD, lw=1.2, elinewidth=0.8)
             over.locator_params(axis="x", nbins=5)
-            over.set_xlabel(f"{p.state or 'position'} [{STATES[p.state or 'position'][0]}]")
+            over.set_xlabel(f"{state} [{unit}]")
+            if p.wave:
+                amplitude, length, phase = p.wave
+                x = np.linspace(0.0, length, 100)
+                over.plot(scale * x, amplitude * np.sin(2.0 * np.pi * x / length + phase), color=AFTER, lw=1.0, ls="--")
+                over.set_xlabel(f"{state} within a period of {scale * length:.4g} {unit}; dashed: a wave")
         over.set_ylabel(f"what is missing [{p.unit}]")
         n = min(len(t), len(p.trace))
         along.plot(*thin(t[:n], p.trace[:n]), color=HELD, lw=0.8)

@@ -38,11 +38,11 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
     return _page(
         title=title, verdict=a.verdict, mood=MOODS[a.verdict], why=tell.sentence(a), lines=tell.lines(a), then=then,
         notes=notes, facts=[("model", model), *_runs(sources, bool(a.baseline["holdout"]))], command=[command],
-        candidates=[_candidate(c, list(e.floor)) for c in a.candidates], signals=[SHOWN[s] for s in e.floor],
+        candidates=[_candidate(c, list(e.floor)) for c in a.explanations], signals=[SHOWN[s] for s in e.floor],
         parameters=_parameters([c for c in a.candidates if c.effect in e.effects]),
         left=pictures.left_over(record, e.base, after, e.floor,
                                 "with what was found" if e.effects else "with the best candidate"),
-        ranking=pictures.ranking(a.candidates, e.floor) if a.candidates else "",
+        ranking=pictures.ranking(a.explanations, e.floor) if a.candidates else "",
         ledger=pictures.ledger([Row(*row) for row in a.ledger], a.baseline["floor"]) if len(a.ledger) > 2 else "",
         shape=pictures.shape(shape, record.trace.t) if shape and shape.place else "",
         blind=[(b.effect, spoken(b.parameter), amount(b.smallest, b.unit), amount(b.usual, b.unit),
