@@ -107,32 +107,46 @@ def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] =
     """
     problem = problem_of(model, record, floor, workers)
     free = free_parameters(model)
+    first = _first(problem, free, starts)
+    problem = _with_noise(problem, first)
+    return _refined(_last(problem, first), problem)
+
+
+def _first(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
+    """A fit from the best start and, before a fault is blamed, from a healthy unit: whichever leaves less."""
     alone = replace(problem, workers=1, _lanes={})
     found = [_best_start(problem, free, starts)]
     healthy = start_of(free, CLOGGING.healthy, FRICTION.healthy, offsets_of(problem))
-    if _blamed(free, found[0]):  # before a fault is blamed a healthy unit gets its chance
+    if _blamed(free, found[0]):
         found.append(healthy)
-    fits = mapped(lambda x: _eased(alone, free, x), found, workers)
+    fits = mapped(lambda x: _eased(alone, free, x), found, problem.workers)
     if len(fits) == 1 and (not _reached(problem, fits[0]) or _blamed(free, fits[0].x)):
         fits.append(_eased(problem, free, healthy))
     first = min(fits, key=lambda f: f.cost)
     for factor, rounds in AGAIN if not _reached(problem, first) else ():
         first = _further(problem, first, factor, rounds)
-    problem = _with_noise(problem, first)
+    return first
+
+
+def _last(problem: Counted, first: Fit) -> Fit:
+    """The fit with finer steps, as long as it takes to leave nothing but noise, or as there is hope."""
     fine = replace(problem, steps=FINE, _lanes={})
-    last = descended(fine, first, SETTLING, flats(problem, free, first.x))
-    if not _reached(problem, last):
-        last = descended(fine, last, LONG, flats(problem, free, last.x))
+    last = first
+    for rounds in (SETTLING, LONG):
+        last = descended(fine, last, rounds, flats(problem, first.free, last.x))
+        if _reached(problem, last):
+            return last
     for _ in range(RESTARTS):
-        if _reached(problem, last) or max(_over(problem, last)) > HOPELESS:
+        before = last
+        if max(_over(problem, last)) > HOPELESS:
             break
-        before, last = last, _restarted(problem, last, workers)
-        if last.cost > WORTHWHILE * before.cost:
+        last = _restarted(problem, last)
+        if _reached(problem, last) or last.cost > WORTHWHILE * before.cost:
             break
-    return _refined(last, problem)
+    return last
 
 
-def _restarted(problem: Counted, found: Fit, workers: int) -> Fit:
+def _restarted(problem: Counted, found: Fit) -> Fit:
     """The best of a fit and some that begin on the way from it to a unit with these faults and no other deviation.
 
     Stops of the ram make ridges: tolerances that lie behind one of them are found from the other side, or never.
@@ -147,7 +161,7 @@ def _restarted(problem: Counted, found: Fit, workers: int) -> Fit:
         begun = _eased(alone, free, found.x + part * (home - found.x))
         return descended(replace(alone, steps=FINE, _lanes={}), begun, LONG, flats(alone, free, begun.x))
 
-    return min(found, *mapped(fitted, BACK, workers), key=lambda f: f.cost)
+    return min(found, *mapped(fitted, BACK, problem.workers), key=lambda f: f.cost)
 
 
 def _eased(problem: Counted, free: Sequence[Free], x: Floats) -> Fit:
