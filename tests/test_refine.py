@@ -101,6 +101,7 @@ def test_sizes_are_within_what_is_possible() -> None:
 @pytest.mark.parametrize(("size", "expected"), [
     ((0.05, 0.0, 0.1), Level.ACCEPTABLE), ((0.21, 0.16, 0.26), Level.MAINTENANCE),
     ((0.25, 0.2, 0.3), Level.MAINTENANCE), ((0.31, 0.27, 0.36), Level.NON_NOMINAL),
+    ((0.2, 0.155, 0.243), Level.ACCEPTABLE), ((0.2, 0.155, 0.247), Level.MAINTENANCE),  # by the margin
     ((0.31, 0.24, 0.38), Level.MAINTENANCE), ((0.5, 0.4, 0.6), Level.NON_NOMINAL), ((0.2, 0.0, 0.4), None)])
 def test_levels(size: tuple[float, float, float], expected: Level | None) -> None:
     assert level(CLOGGING, Estimate(*size)) == expected
