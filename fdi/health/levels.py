@@ -1,9 +1,10 @@
 """From the size of a fault, with its interval, to one of the paper's three levels; and which of two faults rules.
 
 A limit of Table 2 counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the
-healthy size, for MidBand) is excluded. MidBand has to be a little further off (`MARGIN`) before a fault is acceptable, as
+healthy size, for MidBand) is excluded. MidBand has to be a little further off (`MARGIN`) before a fault is acceptable:
 one that is missed costs more than one that is looked at early. So a fault exactly at MidBand is found in 98 % of all
-tests, as long as the interval excludes a healthy unit; one that holds the healthy size and MidBand both cannot be judged.
+tests, as long as the interval excludes a healthy unit. One that holds the healthy size and MidBand both cannot be
+judged.
 """
 from __future__ import annotations
 
