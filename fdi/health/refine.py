@@ -35,10 +35,9 @@ EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
 SETTLING = 4  # rounds of the last fit
 LONG = 8  # further ones, where these were not enough
-RESTARTS = 3  # at most, where nothing of that has left noise alone
-BACK = (1.0, 0.5)  # where they begin: parts of the way back to a unit without deviations
-HOPELESS = 4.0  # times the noise: something else is wrong, no other start mends it
-WORTHWHILE = 0.9  # times the cost before: what a round of them has to get down to if there is to be another
+# where a fit begins again that has not come down to noise: parts of the way back to a unit without deviations, by turns
+BACK = ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25))
+HOPELESS = {"xj": 7.0, "p12": 7.0, "xs": 2.0}  # times the noise: something else is wrong, no other start mends it
 FAULTY = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
 FURTHEST = 5.0  # times the floor, that a few missed stops may leave in all
 REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
@@ -136,17 +135,15 @@ def _last(problem: Counted, first: Fit) -> Fit:
         last = descended(fine, last, rounds, flats(problem, first.free, last.x))
         if _reached(problem, last):
             return last
-    for _ in range(RESTARTS):
-        before = last
-        if max(_over(problem, last)) > HOPELESS:
+    signals = problem.record.signals
+    for parts in BACK:
+        if _reached(problem, last) or any(x > HOPELESS[s] for s, x in zip(signals, _over(problem, last), strict=True)):
             break
-        last = _restarted(problem, last)
-        if _reached(problem, last) or last.cost > WORTHWHILE * before.cost:
-            break
+        last = _restarted(problem, last, parts)
     return last
 
 
-def _restarted(problem: Counted, found: Fit) -> Fit:
+def _restarted(problem: Counted, found: Fit, parts: Sequence[float]) -> Fit:
     """The best of a fit and some that begin on the way from it to a unit with these faults and no other deviation.
 
     Stops of the ram make ridges: tolerances that lie behind one of them are found from the other side, or never.
@@ -161,7 +158,7 @@ def _restarted(problem: Counted, found: Fit) -> Fit:
         begun = _eased(alone, free, found.x + part * (home - found.x))
         return descended(replace(alone, steps=FINE, _lanes={}), begun, LONG, flats(alone, free, begun.x))
 
-    return min(found, *mapped(fitted, BACK, problem.workers), key=lambda f: f.cost)
+    return min(found, *mapped(fitted, parts, problem.workers), key=lambda f: f.cost)
 
 
 def _eased(problem: Counted, free: Sequence[Free], x: Floats) -> Fit:
