@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
 ANCHOR = 20.0  # 1/s; a free replay adds up every bias for ever, this one forgets within 50 ms
 FURTHEST = 5.0  # tolerances that a healthy unit may be off; beyond, something is wrong with it
+TURNING = 2e-3  # Hz, first difference of a frequency: a small part of a turn over a test
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
 
@@ -67,7 +68,8 @@ def unknowns(effect: Effect, model: Model) -> tuple[Free, ...]:
         q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
         sizes = sorted(abs(start[name] - off) for start in effect.starts)
         scale = sizes[len(sizes) // 2] or 1.0
-        free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), 0.05))
+        step = TURNING / scale if q.unit == "Hz" else 0.05
+        free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), step))
     return tuple(free)
 
 

@@ -22,6 +22,10 @@ ZOOM = (  # factors on the size, pass by pass; the first reaches down to sizes t
     (0.97, 0.985, 1.015, 1.03))
 LOOKED_AT = (40, 14, 10, 8)  # effects in each of these passes
 TOGETHER = 64  # runs at a time
+FINER = 16  # times the length of a run: bins of a spectrum fine enough for a fit to begin in
+AROUND = 3.0  # Hz, on either side: what a line has to stand out of
+APART = 1.0  # Hz, between lines
+LINES = 4  # tried
 THINNED = 5  # every so many samples, for the linear shift alone
 
 
@@ -97,28 +101,43 @@ def _near(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str
 def tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]]:
     """Starts for an effect with a frequency: a fit finds none that it does not begin within a period of.
 
-    The effect at next to no frequency and a quarter turn shows how the residual answers a constant; the residual times
-    that answer has a line where the effect has its frequency.
+    The effect at next to no frequency and a quarter turn shows how each residual answers a constant; the residual times
+    that answer has a line where the effect has its frequency. The lines that stand out most from what is around, in all
+    signals together, are tried, at four phases as the answer may lag, and larger as what is fast is weakened.
     """
     entry = CATALOGUE[effect]
     named = {entry.parameters[n].unit: n for n in entry.fitted}
-    if not {"Hz", "rad"} <= set(named) or not entry.starts:
+    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
+    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
         return []
     still = {**entry.starts[0], named["Hz"]: max(1e-6, entry.parameters[named["Hz"]].low), named["rad"]: 0.5 * np.pi}
     names = list(still)
-    answer = problem.whitened(problem.left(problem.predict(names, np.array([list(still.values())]))))[0]
-    product = -(fit.white * (answer - problem.whitened(problem.left(problem.predict(names, np.array([[
-        entry.off.get(n, still[n]) for n in names]]))))[0])).sum(axis=0)
-    n = len(product)
-    spectrum = np.fft.rfft(product - product.mean(), 4 * n)
-    hertz = np.fft.rfftfreq(4 * n, problem.model.values["controller.period"])
+    at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
+    white = problem.whitened(problem.left(problem.predict(names, at)))
+    answer = white[1] - white[0]
+    product = fit.white * answer
+    period = problem.model.values["controller.period"]
+    spectra = np.fft.rfft(product - product.mean(axis=1, keepdims=True), FINER * product.shape[1])
+    hertz = np.fft.rfftfreq(FINER * product.shape[1], period)
+    height = (_prominence(np.abs(spectra), round(AROUND / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
+    line = spectra.sum(axis=0) * 2.0 / max(float((answer**2).sum()), 1e-300)  # in sizes of the start
     found = []
-    for _ in range(3):
-        k = int(np.argmax(np.abs(spectrum) * (hertz > 0.5)))
-        phase = float(np.angle(spectrum[k])) + 0.5 * np.pi
-        found.append({**still, named["Hz"]: float(hertz[k]), named["rad"]: phase})
-        spectrum[np.abs(hertz - hertz[k]) < 1.0] = 0.0
+    for _ in range(LINES):
+        k = int(np.argmax(height))
+        found += [{size: still[size] * larger * float(np.abs(line[k])), named["Hz"]: float(hertz[k]),
+                   named["rad"]: float(np.angle(line[k])) + turn * np.pi}
+                  for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
+        height[np.abs(hertz - hertz[k]) < APART] = 0.0
     return found
+
+
+def _prominence(spectra: Floats, width: int) -> Floats:
+    """Magnitudes (s, n) over the median of those around them, `width` bins on either side."""
+    out = np.empty_like(spectra)
+    for first in range(0, spectra.shape[1], width):
+        around = spectra[:, max(first - width, 0):first + 2 * width]
+        out[:, first:first + width] = spectra[:, first:first + width] / np.median(around, axis=1, keepdims=True)
+    return out
 
 
 def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
