@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effect_files import restored_catalogue
+from recordings import recorded
 from scipy.signal import lfilter
 
 from fdi.discovery.fingerprints import comb, firmware, firmware_residual
@@ -14,7 +15,8 @@ from fdi.discovery.noise import fitted, level
 from fdi.discovery.nulls import Sensitivity, p_value, smallest_visible
 from fdi.discovery.pattern import Pattern, curve, wave, write_effect
 from fdi.discovery.record import record
-from fdi.discovery.search import common
+from fdi.discovery.scan import tones
+from fdi.discovery.search import Search, common
 from fdi.trace import Trace
 from plant import InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
@@ -167,3 +169,13 @@ def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match="measured signal"):
         trace = _recorded({})
         record(Trace.of({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
+
+
+@pytest.mark.parametrize("hertz", [11.4767, 99.6187])
+def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None:
+    """Of a supply that ripples, while the fit's own misfit is larger at low frequencies: a start within a quarter turn."""
+    ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
+    search = Search(Model(), record(recorded(ripple)), [], ["supply_ripple"], 1)
+    starts = tones(search.problem, search.base().fit, "supply_ripple")
+    assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
+    assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10
