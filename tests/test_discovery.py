@@ -173,7 +173,7 @@ def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
 
 @pytest.mark.parametrize("hertz", [11.4767, 99.6187])
 def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None:
-    """Of a supply that ripples, while the fit's own misfit is larger at low frequencies: a start within a quarter turn."""
+    """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
     ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
     search = Search(Model(), record(recorded(ripple)), [], ["supply_ripple"], 1)
     starts = tones(search.problem, search.base().fit, "supply_ripple")
