@@ -233,10 +233,10 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
 
 
 def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "bad.json").write_text("{}")
-    nan = points(tmp_path / "nan.json", LINE)
-    nan.write_text(nan.read_text().replace('"t": ', '"t": NaN, "x": ', 1))
-    for words in ([], [nan], ["--score", "--units", "0"], *([tmp_path / name] for name in ("bad.json", "none"))):
+    (bad := tmp_path / "bad.json").write_text("{}")
+    (empty := tmp_path / "empty").mkdir()
+    (nan := tmp_path / "nan.json").write_text(points(nan, LINE).read_text().replace('"t": ', '"t": NaN, "x": ', 1))
+    for words in ([], [bad], [nan], ["--score", "--units", "0"], [tmp_path / "none"], [empty], [bad, "--out", "x.txt"]):
         said = rig("trend", *words)
         assert said.status == 2 and said.err.count("\n") == 1, words
 
@@ -274,7 +274,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [iso(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
     assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
-    assert any("old.csv stands in" in note for note in found.notes)
+    assert any("old.csv stands in dates.csv" in note for note in found.notes)
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
     with pytest.raises(InputError, match="flights"):
         gathered("flights")
