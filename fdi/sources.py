@@ -5,6 +5,7 @@ import hashlib
 import importlib
 from collections.abc import Callable
 from functools import cache
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,11 @@ from typing import Any
 from plant.errors import InputError
 
 COUNTS = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; not pages and caches
+
+
+def software() -> str:
+    """Name and version of this software."""
+    return f"eha-rig {version('eha-rig')}"
 
 
 def named(name: str, field: str, expected: str) -> Callable[..., Any]:

@@ -6,7 +6,6 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -126,11 +125,6 @@ def place(out: str | None, suffixes: tuple[str, ...], source: str, option: str =
 def typed() -> str:
     """The command as it was typed, for provenance."""
     return shlex.join(["rig", *sys.argv[1:]]) if Path(sys.argv[0]).name in ("rig", "cli.py") else "rig"
-
-
-def software() -> str:
-    """Name and version of this software."""
-    return f"eha-rig {version('eha-rig')}"
 
 
 def words(trace: str, args: argparse.Namespace, model: str | None = None) -> str:

@@ -14,6 +14,7 @@ from fdi.discovery.ledger import Provenance, Row
 from fdi.discovery.refit import Refit, model_of, refit
 from fdi.discovery.runs import Runs
 from fdi.output import write_text
+from fdi.sources import software
 from plant import InputError, Model
 from plant.model import meaning, offered
 from rig import discovery
@@ -121,7 +122,7 @@ def _finished(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], r
     before_it = known.floor or {}  # a model that lacks something makes noise look larger: the least is the noise
     floor = {s: min(x, before_it.get(s, x)) if len(rows) > len(r.steps) else x for s, x in r.floor.items()}
     provenance = replace(
-        known, software=discovery.software(), history=(*known.history, discovery.typed()), effects=tuple(effects),
+        known, software=software(), history=(*known.history, discovery.typed()), effects=tuple(effects),
         signals=runs.est.signals, trace=runs.sources[0], repeats=runs.sources[1:1 + len(runs.repeats)], holdout=held,
         floor=floor, before={**(known.before or {}), **before}, ledger=tuple(rows))
     return Done(model, provenance, r, values, suspicious(fit, model.plant), notes)

@@ -4,7 +4,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,9 @@ from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.settle import settled
 from plant.effects import CATALOGUE
 from plant.model import Model
-from plant.threads import mapped, threads
+from plant.threads import R, T, mapped, threads
 
 Floats = NDArray[np.float64]
-T = TypeVar("T")
-R = TypeVar("R")
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage

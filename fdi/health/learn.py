@@ -4,7 +4,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from fdi.health.montecarlo import STEPS, Kind, Tell, runs, silent
 from fdi.health.types import CLOGGING, FRICTION
 from fdi.output import writable
 from fdi.sections import Section, sections
+from fdi.sources import software
 from fdi.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -190,4 +190,4 @@ def _mean(values: Floats) -> float:
 
 def _facts(parts: Sequence[Section], period: float) -> dict[str, str]:
     text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
-    return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": f"eha-rig {version('eha-rig')}"}
+    return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": software()}

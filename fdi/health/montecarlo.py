@@ -18,6 +18,7 @@ from fdi.tolerance import tolerances
 from plant.block import NARROW
 from plant.lanes import Lanes
 from plant.model import Model
+from plant.threads import threads
 
 Floats = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]
@@ -64,7 +65,7 @@ def runs(model: Model, com: Floats, load: Floats, kind: Kind, count: int, seed: 
         out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
 
     starts = range(0, count, NARROW)
-    with ThreadPoolExecutor(Lanes(model, names).workers) as pool:
+    with ThreadPoolExecutor(threads()) as pool:
         for done, _ in enumerate(pool.map(block, starts)):
             tell(f"simulating units, {kind.name}", done + 1, len(starts))
     return out

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Any
 
 from fdi.health import pictures
@@ -14,6 +13,7 @@ from fdi.health.precursors import shown
 from fdi.health.types import FAULTS, Event, Fault, Level
 from fdi.health.words import LEVELS, NAMES, besides, overruled, sentence, size
 from fdi.output import rendered
+from fdi.sources import software
 
 MOODS = {"ACCEPTABLE": "good", "MAINTENANCE": "doubtful", "NON_NOMINAL": "bad"}
 OF_LEVEL = {Level.ACCEPTABLE: "within", Level.MAINTENANCE: "near", Level.NON_NOMINAL: "over", None: "muted"}
@@ -45,7 +45,7 @@ def _facts(d: Diagnosis) -> list[tuple[str, str]]:
     return [("trace", f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"),
             ("signals", ", ".join(name.upper() for name in c.signals)), ("left over noise", left),
             ("method", f"{r.method}, {r.simulations} simulations"), ("model", " ".join([d.model.name, *_changes(d)])),
-            ("software", f"eha-rig {version('eha-rig')}")]
+            ("software", software())]
 
 
 def _changes(d: Diagnosis) -> list[str]:
