@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from fdi.discovery import explain, pictures
 from fdi.discovery.ledger import load
 from fdi.discovery.pattern import pattern
 from fdi.discovery.runs import read
-from fdi.figures import STYLE, svg
+from fdi.figures import STYLE, smaller, svg
 from fdi.replay import open_loop, residuals
 from plant import Model
 from plant.effects import load_effects
@@ -50,11 +49,6 @@ def left_over(run: str, repeat: str, model: Model) -> str:
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
         return svg(figure, run)
-
-
-def smaller(text: str) -> str:
-    """The same drawing with one decimal of a point in its lines."""
-    return re.sub(r'(?<= d=")[^"]*', lambda line: re.sub(r"(\d+\.\d)\d+", r"\1", line[0]), text)
 
 
 def main(folder: str) -> None:

@@ -1,7 +1,6 @@
 """Make the pictures and tables of worked_cases.md anew: python docs/worked_cases.py (six runs, a minute)."""
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 import tempfile
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fdi import Trace
+from fdi.figures import smaller
 from fdi.health import paper_figures as figures
 from fdi.health.bands import excursions, suited
 from fdi.health.grid import search
@@ -65,8 +65,7 @@ def main() -> None:
     HERE.mkdir(exist_ok=True)
 
     def save(number: str, text: str) -> None:
-        shorter = re.sub(r"(\d+\.\d)\d+", r"\1", text)  # a tenth of a point will do
-        (HERE / f"fig{number}.svg").write_text(shorter, encoding="utf-8")
+        (HERE / f"fig{number}.svg").write_text(smaller(text), encoding="utf-8")
 
     with tempfile.TemporaryDirectory() as folder:
         healthy = run(folder)

@@ -105,7 +105,7 @@ def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Tr
             ax.set_title(f"{kind} of {size:+.2g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
         unit = "mm" if kind == "step" else "departure, µm" if signal == "position" else "departure, mm/s"
         axes[0].set_ylabel(f"{signal} [{unit}]")
-        axes[0].legend(loc="best", frameon=False, fontsize=7)
+        axes[0].legend(loc="best", frameon=True, edgecolor="none", fontsize=7)
         return svg(figure, f"banded {kind} {signal}")
 
 
