@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 
-from fdi.health.bands import judge_columns
-from fdi.health.montecarlo import Kind, runs
-from fdi.health.precursors import shown
-from fdi.health.store import default
-from fdi.health.types import FAULTS, Level
-from fdi.sections import sections
+from fdi.diagnosis.bands import judge_columns
+from fdi.diagnosis.bands_file import default
+from fdi.diagnosis.faults import FAULTS, Level
+from fdi.diagnosis.precursors import shown
+from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.trace.sections import sections
 from plant import load_model
 from rig.sequences import load_sequence
 

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdi.health.types import FAULTS
-from rig.campaign.folder import matrix_of, read_rows
-from rig.campaign.picture import detection
-from rig.campaign.show import asked, percent
-from rig.campaign.summary import summary, title
+from fdi.diagnosis.faults import FAULTS
+from rig.studies.campaign.detection_figure import detection
+from rig.studies.campaign.folder import matrix_of, read_rows
+from rig.studies.campaign.show_campaign import asked, percent
+from rig.studies.campaign.summary import summary, title
 
 PAGE = Path(__file__).with_suffix(".md")
 BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from PIL import Image  # comes with matplotlib
 
-from fdi import Trace, figures
+from fdi import Trace
+from fdi.report import figures
 
 HERE = Path(__file__).parent
-RIG = [sys.executable, "-m", "rig.cli"]
+RIG = [sys.executable, "-m", "rig.cli.main"]
 
 
 def main() -> None:

@@ -14,14 +14,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdi.trend import fleet
-from fdi.trend.score import predict
+from rig.studies.prognosis import degrading_units
+from rig.studies.prognosis.score import predict
 
 PARTICLES, PARTS = 2000, (0.3, 0.5, 0.7, 0.9)
 START, SPREAD = np.log(0.2), 1.5  # of the logarithm of a, and of c
 
 
-def scaled(u: fleet.Unit, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scaled(u: degrading_units.Unit, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, sizes and their deviations."""
     span = u.fault.most - u.fault.healthy
     value, low, high = np.array(u.sizes[:n]).T
@@ -42,12 +42,12 @@ def moved(x: np.ndarray, a: np.ndarray, c: np.ndarray, dt: float) -> np.ndarray:
     return x * np.exp(c * dt) + a * np.expm1(c * dt) / c
 
 
-def ours(u: fleet.Unit, n: int) -> np.ndarray:
+def ours(u: degrading_units.Unit, n: int) -> np.ndarray:
     """`rig trend`."""
     return predict(u, n).most
 
 
-def unscented(u: fleet.Unit, n: int) -> np.ndarray:
+def unscented(u: degrading_units.Unit, n: int) -> np.ndarray:
     """filterpy's unscented Kalman filter of (x, log a, c)."""
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
@@ -71,7 +71,7 @@ def unscented(u: fleet.Unit, n: int) -> np.ndarray:
     return ahead(x, rate(log_a), np.clip(c, -8, 8))
 
 
-def particles(u: fleet.Unit, n: int) -> np.ndarray:
+def particles(u: degrading_units.Unit, n: int) -> np.ndarray:
     """ProgPy's particle filter of (x, a, c)."""
     from progpy import PrognosticsModel
     from progpy.state_estimators import ParticleFilter
@@ -106,7 +106,8 @@ def particles(u: fleet.Unit, n: int) -> np.ndarray:
     return ahead(x, np.maximum(a, 1e-6), c)
 
 
-def line(name: str, method: Callable[[fleet.Unit, int], np.ndarray], units: list[fleet.Unit]) -> str:
+def line(name: str, method: Callable[[degrading_units.Unit, int], np.ndarray],
+         units: list[degrading_units.Unit]) -> str:
     """One line of the table."""
     rows = []
     for u in units:
@@ -129,7 +130,8 @@ def line(name: str, method: Callable[[fleet.Unit, int], np.ndarray], units: list
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    fleet_units = [fleet.unit(law, 5000 + 100 * i + k) for i, law in enumerate(fleet.LAWS) for k in range(count)]
+    fleet_units = [degrading_units.unit(law, 5000 + 100 * i + k)
+                   for i, law in enumerate(degrading_units.LAWS) for k in range(count)]
     print("| method | 95 % to MaxBand | within 20 % | upper end / true | error of the median | a prediction |")
     print("|---|---|---|---|---|---|")
     for method in (ours, unscented, particles):

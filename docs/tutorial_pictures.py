@@ -10,14 +10,15 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from fdi import Trace
-from fdi.compare import compare
-from fdi.cycles import readings
-from fdi.discovery import explain, pictures
-from fdi.discovery.ledger import load
-from fdi.discovery.pattern import pattern
+from fdi.comparison.compare import compare
+from fdi.discovery import explain
+from fdi.discovery.model_file import load
+from fdi.discovery.residual_pattern import pattern
 from fdi.discovery.runs import read
-from fdi.figures import STYLE, smaller, svg
-from fdi.replay import open_loop, residuals
+from fdi.estimation.replay import open_loop, residuals
+from fdi.report import explain_figures
+from fdi.report.figures import STYLE, smaller, svg
+from fdi.trace.cycles import readings
 from plant import Model
 from plant.effects import load_effects
 
@@ -33,7 +34,7 @@ def left_over(run: str, repeat: str, model: Model) -> str:
     with rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.subplots(3, 1, sharex=True)
-        models = ((Model(), pictures.BEFORE, "nominal model"), (model, pictures.AFTER, "after rig add"))
+        models = ((Model(), explain_figures.BEFORE, "nominal model"), (model, explain_figures.AFTER, "after rig add"))
         for which, colour, label in models:
             cycles = readings(trace, which)[0]
             rest = residuals(cycles, open_loop(cycles, which))
@@ -45,7 +46,7 @@ def left_over(run: str, repeat: str, model: Model) -> str:
                 ax.set_ylabel(title)
         for ax, (name, _, scale) in zip(axes, SIGNALS, strict=True):
             for side in (-2, 2):
-                ax.axhline(side * floor[name].floor.value * scale, color=pictures.FLOOR, lw=0.8, ls=":")
+                ax.axhline(side * floor[name].floor.value * scale, color=explain_figures.FLOOR, lw=0.8, ls=":")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
         return svg(figure, run)
@@ -56,14 +57,14 @@ def main(folder: str) -> None:
     os.chdir(folder)
     runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
-    shape = pictures.shape(pattern(found.search, found.ledger[-1]), runs.est.trace.t)
+    shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.trace.t)
     (HERE / "shape.svg").write_text(smaller(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for story, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                      ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load(Path(file))
         (HERE / f"{story}_left.svg").write_text(smaller(left_over(run, repeat, model)), encoding="utf-8")
-        drawn = pictures.ledger(known.ledger, known.floor or {})
+        drawn = explain_figures.ledger(known.ledger, known.floor or {})
         (HERE / f"{story}_ledger.svg").write_text(smaller(drawn), encoding="utf-8")
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from fdi import Trace
-from fdi.figures import smaller
-from fdi.health import paper_figures as figures
-from fdi.health.bands import excursions, suited
-from fdi.health.grid import search
+from fdi.diagnosis.bands import excursions, suited
+from fdi.diagnosis.rms_grid import search
+from fdi.report import paper_figures as figures
+from fdi.report.figures import smaller
 from plant import Model, simulate
 
 HERE = Path(__file__).parent / "worked_cases"
-RIG = [sys.executable, "-m", "rig.cli"]
+RIG = [sys.executable, "-m", "rig.cli.main"]
 FSS_NC = 5.0  # N
 CASES = {"14": (0.25, 6 * FSS_NC), "15": (0.17, 9 * FSS_NC)}
 SCATTERED = 40  # units, for the table of what tolerance does

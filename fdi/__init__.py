@@ -1,4 +1,4 @@
 """What is done offline on a captured trace: no CAN, no viewer."""
-from fdi.trace import Trace
+from fdi.trace.trace import Trace
 
 __all__ = ["Trace"]

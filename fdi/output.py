@@ -42,5 +42,5 @@ def rendered(template: str, **content: Any) -> str:
     """A page of this package, `template` on top of page.html, as text; what is put in is escaped."""
     from jinja2 import Environment, PackageLoader
 
-    pages = Environment(loader=PackageLoader("fdi", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    pages = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return pages.get_template(template).render(**content)

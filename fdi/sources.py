@@ -38,7 +38,7 @@ def named(name: str, field: str, expected: str) -> Callable[..., Any]:
 
 @cache
 def digest(*places: str) -> str:
-    """A hash of all code and data in packages and files, "plant", "rig/trial", "rig/trial/truth.c": 16 digits."""
+    """A hash of all code and data in packages and files, "plant", "rig/studies/trial": 16 digits."""
     known = hashlib.sha256()
     for place in places:
         package, *rest = place.split("/")

@@ -15,7 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from rig import bus, lateness
+from rig.network import bus
+from rig.run import lateness
 
 Status = Literal["ok", "limited", "missing"]
 LOG_BYTES_PER_S = 500e3  # raw frames, signals and timing of a 1 kHz run, compressed

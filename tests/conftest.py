@@ -5,9 +5,9 @@ import os
 from pathlib import Path
 
 import pytest
-from command import rig
+from rig_command import rig
 
-from rig.bus import socketcan_problem
+from rig.network.bus import socketcan_problem
 
 pytest_plugins = ["plugin_bus_summary"]
 

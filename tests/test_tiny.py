@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import rig
+from rig_command import rig
 
-from fdi.trace import Trace
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 
 MY_EFFECT = '''

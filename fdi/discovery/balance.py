@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.record import SIGNALS
 from fdi.discovery.search import Hypothesis, Search
+from fdi.trace.record import SIGNALS
 
 Floats = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.fingerprints import Fingerprint, comb, firmware
-from fdi.discovery.fit import typical
-from fdi.discovery.nulls import SEEN, Sensitivity, sensitivity
-from fdi.discovery.problem import Problem
-from fdi.discovery.record import Record
 from fdi.discovery.search import Hypothesis, Search
+from fdi.discovery.significance import SEEN, Sensitivity, sensitivity
+from fdi.estimation.fit import typical
+from fdi.estimation.problem import Problem
+from fdi.trace.record import Record
 from plant.effects import CATALOGUE
 from plant.model import Model, offered
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.record import Record, held
+from fdi.trace.record import Record, held
 from plant.effects import CATALOGUE
 from plant.model import Model, kernel
 

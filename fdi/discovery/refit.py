@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.answer import friction_sorted
+from fdi.discovery.candidates import friction_sorted
 from fdi.discovery.explain import gain, held_out
 from fdi.discovery.fingerprints import comb, firmware
-from fdi.discovery.fit import Fit, improved, linearised, misfit
-from fdi.discovery.known import UNREPLAYED, effects_of, free_of
-from fdi.discovery.problem import Free, quiet, unknowns, whole
-from fdi.discovery.record import Record
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.search import Hypothesis, Search
-from fdi.discovery.settle import settled
+from fdi.estimation.final_rounds import settled
+from fdi.estimation.fit import Fit, improved, linearised, misfit
+from fdi.estimation.model_unknowns import UNREPLAYED, effects_of, free_of
+from fdi.estimation.problem import Free, quiet, unknowns, whole
+from fdi.trace.record import Record
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.lanes import ladder

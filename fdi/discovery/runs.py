@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.compare import best_reading
-from fdi.cycles import Cycles
-from fdi.discovery.record import SIGNALS, Record, record
-from fdi.repeats import Repeat, matching
-from fdi.trace import Trace
+from fdi.comparison.compare import best_reading
+from fdi.estimation.repeats import Repeat, matching
+from fdi.trace.cycles import Cycles
+from fdi.trace.record import SIGNALS, Record, record
+from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
 

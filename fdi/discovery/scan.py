@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.discovery.fit import Fit, misfit, weights
-from fdi.discovery.level import powers, scaled
-from fdi.discovery.problem import Free, Problem, ends, unknowns
+from fdi.estimation.fit import Fit, misfit, weights
+from fdi.estimation.problem import Free, Problem, ends, unknowns
+from fdi.estimation.unidentifiable import powers, scaled
 from plant.effects import CATALOGUE
 from plant.threads import mapped
 

@@ -8,14 +8,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery import noise as noises
-from fdi.discovery.fit import Fit, fit, improved, linearised, misfit
-from fdi.discovery.known import free_of
-from fdi.discovery.noise import Noise
-from fdi.discovery.problem import Free, Problem, quiet, whole
-from fdi.discovery.record import NOISE, Record
 from fdi.discovery.scan import Prospect, scan
-from fdi.discovery.settle import settled
+from fdi.estimation import noise as noises
+from fdi.estimation.final_rounds import settled
+from fdi.estimation.fit import Fit, fit, improved, linearised, misfit
+from fdi.estimation.model_unknowns import free_of
+from fdi.estimation.noise import Noise
+from fdi.estimation.problem import Free, Problem, quiet, whole
+from fdi.trace.record import NOISE, Record
 from plant.effects import CATALOGUE
 from plant.model import Model
 from plant.threads import R, T, mapped, threads

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.fit import fit
-from fdi.discovery.noise import Noise
-from fdi.discovery.problem import Problem
-from fdi.discovery.record import SIGNALS, Record, record
 from fdi.discovery.search import Hypothesis, Search
-from fdi.trace import Trace
+from fdi.estimation.fit import fit
+from fdi.estimation.noise import Noise
+from fdi.estimation.problem import Problem
+from fdi.trace.record import SIGNALS, Record, record
+from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 
 Floats = NDArray[np.float64]

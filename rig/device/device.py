@@ -11,7 +11,7 @@ from rig.device.nmt import Nmt, NmtState
 from rig.device.pdo import Pdos
 from rig.device.sdo import Abort, SdoAbort, SdoServer
 from rig.device.sync import SyncConsumer
-from rig.frame import Frame, Send
+from rig.network.frame import Frame, Send
 
 Handler = Callable[[Frame], None]
 _COMMUNICATING = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)  # states in which SDO, SYNC and EMCY exist

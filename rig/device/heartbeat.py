@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rig.frame import Frame, Send
+from rig.network.frame import Frame, Send
 
 COB_ID = 0x700  # + node
 _MS = 1_000_000  # ns

@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 
-from rig.frame import Frame
+from rig.network.frame import Frame
 
 
 class NmtState(IntEnum):

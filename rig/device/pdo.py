@@ -11,7 +11,7 @@ from plant.errors import InputError
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
-from rig.frame import Frame, Send
+from rig.network.frame import Frame, Send
 
 RPDO, TPDO = 0x1400, 0x1800  # communication parameters; the mapping is 0x200 further on
 _INVALID = 1 << 31  # in a PDO's COB-ID

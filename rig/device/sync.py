@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
-from rig.frame import Frame
+from rig.network.frame import Frame
 
 # 0x1006 says when a SYNC is due but not when it is lost. A late one is the bench's own business, it measures lateness;
 # a hundred missing in a row mean that the producer is gone.

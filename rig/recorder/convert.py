@@ -8,13 +8,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fdi.log import open_log
 from fdi.output import writable
-from fdi.trace import Trace
+from fdi.trace.mcap_log import open_log
+from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig import codec
 from rig.device.nmt import NmtState as State
-from rig.frame import Frame
+from rig.network import codec
+from rig.network.frame import Frame
 from rig.recorder.provenance import provenance
 from rig.recorder.schema import Event, NmtState, Record, Signals
 from rig.recorder.writer import Recorder

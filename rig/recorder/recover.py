@@ -14,8 +14,8 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 
-from fdi.log import scan
 from fdi.output import writable
+from fdi.trace.mcap_log import scan
 from plant.errors import InputError
 from rig.recorder.container import McapFile
 

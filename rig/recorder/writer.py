@@ -17,7 +17,7 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from plant.errors import RigError
-from rig.frame import Frame
+from rig.network.frame import Frame
 from rig.recorder.container import McapFile
 from rig.recorder.schema import (
     CHANNELS,

@@ -24,7 +24,7 @@ RIG = Path(sys.executable).with_name("rig")
 
 def bus_tests(out: Path) -> int:
     """Every test that takes a `bus_kind`, on socketcan; pytest's exit status."""
-    files = sorted(str(path) for path in TESTS.glob("test_*.py") if "bus_kind" in path.read_text())
+    files = sorted(str(path) for path in TESTS.rglob("test_*.py") if "bus_kind" in path.read_text())
     words = ["-m", "pytest", *files, "-k", "socketcan", f"--junitxml={out / 'bus.xml'}", "-p", "no:cacheprovider"]
     return subprocess.run([sys.executable, *words, f"--basetemp={out / 'tmp'}"], cwd=TESTS.parent).returncode
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTES
 from vcan import dissect
-from vcan.support import APT_LINE, FOLDER, REQUIRED, guest_missing, in_guest, kernel_has_vcan0
+from vcan_host import APT_LINE, FOLDER, REQUIRED, guest_missing, in_guest, kernel_has_vcan0
 
 CYCLIC = (0x080, 0x182, 0x183, 0x202, 0x283)
 HEARTBEATS = {0x701: "heartbeat of 1", 0x702: "heartbeat of 2", 0x703: "heartbeat of 3"}

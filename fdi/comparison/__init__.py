@@ -1,0 +1,1 @@
+"""Model against measurement: how large the error is, where, when, and in which block of the actuator."""

@@ -1,0 +1,266 @@
+"""Which block of the actuator disagrees, each held alone against measurements of what goes in and what comes out.
+
+servovalve  Cor -> XS: the replay from the current; the spool's part in it does not know the ram.
+jack        flow: XS and P12 -> speed of the ram (metering edges, leakage, area), against the sensed XJ;
+            force: P12 -> what the speed, its change and the load take (mass, drag, friction), in bar of P12.
+sensor      XJ as sensed against XJ as the flow adds it up.
+
+Flow and sensor meet in one residual, XJ sensed less XJ from the flow. What is wrong with the flow is an error of speed
+that depends on the opening and on P12, and adds up; what is wrong with the sensor is an error of position that depends
+on position, speed, pressure or the way it came, and does not. The residual goes to whichever describes it better; to
+both where they do equally well, as for a sensor's gain against the valve's flow gain.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.noise_floor import floors, from_data
+from fdi.estimation.repeats import aligned
+from fdi.estimation.replay import Columns, derivative, rms
+from fdi.trace.cycles import BRIDGED, Cycles, bridged
+from plant.forced import flow_balance, force_balance
+from plant.model import Model
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+SPAN = 0.02  # s; the flow is compared over the ram's way in it: longer adds up noise of XS, shorter shows that of XJ
+MEAN = 0.011  # s, over which the direction of motion is told
+SURE = 5.0  # standard deviations of the speed that tell a moving ram
+JERK = 4.0  # standard deviations, that accelerations over two and four samples may differ
+LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
+SATURATED = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
+PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
+TIE = 10.0  # twice the log likelihood, below which two descriptions are equally good
+NOISY = 1.3  # times the noise of the position from sample to sample
+FEWEST = 400  # rows in which the forces are known; fewer are the ends of steps, where speed is hardest to tell
+OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
+SPARSE = 0.2  # of the rows; where more are missing, accelerations are guesses
+FITS = 1.1  # floors, of a spool that is as the model says
+MATTERS = 0.1  # of the floor, squared: less in excess is not worth a question
+
+
+class Balance(NamedTuple):
+    """The jack's two residuals and what they were made of, columns (n,)."""
+
+    way: Floats  # m, XJ sensed less XJ from the flow, gained over SPAN; NaN where it cannot be told
+    force: Floats  # Pa, P12 less what the motion takes; NaN unless the ram surely moves, and without P12
+    gain: float  # by which the ram moves further than the flow says, as a fraction
+    speed: Floats  # m/s, from the flow
+    position: Floats  # m, as the flow adds it up
+
+
+class Split(NamedTuple):
+    """Flow against sensor: RMS of `way`, and how much of it each of them leaves unexplained, m."""
+
+    error: float
+    flow: float
+    sensor: float
+    both: float
+    winner: str  # "flow", "sensor", "either"
+
+
+def balance(c: Cycles, model: Model, replayed: Columns) -> Balance:
+    """Flow and force of the jack from measured XS and P12; an XS that was not measured is the replay's."""
+    chosen = {name: getattr(c, name) if name in c.signals else replayed[name] for name in ("p12", "xs")}
+    (p12, lost), (xs, missing) = (bridged(chosen[name], BRIDGED) for name in ("p12", "xs"))
+    xj = bridged(c.xj, BRIDGED)[0]
+    seen = derivative(xj, max(5, round(MEAN / c.period) | 1), 1) / c.period
+    bad = lost | missing | ~c.usable
+    if "p12" not in c.signals:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
+        error = _force(c, model, p12, xj, seen)
+        p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
+    bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
+    sensed, speed = flow_balance(model, xs, p12, float(xj[0]))
+    lag = span(c.period)
+    way = gained(c.xj - sensed, lag)
+    way[_any_within(bad, lag)] = np.nan
+    dx = gained(xj, lag)
+    there = ~np.isnan(way) & ~np.isnan(dx)
+    power = float(np.sum(dx[there] ** 2))
+    gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
+    # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
+    known = speed * (1 + max(-0.2, min(gain, 0.2))) if "xs" in c.signals else seen
+    force = _force(c, model, p12, xj, known) if "p12" in c.signals else np.full(len(c), np.nan)
+    force[bad] = np.nan
+    return Balance(way, force, gain, speed, sensed)
+
+
+def span(period: float) -> int:
+    """SPAN in rows."""
+    return max(1, round(SPAN / period))
+
+
+def gained(x: Floats, rows: int) -> Floats:
+    """x less what it was so many rows before; NaN at the start."""
+    out = np.full(len(x), np.nan)
+    out[rows:] = x[rows:] - x[:-rows]
+    return out
+
+
+def _any_within(bad: Flags, rows: int) -> Flags:
+    total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(bad)])
+    out: Flags = total[rows + 1:] > total[:-rows - 1]
+    return out
+
+
+def _force(c: Cycles, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
+    takes, _, dynamic = force_balance(model, xj, speed, p12, c.load)
+    size = max(1, round(MEAN / c.period)) | 1
+    kernel = np.ones(size) / size
+    mean = np.convolve(speed, kernel, "same")
+    noise = float(np.median(np.abs(np.diff(speed, 2)))) / 0.6745 / math.sqrt(6.0 * size)
+    seen = np.convolve(np.gradient(xj, c.period), kernel, "same")
+    direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
+    direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
+    turned = _any_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
+    turned |= np.roll(turned, -size) | ~_resolved(speed, c.period)
+    out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
+    return np.where((direction == 0.0) | turned, np.nan, out)
+
+
+def _resolved(speed: Floats, period: float) -> Flags:
+    """Where the change of speed is the same over two and over four samples: there is no jerk between them."""
+    near, wide = np.gradient(speed, period), np.zeros(len(speed))
+    wide[2:-2] = (speed[4:] - speed[:-4]) / (4 * period)
+    apart = np.abs(near - wide)
+    out: Flags = apart <= JERK * float(np.median(apart)) / 0.6745
+    return out
+
+
+def split(c: Cycles, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False) -> Split:
+    """How well an error of the flow and one of the sensor describe `b.way`; xs m, p12 Pa, (n,), as in the balance.
+
+    `noisy`: the sensed position changes from sample to sample by more than its noise, as no flow can make it.
+
+    The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
+    whose noise is in the residual itself.
+    """
+    lag, x = span(c.period), b.position
+    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * c.period for r in _rates(xs, p12)]
+    places = [x, b.speed, p12, *(play(x, width) for width in PLAYS)]
+    there = ~np.isnan(b.way)
+    columns = [gained(s, lag)[there] for s in (*rates, *places)]
+    error, (rate, place, gain, both) = _left(b.way[there], columns, len(rates))
+    effective = int(there.sum()) / lag
+
+    def worse(one: float, other: float) -> float:
+        """Twice the log likelihood by which `one` describes worse than `other`."""
+        return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
+
+    tie = worse(gain, both) < TIE + len(columns) or abs(worse(rate, place)) < TIE
+    winner = "either" if tie else "flow" if rate < place else "sensor"
+    return Split(error, rate, place, both, "sensor" if tie and noisy else winner)
+
+
+def _left(y: Floats, columns: list[Floats], first: int) -> tuple[float, tuple[float, float, float, float]]:
+    """RMS of y, and of what the `first` columns, the others, the first of the others, and all of them leave of it."""
+    z = np.column_stack([*columns, y])
+    size = np.sqrt((z**2).mean(axis=0))
+    z = z / np.where(size > 0.0, size, 1.0)
+    # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
+    gram = np.einsum("ki,kj->ij", z, z) / len(y)
+
+    def left(pick: slice) -> float:
+        inverse = np.linalg.pinv(gram[pick, pick], rcond=1e-9, hermitian=True)
+        part = gram[pick, -1]
+        return float(size[-1]) * math.sqrt(max(0.0, 1.0 - float(part @ inverse @ part)))
+
+    parts = slice(0, first), slice(first, -1), slice(first, first + 1), slice(0, -1)
+    return float(size[-1]), tuple(left(part) for part in parts)  # type: ignore[return-value]
+
+
+def _rates(xs: Floats, p12: Floats) -> list[Floats]:
+    """Errors of speed that a valve or a jack can make, as functions of opening and pressure, each of order one."""
+    x, p = xs / 1e-4, p12 / 1e6
+    edge, narrow, held = np.tanh(xs / 2e-5), np.tanh(xs / 5e-6), np.tanh(p / 0.3)
+    return [np.ones(len(x)), x, np.abs(x), p, np.abs(p), x * p, x * np.abs(x), np.abs(x) * p, x * x * p,
+            x * np.abs(p), x * p * p, edge, narrow, held, edge * np.abs(p)]
+
+
+def play(x: Floats, width: float) -> Floats:
+    """x behind a play of that width, m: the elementary hysteresis."""
+    out, held, half = [], float(x[0]), 0.5 * width
+    for value in x.tolist():
+        held = min(max(held, value - half), value + half)
+        out.append(held)
+    return np.array(out)
+
+
+def shares(found: Split, floor: float) -> tuple[float, float]:
+    """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains."""
+    whole = found.error / floor
+    if whole**2 - 1.0 < MATTERS:
+        return whole, whole
+    alone_flow = math.sqrt(1.0 + max(0.0, found.sensor**2 - found.both**2) / floor**2)
+    alone_sensor = math.sqrt(1.0 + max(0.0, found.flow**2 - found.both**2) / floor**2)
+    if found.winner == "either":
+        return whole, whole
+    return (whole, alone_sensor) if found.winner == "flow" else (alone_flow, whole)
+
+
+class Jack(NamedTuple):
+    """Ratios to their floors of the parts that flow and force decide."""
+
+    flow: float
+    force: float | None
+    sensor: float
+    gain: float  # by which the ram moves further than the flow says, as a fraction
+
+
+def jack(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Cycles, int, Columns]],
+         level: Mapping[str, float]) -> Jack | None:
+    """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
+
+    None if too few rows hang together.
+
+    The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
+    more, and what that changes is what noise does.
+    """
+    b = balance(c, model, run)
+    found = {"way": b.way, "force": b.force}
+    if repeats:
+        others = [(late, balance(other, model, theirs)) for other, late, theirs in repeats]
+        pairs = [aligned({"way": o.way, "force": o.force}, late, len(c)) for late, o in others]
+        floor = {name: f.value for name, f in floors(found, pairs, c.period).items()}
+    else:
+        again = balance(noisier(c, level), model, run)
+        floor = {"way": rms(again.way - b.way), "force": rms(again.force - b.force)}
+    floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
+    xs, p12 = (bridged(getattr(c, name) if name in c.signals else run[name], BRIDGED)[0] for name in ("xs", "p12"))
+    if (~np.isnan(b.way)).sum() < FEWEST or not floor.get("way", 0.0) > 0.0:
+        return None
+    noisy = from_data(c.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
+    flow, sensor = shares(split(c, b, xs, p12, floor["way"], noisy), floor["way"])
+    flow = flow if "xs" in c.signals else max(flow, sensor)
+    told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and c.filled.mean() < SPARSE
+    return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
+
+
+def noisier(c: Cycles, level: Mapping[str, float]) -> Cycles:
+    """The trace with noise of each signal's level added, always the same."""
+    rng = np.random.default_rng(0)
+    return replace(c, **{name: getattr(c, name) + size * rng.standard_normal(len(c)) for name, size in level.items()})
+
+
+def ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
+           controller: float | None, spool: bool = True) -> dict[str, float | None]:
+    """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
+
+    Where the spool is as the model says, an error of P12 in the replay is the jack's too: it sees standstill and
+    reversals, which the balance of forces leaves out. Without a measured spool the servovalve is judged with its
+    metering edges, as current to flow, and the jack by its forces alone; a sensor cannot be told from a valve then.
+    """
+    if not spool:
+        return {"controller": controller, "servovalve": flow, "jack": force, "sensor": None}
+    parts = [x for x in (flow, force) if x is not None]
+    if parts and "p12" in signal and signal.get("xs", math.inf) < FITS:
+        parts.append(signal["p12"])
+    return {"controller": controller, "servovalve": signal.get("xs"), "jack": max(parts) if parts else None,
+            "sensor": sensor}

@@ -1,0 +1,257 @@
+"""Model against measurement: how large the error is beside what noise explains, where, when, and in which block."""
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.comparison import blocks, controller_block
+from fdi.comparison.localisation import Motion, Place, condition, motion, places, whole
+from fdi.comparison.residual_tests import Diagnosis, diagnose
+from fdi.estimation.noise_floor import Floor, floors, from_data
+from fdi.estimation.repeats import Repeat, aligned, matching
+from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, open_loop, read_noise, residuals, rms
+from fdi.estimation.tolerances import Scatter, scatter
+from fdi.trace.cycles import Cycles, readings
+from fdi.trace.trace import Trace
+from plant.model import Model
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+UNITS = {"xj": "m", "p12": "Pa", "xs": "m"}
+NOISE = {"xj": "sensors.position_noise", "p12": "sensors.pressure_noise", "xs": "sensors.spool_noise"}
+FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
+LIMIT = 1.1  # floors, and three standard deviations of what is estimated from so many samples
+SECTION = 5.0  # standard deviations, that a single section may be above the floor: there are dozens
+BLOCK = 1.3  # floors, of a single block
+BOUNDED = 3.0  # floors, from which on an error is one even if the floor is a lower bound
+TOO_COARSE = 0.5  # of the floor: a solver's error as large as that leaves nothing to judge
+UNDECIDED = 0.4  # of all rows, that may hang on a knife's edge and be left out
+LAGGED = 0.5  # of the misfit, that moving the current by some cycles must leave for the columns to be out of step
+UNLIKE = 1.5  # floors, by which residuals of repeats may differ before that is told
+BALANCED = "eha"  # the plant whose metering edges and ram the balances of `plant.forced` are
+STAGES = 7
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One signal's error, SI units."""
+
+    name: str
+    unit: str
+    error: float  # RMS of the replay from measured inputs; XJ: drawn to the measured position at 20 1/s
+    floor: Floor
+    closed_loop_error: float  # RMS of the replay from the command alone
+    solver_error: float
+    limit: float  # the ratio up to which the error is noise
+
+    @property
+    def ratio(self) -> float:
+        """Error over floor; 1 for a perfect model."""
+        return self.error / self.floor.value if self.floor.value > 0.0 else math.inf if self.error else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A model held against a trace; what `rig compare` tells."""
+
+    source: str
+    model: Model
+    cycles: Cycles
+    verdict: str  # WITHIN_FLOOR, MODEL_INCOMPLETE, CANNOT_TELL
+    reason: str  # why it cannot tell, or ""
+    signals: Mapping[str, Signal]
+    answer: controller_block.Answer
+    blocks: Mapping[str, float | None]
+    parts: Mapping[str, float | None]  # the jack's: "flow", "force"; and "gain", its speed over the model's less 1
+    named: tuple[str, ...]  # blocks that disagree, the worst first
+    where: tuple[Place, ...]
+    condition: str  # of the whole trace
+    free_error: float  # m, RMS of XJ in a replay without anchor
+    drift: float  # m/s, at which that replay departs
+    scatter: Scatter | None  # None: nothing to explain
+    diagnoses: Mapping[str, Diagnosis]
+    replay: Replay
+    motion: Motion
+    closed: Columns  # residuals of the replay from the command alone, (n,)
+    repeats: int
+    notes: tuple[str, ...]
+
+
+def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: Sequence[str] | None = None,
+            progress: Progress = lambda what, done, total: None, source: str = "trace") -> Comparison:
+    """Replay a trace and judge what is left.
+
+    Raises:
+        InputError: a trace, a repeat or a signal that cannot be used, in one line.
+    """
+    progress("reading", 0, STAGES)
+    c, model = best_reading(trace, model, signals, source)
+    c, found = _in_step(c, model, controller_block.controller(c, model))
+    others = [matching(c, other, model, number) for number, other in enumerate(repeats, 1)]
+    progress("solver", 1, STAGES)
+    noise = sensors(c, model)
+    replay = checked(c, model, {name: f.value for name, f in noise.items()})
+    progress("repeats", 2, STAGES)
+    runs = [(other, open_loop(other.cycles, model, replay.steps)) for other in others]
+    theirs = [aligned(residuals(other.cycles, run), other.late, len(c)) for other, run in runs]
+    floor = _blinder(noise, replay) | floors(replay.residual, theirs, c.period)
+    judged = {name: np.where(_left_out(replay), np.nan, r) for name, r in replay.residual.items()}
+    progress("closed loop", 3, STAGES)
+    closed, (free, speed) = closed_loop(c, model), drift(c, model)
+    table = {name: _signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
+    progress("blocks", 4, STAGES)
+    ratios, parts = _blocks(c, model, replay.model, runs, table, found, noise)
+    progress("where", 5, STAGES)
+    m, z2 = motion(c, replay.model), whole(judged, {name: f.value for name, f in floor.items()})
+    sections, when = places(c, z2, m, found.limit), condition(z2, m, found.limit)
+    verdict, reason = _verdict(table, sections, ratios, replay, c.period)
+    diagnoses = diagnose(c, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
+                                     for name, r in (theirs[0] if theirs else {}).items()}, m)
+    progress("tolerances", 6, STAGES)
+    plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
+    scattered = scatter(c, model, {name: s.floor.value for name, s in table.items()}) if plant else None
+    progress("done", STAGES, STAGES)
+    return Comparison(source, model, c, verdict, reason, table, found, ratios, parts, _named(ratios), tuple(sections),
+                      when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
+                      (*c.notes, *_notes(floor, replay, c)))
+
+
+def sensors(c: Cycles, model: Model) -> dict[str, Floor]:
+    """The floor without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
+    out = {}
+    for name in c.signals:
+        given, seen = model[NOISE[name]], from_data(c.measured(name))
+        given = read_noise(model, c.xj) if name == "xj" else given
+        found = Floor(given, "model") if given > 0.0 and seen.value < BLOCK * given else seen
+        out[name] = found._replace(value=max(found.value, FINEST[name]))
+    return out
+
+
+def _blinder(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
+    """The floor with what a current that was not recorded leaves open."""
+    return {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
+
+
+def _left_out(replay: Replay) -> NDArray[np.bool_]:
+    """Rows that hang on a knife's edge, unless that is half the trace."""
+    out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED)
+    return out
+
+
+def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> Signal:
+    limit = LIMIT + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
+    return Signal(name, UNITS[name], rms(residual), floor, rms(closed), replay.solver_error[name], limit)
+
+
+def _spread(floor: Floor, samples: int) -> float:
+    """Standard deviation of a ratio of two RMS values of so many samples each."""
+    return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
+
+
+def best_reading(trace: Trace, model: Model, signals: Sequence[str] | None, source: str) -> tuple[Cycles, Model]:
+    """Of several ways to read the rows, the one that the model's replay fits best, and the model at its cycle."""
+    best: tuple[float, Cycles, Model] | None = None
+    ways = readings(trace, model, signals, source)
+    for c in ways:
+        own = model if c.period == model["controller.period"] else model.replace({"controller.period": c.period})
+        misfit = 0.0 if len(ways) == 1 else _misfit(c, own)
+        if best is None or misfit < best[0]:
+            best = (misfit, c, own)
+    assert best is not None
+    return best[1], best[2]
+
+
+def _misfit(c: Cycles, model: Model) -> float:
+    left = residuals(c, open_loop(c, model, 20))
+    return sum(math.log(rms(r)) for r in left.values()) / len(left)
+
+
+def _in_step(c: Cycles, model: Model, found: controller_block.Answer) -> tuple[Cycles, controller_block.Answer]:
+    """Columns that are cycles late in the file, set right; a firmware that answers late stays as it is."""
+    com, xj = found.com_lag, found.xj_lag
+    notes = []
+    if xj:
+        moved = c.shifted(cor=-xj)
+        if _misfit(moved, model) < _misfit(c, model) + math.log(LAGGED):
+            c, com = moved, com - xj
+            notes.append(f"Cor stands {_cycles(xj)} than the other columns: moved into step")
+        else:
+            notes.append(f"Cor fits the XJ {_cycles(-xj)}: the firmware answers late, or XJ is delayed on its way")
+    if com:
+        c = c.shifted(com=com)
+        notes.append(f"Com stands {_cycles(-com)} than the rest of the trace: moved into step")
+    return c.noted(*notes), found
+
+
+def _cycles(n: int) -> str:
+    return f"{abs(n)} cycle{'s' if abs(n) > 1 else ''} {'later' if n > 0 else 'earlier'}"
+
+
+def _blocks(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+            table: Mapping[str, Signal], found: controller_block.Answer,
+            noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Ratios of the blocks, and the parts of the jack's."""
+    signal = {name: s.ratio for name, s in table.items()}
+    pairs = [(other.cycles, other.late, theirs) for other, theirs in repeats]
+    level = {"xj": read_noise(model, c.xj)} | {name: f.value for name, f in noise.items()}
+    told = model.plant == BALANCED and {"p12", "xs"} & set(c.signals)
+    j = blocks.jack(c, model, run, pairs, level) if told else None
+    answered = found.ratio if model.kind.controller else None
+    if j is None:
+        return blocks.ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
+    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in c.signals)
+    return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
+
+
+def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
+    def limit(name: str) -> float:
+        return controller_block.DISAGREES if name == "controller" else BLOCK
+
+    over = [(ratio, name) for name, ratio in ratios.items() if ratio is not None and ratio > limit(name)]
+    return tuple(name for _, name in sorted(over, reverse=True))
+
+
+def _verdict(table: Mapping[str, Signal], sections: Sequence[Place], ratios: Mapping[str, float | None],
+             replay: Replay, period: float) -> tuple[str, str]:
+    """The verdict, and why it cannot tell."""
+    coarse = [s.name for s in table.values() if s.solver_error > TOO_COARSE * s.floor.value]
+    if coarse:
+        return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
+    above = [s for s in table.values() if s.ratio > s.limit]
+    least = min((s.floor.freedom for s in table.values()), default=1.0)
+    local = [p for p in sections
+             if p.ratio > LIMIT + SECTION / math.sqrt(max(1.0, 2 * least * (p.t1 - p.t0) / period))]
+    if not (above or local or _named(ratios)):
+        return "WITHIN_FLOOR", ""
+    edgy = float(replay.undecided.mean())
+    doubt = "without a repeat the floor is only a lower bound, and the error is not far above it" \
+        if any(s.floor.lower_bound for s in table.values()) else \
+        f"{100 * edgy:.0f} % of the trace {_hangs(replay)}" if edgy > UNDECIDED else ""
+    sure = any(s.ratio > (BOUNDED if edgy > UNDECIDED or s.floor.lower_bound else 0.0) for s in above)
+    if doubt and not sure and (ratios["controller"] or 0.0) <= controller_block.DISAGREES:
+        return "CANNOT_TELL", doubt
+    return "MODEL_INCOMPLETE", ""
+
+
+def _notes(floor: Mapping[str, Floor], replay: Replay, c: Cycles) -> list[str]:
+    """What a reader must know about the floor and about rows left out."""
+    said = []
+    apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
+             if f.source == "repeats" and f.difference > UNLIKE * f.value]
+    if apart:
+        said.append(f"the error itself differs between the repeats, as stick-slip does, in floors: {', '.join(apart)}")
+    if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED:
+        seconds = float(replay.undecided.sum()) * c.period
+        said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_hangs(replay)}")
+    return said
+
+
+def _hangs(replay: Replay) -> str:
+    guessed = " or on current that was not recorded" if any(replay.blind.values()) else ""
+    return f"hangs there on less than 0.1 % of a friction level{guessed}"
+

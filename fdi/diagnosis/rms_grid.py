@@ -1,0 +1,188 @@
+"""The RMS grid: the monitor run for every pair of fault sizes, held against the measured ram (the paper's Figs. 13-15).
+
+One map is of the step sections, one of the ramp sections, one of both. The monitor is driven by the measured current
+and its ram drawn to the measured one at ANCHOR; an offset does not count. In closed loop, as in the paper, the maps of
+this plant have no use: with spool friction the loop limit-cycles, two runs differ in phase, and a monitor that does not
+oscillate at all is nearer to the trace than the right one (`drive="command"` shows it).
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.diagnosis.faults import CLOGGING, FRICTION
+from fdi.estimation.replay import ANCHOR, known_start
+from fdi.trace.cycles import Cycles, readings
+from fdi.trace.sections import Section, sections
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from plant.model import Model
+from plant.monitor import Monitor
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+KINTAS = np.linspace(0.0, 0.5, 21)
+FSS = np.linspace(0.0, 90.0, 21)  # N
+SLIDING = (2.0 / 3.0, 1.0, 1.0 / 3.0, 1.0 / 15.0)  # FDS/FSS, as the plant has it and as it may be
+DRIVES = ("current", "command")
+BETWEEN = np.linspace(-1.0, 1.0, 13)  # cells along FSS, around the best of each Kintas
+# corners of the unit square (Kintas, FSS N): MidBand in its middle, MaxBand at its right and upper edge
+LEFT = 2.0 * CLOGGING.middle - CLOGGING.most, 2.0 * FRICTION.middle - FRICTION.most
+RIGHT = CLOGGING.most, FRICTION.most
+
+
+class Point(NamedTuple):
+    """A pair of fault sizes, and what it leaves."""
+
+    kintas: float
+    fss: float  # N
+    rms: float  # m
+
+
+class Map(NamedTuple):
+    """RMS of XJ, measured less monitor, about its mean, over the sections of one kind, at each cell."""
+
+    rms: Floats  # (kintas, fss), m
+    minimum: Point
+
+
+class Merged(NamedTuple):
+    """The centre of gravity of the minima A (steps) and B (ramps)."""
+
+    kintas: float
+    fss: float  # N
+    weight: float  # of A; B has the rest
+    distance: float  # from the first bisector, -1 at the left edge, 1 at the right
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The maps and what they say; a map is None where the command has no such section."""
+
+    kintas: Floats  # the axes
+    fss: Floats  # N
+    step: Map | None
+    ramp: Map | None
+    joint: Map
+    merged: Merged
+    best: Point  # between the cells: the joint map is a valley narrower than they are
+    sliding: float  # FDS/FSS of the spool, at which the grid fits best
+    drive: str
+    simulations: int
+
+
+def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats = KINTAS, fss: Floats = FSS,
+           drive: str = "current", sliding: tuple[float, ...] = SLIDING) -> Grid:
+    """The RMS maps of a trace over all pairs of `kintas` (k,) and `fss` (f,) N.
+
+    Args:
+        measured: a trace, or its cycles; the command must have steps or ramps.
+        model: what is not a fault; nominal by default.
+        drive: the monitor is run by the measured "current", or by the "command" in closed loop.
+        sliding: FDS/FSS of the spool to try; the grid is that of the best.
+
+    Raises:
+        InputError: a trace that cannot be replayed, a command with neither steps nor ramps, or an unknown drive.
+    """
+    model = Model() if model is None else model
+    c = measured if isinstance(measured, Cycles) else readings(measured, model)[0]
+    if drive not in DRIVES:
+        raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
+    parts = sections(c.com, c.period)
+    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _rows(c, parts, kind)).any()}
+    if not rows:
+        raise InputError("trace", "com", "steps or ramps, for the RMS grid")
+    values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
+    tried = {ratio: _rms(c, model, values, drive, ratio, rows) for ratio in sliding}
+    joint = {ratio: _joint(maps, rows) for ratio, maps in tried.items()}
+    ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
+    step, ramp = (_map(tried[ratio][kind], kintas, fss) if kind in rows else None for kind in ("step", "ramp"))
+    both = _map(joint[ratio], kintas, fss)
+    near = _valley(both, kintas, fss)
+    finer = _joint(_rms(c, model, near, drive, ratio, rows), rows)
+    deepest = int(finer.argmin())
+    best = Point(float(near[deepest, 0]), float(near[deepest, 1]), float(finer[deepest]))
+    return Grid(kintas, fss, step, ramp, both, merge(step, ramp), best, ratio, drive,
+                len(values) * len(sliding) + len(near))
+
+
+def _valley(joint: Map, kintas: Floats, fss: Floats) -> Floats:
+    """Pairs (m, 2) along the floor of a map's valley, closer along FSS than its cells.
+
+    What counts is friction over pilot pressure, so the valley runs across the grid, and which of its cells is deepest
+    says first of all which of them happens to lie on the floor.
+    """
+    apart = float(fss[1] - fss[0]) if len(fss) > 1 else 0.0
+    floor = fss[joint.rms.argmin(axis=1)]
+    across = np.maximum(floor[:, None] + apart * BETWEEN, 0.0)
+    return np.column_stack([np.repeat(kintas, len(BETWEEN)), across.reshape(-1)])
+
+
+def _rows(c: Cycles, parts: list[Section], kind: str) -> Flags:
+    """Measured rows of the sections of a kind."""
+    chosen = np.zeros(len(c), bool)
+    for s in parts:
+        chosen[s.start:s.stop] |= s.kind == kind
+    return chosen & ~np.isnan(c.measured("xj"))
+
+
+def _rms(c: Cycles, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]
+         ) -> dict[str, Floats]:
+    """RMS of XJ, measured less monitor, about its mean, by kind of section; (m,) m each."""
+    def reduced(runs: Floats) -> Floats:
+        found = []
+        for chosen in rows.values():
+            left = runs[:, 0].T[chosen] - c.xj[chosen, None]
+            left -= left.mean(axis=0)  # a load, a null bias: against the pull to the measured ram they end as an offset
+            found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
+        return np.stack(found, -1)
+
+    monitor = Monitor(model, sliding=sliding)
+    if drive == "command":
+        out = monitor.closed_loop(values, c.com, float(c.xj[0]) if known_start(c) else 0.0, reduced=reduced)
+    else:
+        out = monitor.replay(values, c.cor, c.xj if known_start(c) else None, ANCHOR, reduced=reduced)
+    return dict(zip(rows, out.T, strict=True))
+
+
+def _joint(maps: dict[str, Floats], rows: dict[str, Flags]) -> Floats:
+    """RMS over the rows of both kinds, (m,) m."""
+    counts = {kind: float(rows[kind].sum()) for kind in maps}
+    joint: Floats = np.sqrt(sum(counts[kind] * maps[kind] ** 2 for kind in maps) / sum(counts.values()))
+    return joint
+
+
+def _map(rms: Floats, kintas: Floats, fss: Floats) -> Map:
+    table = rms.reshape(len(kintas), len(fss))
+    i, j = np.unravel_index(int(table.argmin()), table.shape)
+    return Map(table, Point(float(kintas[i]), float(fss[j]), float(table[i, j])))
+
+
+def merge(step: Map | None, ramp: Map | None) -> Merged:
+    """A and B by the rule of the paper: how far their middle is from the first bisector says how much A counts.
+
+    In the unit square, Kintas from 0.15 to 0.35 and FSS over the same share of its own limits: MidBand is the middle,
+    MaxBand the right and upper edge. The distance is measured along Kintas, from the bisector to the edge: at the right
+    edge the steps count fully, at the left edge the ramps, on the bisector both alike. Without one, the other counts.
+    """
+    points = [m.minimum for m in (step, ramp) if m is not None]
+    if len(points) < 2:
+        only, weight = points[0], float(step is not None)
+        return Merged(only.kintas, only.fss, weight, 2.0 * weight - 1.0)
+    a, b = points
+    distance = bisector(0.5 * (a.kintas + b.kintas), 0.5 * (a.fss + b.fss))
+    weight = 0.5 * (1.0 + distance)
+    return Merged(weight * a.kintas + (1.0 - weight) * b.kintas, weight * a.fss + (1.0 - weight) * b.fss, weight,
+                  distance)
+
+
+def bisector(kintas: float, fss: float) -> float:
+    """Signed distance along Kintas from the first bisector of the unit square, over that of the edge: -1 .. 1."""
+    x, y = (min(max((size - low) / (high - low), 0.0), 1.0)
+            for size, low, high in zip((kintas, fss), LEFT, RIGHT, strict=True))
+    room = 1.0 - y if x > y else y
+    return (x - y) / room if x != y else 0.0

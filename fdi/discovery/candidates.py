@@ -1,0 +1,267 @@
+"""What an explanation says, effect by effect, as people and programs read it (interface.md, 4)."""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi.discovery.explain import BETTER, HELD_OUT, Explanation, gain
+from fdi.discovery.fingerprints import Fingerprint, resolution
+from fdi.discovery.search import REACHED, Hypothesis
+from fdi.discovery.significance import p_value, smallest_visible
+from fdi.estimation.fit import Fit
+from fdi.estimation.model_unknowns import UNREPLAYED
+from fdi.report.numbers import SHOWN
+from plant.effects import CATALOGUE
+from plant.model import Model, meaning, offered
+
+NORMAL = 1.96  # standard deviations on either side that hold 95 %
+ROUGH = 1.6  # true standard deviation over that at the end of a fit, which ends in one of the dents of a rough valley
+SYSTEMATIC = 0.01  # of an effect's size, standard deviation: what the solver's step and unfitted parameters are worth
+"""Both measured on cases of another simulator with 1.5 % scatter: without them one interval in four missed."""
+FAR = 3.0  # tolerances that a parameter may be off before it is suspicious
+LEAST = 1e-300
+
+
+class Value(NamedTuple):
+    """A parameter with its 95 % interval, SI."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+class Candidate(NamedTuple):
+    """An effect as part of an explanation, the one it does best in."""
+
+    effect: str
+    beside: tuple[str, ...]  # what else is in that explanation
+    parameters: dict[str, Value]
+    error: dict[str, float]  # RMS that the explanation leaves of each signal
+    holdout: dict[str, float]
+    ratios: dict[str, float]  # what is left and repeats over the floor, 1 = noise alone
+    evidence: float  # gain in log likelihood, less the charge
+    p_value: float
+    word: str
+
+    @property
+    def ratio(self) -> float:
+        """That of the signal that is explained worst."""
+        return max(self.ratios.values(), default=math.inf)
+
+
+class Blind(NamedTuple):
+    """The smallest size of an effect that this test shows; infinite where none that was tried does."""
+
+    effect: str
+    parameter: str
+    smallest: float  # distance from the off value
+    usual: float  # the largest that is usual
+    unit: str
+
+
+class Suspicious(NamedTuple):
+    """A parameter of the reference model further off than a healthy unit has it."""
+
+    parameter: str
+    value: float
+    unit: str
+    tolerances: float
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """All that is told of an explanation. `baseline` holds error, holdout and floor of each signal, SI."""
+
+    explanation: Explanation
+    candidates: tuple[Candidate, ...]
+    baseline: Mapping[str, Mapping[str, float]]
+    blind: tuple[Blind, ...]
+    noiseless: tuple[str, ...]  # effects that leave their mark without noise, of whatever size
+    suspicious: tuple[Suspicious, ...]
+    ledger: tuple[tuple[str | None, Mapping[str, float], Mapping[str, float]], ...]  # effect, error, holdout
+    pattern: str = ""
+    separate: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """As interface.md has it."""
+        return self.explanation.verdict
+
+    @property
+    def best(self) -> Hypothesis:
+        """The explanation that is told: the best one, or none at all."""
+        e = self.explanation
+        return e.ledger[-1] if len(e.ledger) > 1 else e.base
+
+    @property
+    def explanations(self) -> tuple[Candidate, ...]:
+        """The candidates, each set of effects once, with the parameters of all its effects that are candidates."""
+        found: dict[frozenset[str], Candidate] = {}
+        for c in self.candidates:
+            effects = frozenset((*c.beside, c.effect))
+            first = found.get(effects, c)
+            found[effects] = first._replace(parameters={**first.parameters, **c.parameters})
+        return tuple(found.values())
+
+
+def told(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None) -> Answer:
+    """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
+    hand = _firmware(e)
+    baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
+    if hand:
+        unit = resolution(e.search.problem.model)
+        baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
+    best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
+    model = e.search.problem.model
+    blind = tuple(_blind(name, size, model) for name, size in smallest_visible(e.blind).items())
+    noiseless = tuple(c.name for c in offered(model.plant) if c.port in UNREPLAYED and c.fitted)
+    return Answer(e, tuple(_candidates(e, seed)), baseline, blind, noiseless, tuple(suspicious(best, model.plant)),
+                  tuple(_ledger(e, hand)), pattern, separate or {})
+
+
+def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
+    """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
+    found = {}
+    values, entry = friction_sorted(fit.values), CATALOGUE[effect]
+    for f in fit.free:
+        if f.name in entry.fitted:
+            value = values[f.name]
+            size = abs(value - entry.off.get(f.name, model.kind.nominal.get(f.name, 0.0)))
+            half = NORMAL * math.hypot(ROUGH * fit.spread(f.name), SYSTEMATIC * size)
+            found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
+                                  entry.parameters[f.name].unit)
+    for name, v in found.items():  # dynamic friction is not above static friction, nor is its interval
+        static = found.get(name.replace("dynamic", "static"), v)
+        found[name] = v._replace(high=max(min(v.high, static.high), v.value))
+    return found
+
+
+def friction_sorted(values: Mapping[str, float]) -> dict[str, float]:
+    """Values in which no dynamic friction is above the static one, as replays take them."""
+    out = dict(values)
+    for body in ("spool", "jack"):
+        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
+        if static in out and dynamic in out:
+            out[dynamic] = min(out[static], out[dynamic])
+    return out
+
+
+def suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
+    """Parameters that are more than `FAR` tolerances from where a healthy unit has them."""
+    return [Suspicious(f.name, f.value(float(x)), meaning(f.name, plant=plant).unit, float(x))
+            for f, x in zip(fit.free, fit.x, strict=True) if np.isfinite(f.prior) and abs(x) > FAR * f.prior]
+
+
+def _candidates(e: Explanation, seed: int) -> list[Candidate]:
+    """Each effect once, in the order of the explanations it is part of."""
+    found = {p.effect: _printed(e, p) for p in e.prints}
+    for rank, h in enumerate(e.ranked):
+        for effect in h.effects if rank == 0 else h.effects[-1:]:
+            if effect not in found:
+                found[effect] = _candidate(e, h, effect, seed)
+    return list(found.values())
+
+
+def _candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
+    won, extra = gain(e.base, h), _unknown(h.fit) - _unknown(e.base.fit)
+    samples = sum(int(np.isfinite(r.measured).sum()) for r in (e.search.problem.record, *e.search.problem.also))
+    charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
+    values = fitted(effect, h.fit, e.search.problem.model)
+    return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
+                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * won - charge,
+                     p_value(e.blind, won, max(extra, 1), seed), _word(e, h, effect))
+
+
+def _unknown(fit: Fit) -> int:
+    """How many parameters of which nothing was known."""
+    return sum(not np.isfinite(f.prior) for f in fit.free)
+
+
+def _word(e: Explanation, h: Hypothesis, effect: str) -> str:
+    """What to think of an effect, in a word or two."""
+    words = {"EXPLAINED": "explains", "AMBIGUOUS": "equal", "PARTLY": "part", "NOT_RESOLVABLE": "too small to be sure"}
+    if effect in e.effects and e.verdict in words:
+        return words[e.verdict]
+    worst, before = max(h.ratio.values()), max(e.base.ratio.values())
+    if worst <= REACHED and not e.base.reached:
+        held = e.holdout.get(h.effects, {})
+        fails = any(error > HELD_OUT * e.floor[s] for s, error in held.items())
+        return "fails on the held-out run" if fails else "less likely"
+    return "part" if worst - 1.0 < BETTER * (before - 1.0) and not e.base.reached else "no"
+
+
+def _firmware(e: Explanation) -> list[Fingerprint]:
+    return [p for p in e.prints if CATALOGUE[p.effect].firmware]
+
+
+def _printed(e: Explanation, p: Fingerprint) -> Candidate:
+    """An effect that was found by a mark without noise."""
+    values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
+    error, ratios = dict(e.base.errors), dict(e.base.ratio)
+    if CATALOGUE[p.effect].firmware:
+        error["cor"] = p.after * resolution(e.search.problem.model)
+        ratios = {"cor": p.after}
+    n = len(e.search.problem.record)
+    won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
+    evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
+    return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
+                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), LEAST),
+                     "explains" if p.effect in e.effects else "no")
+
+
+def _blind(name: str, size: float, model: Model) -> Blind:
+    entry = CATALOGUE[name]
+    first = entry.fitted[0]
+    off = entry.off.get(first, model.kind.nominal.get(first, 0.0))
+    return Blind(name, first, size, max(abs(s[first] - off) for s in entry.starts), entry.parameters[first].unit)
+
+
+def _ledger(e: Explanation, hand: Sequence[Fingerprint]
+            ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
+    unit = resolution(e.search.problem.model)
+    cor = {"cor": e.controller * unit} if hand else {}
+    rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
+        (None, e.base.errors | cor, e.holdout.get((), {}))]
+    for p in e.prints:
+        if p.effect in e.effects:
+            cor = {"cor": p.after * unit} if p in hand else cor
+            rows.append((p.effect, e.base.errors | cor, e.holdout.get((), {})))
+    return rows + [(h.effects[-1], h.errors | cor, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]
+
+
+def to_json(a: Answer) -> dict[str, Any]:
+    """`rig explain --json`; a number that is not there is null."""
+    e = a.explanation
+    several = len(e.effects) > 1 and e.verdict != "AMBIGUOUS"
+    found: dict[str, Any] = {
+        "verdict": e.verdict, "effects": list(e.effects), "candidates": [_row(c) for c in a.candidates],
+        "baseline": {**a.baseline, "ratio": e.base.ratio},
+        "blind_to": [{"effect": b.effect, "parameter": b.parameter, "smallest_visible": b.smallest, "unit": b.unit,
+                      "usual": b.usual} for b in a.blind],
+        "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
+        "separate": dict(a.separate), "pattern": a.pattern,
+        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SHOWN[s] for s in e.floor}}
+    if several:
+        found["ledger"] = [{"effect": effect, "error": error, "holdout": held} for effect, error, held in a.ledger]
+    return dict(plain(found))
+
+
+def _row(c: Candidate) -> dict[str, Any]:
+    row = c._asdict() | {"parameters": {name: v._asdict() for name, v in c.parameters.items()}, "ratio": c.ratio}
+    return row | {"with": list(row.pop("beside"))}
+
+
+def plain(x: Any) -> Any:
+    """As JSON has it: dicts, lists, and null for a number that is none."""
+    if isinstance(x, Mapping):
+        return {key: plain(value) for key, value in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [plain(value) for value in x]
+    if isinstance(x, (float, np.floating)):
+        return float(x) if math.isfinite(x) else None
+    return x

@@ -1,0 +1,84 @@
+"""How easily noise alone looks like an effect, and how large an effect must be to be seen."""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from fdi.estimation.fit import Fit
+from fdi.estimation.problem import Problem
+from plant.effects import CATALOGUE
+
+Floats = NDArray[np.float64]
+
+DRAWS = 4000  # simulated runs in which nothing is missing
+SEEN = 30.0  # gain in -2 log likelihood with which an effect is seen: the charge for the candidates and ten more
+THINNED = 3
+
+
+class Sensitivity(NamedTuple):
+    """What effects would change, beyond what the fit's own unknowns can make up for."""
+
+    names: tuple[str, ...]  # the effect of each direction
+    sizes: tuple[float, ...]  # of its first fitted parameter, as distance from the off value
+    gains: Floats  # (d,) squared length of each direction, whitened
+    gram: Floats  # (d, d) cosines between directions
+
+
+def sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
+    """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
+    usual = problem.model.kind.nominal
+    starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
+    names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
+    held = [fit.values.get(n, problem.model.values[n]) for n in names]
+    rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
+    white = np.concatenate([problem.whitened(problem.left(problem.predict(names, part)))
+                            for part in np.array_split(rows, -(-len(rows) // 64))])
+    thin = (white[1:] - white[0])[:, :, ::THINNED].reshape(len(starts), -1) * np.sqrt(THINNED)
+    own = fit.jacobian[:, :, ::THINNED].reshape(len(fit.x), -1) * np.sqrt(THINNED)
+    prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
+    left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
+    gains = np.einsum("ij,ij->i", left, left)
+    length = np.sqrt(np.maximum(gains, 1e-300))
+    sizes = tuple(abs(s[CATALOGUE[e].fitted[0]] - CATALOGUE[e].off.get(CATALOGUE[e].fitted[0],
+                                                                       usual.get(CATALOGUE[e].fitted[0], 0.0)))
+                  for e, s in starts)
+    return Sensitivity(tuple(e for e, _ in starts), sizes, gains, (left @ left.T) / np.outer(length, length))
+
+
+def p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:
+    """Chance that the best of all effects gains as much where nothing is missing.
+
+    Runs without any effect are simulated in the space of the effects' directions, where their noise is normal with the
+    directions' cosines as covariance; an effect with a bound at its off value gains only on its own side. Beyond the
+    reach of the draws, the bound of Bonferroni.
+    """
+    rng = np.random.default_rng(seed)
+    weight, vectors = np.linalg.eigh(s.gram)
+    draws = rng.standard_normal((DRAWS, len(weight))) @ (vectors * np.sqrt(np.maximum(weight, 0.0))).T
+    best = (np.maximum(draws, 0.0) ** 2).max(axis=1)
+    simulated = float(np.mean(best >= gain))
+    bound = len(set(s.names)) * float(chdtrc(parameters, max(gain, 0.0)))
+    return simulated if simulated > 10.0 / DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / DRAWS))
+
+
+def smallest_visible(s: Sensitivity, seen: float = SEEN) -> Mapping[str, float]:
+    """Size of each effect's first parameter, from its off value, at which it would be seen; inf: at none tried.
+
+    Between the sizes tried, log gain is linear in log size; below the smallest, the gain falls with its square.
+    """
+    found: dict[str, float] = {}
+    for name in dict.fromkeys(s.names):
+        pairs = sorted((size, gain) for e, size, gain in zip(s.names, s.sizes, s.gains, strict=True) if e == name)
+        visible = np.inf
+        for (a, ga), (b, gb) in pairwise(pairs):
+            if ga < seen <= gb and b > a:
+                visible = min(visible, a * (b / a) ** (np.log(seen / max(ga, 1e-12)) / np.log(gb / max(ga, 1e-12))))
+        if pairs[0][1] >= seen:
+            visible = min(visible, pairs[0][0] * np.sqrt(seen / pairs[0][1]))
+        found[name] = float(visible)
+    return found

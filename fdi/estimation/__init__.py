@@ -1,0 +1,1 @@
+"""Parameters from measurements: replay, noise, likelihood, fit, covariance, tolerances, unidentifiable directions."""

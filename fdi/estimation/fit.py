@@ -1,0 +1,176 @@
+"""Fits to measured runs: Levenberg-Marquardt on whitened residuals with priors; its trials run side by side in lanes.
+
+What is minimised is the likelihood of blocks of residuals whose noise may be larger than known: a block that is fitted
+counts by its squares, one that is not by the logarithm of its mean square. So no single stop of the ram, made or
+missed, outweighs a whole run, and what is missing is not made up for by parameters that no healthy unit has.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from fdi.estimation.problem import Free, Problem, ends
+
+Floats = NDArray[np.float64]
+
+BLOCK = 100  # cycles
+FITTED = 2.0  # mean square of a block up to which it counts as fitted: noise alone gives 1 +- 0.14
+TYPICAL = 0.85  # of the blocks
+DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+WIDTH = 3.0  # of a difference, in standard deviations of a parameter: wide enough for stick-slip, narrow at the end
+NARROWEST = 0.01  # times the first width
+ENOUGH = 0.5  # improvement in cost below which a fit has converged: a quarter of a unit of log likelihood
+ROUNDS = 12
+CLOSE = 1e-4  # the same as a fraction of the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters found: `x` (p,) scaled, `cost` = -2 log likelihood with priors, `covariance` (p, p) of x."""
+
+    free: tuple[Free, ...]
+    x: Floats
+    cost: float
+    misfit: float  # the cost without the priors
+    covariance: Floats
+    residuals: Floats  # (s, n), SI units
+    white: Floats  # (s, n), whitened
+    jacobian: Floats  # (p, s, n), whitened, at x or one step before it
+    converged: bool = False
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters in SI units."""
+        return {f.name: f.value(float(v)) for f, v in zip(self.free, self.x, strict=True)}
+
+    def spread(self, name: str) -> float:
+        """Standard deviation of a parameter, SI units."""
+        i = [f.name for f in self.free].index(name)
+        return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
+
+
+def blocks(white: Floats) -> Floats:
+    """Sums of squares of whitened residuals (.., n) over blocks: (.., b)."""
+    n = white.shape[-1]
+    padded = np.concatenate([white, np.zeros((*white.shape[:-1], -n % BLOCK))], axis=-1)
+    cut = padded.reshape(*white.shape[:-1], -1, BLOCK)
+    sums: Floats = np.einsum("...i,...i->...", cut, cut)
+    return sums
+
+
+def misfit(white: Floats) -> Floats:
+    """-2 log likelihood of whitened residuals (m, s, n), up to a constant: (m,)."""
+    sums = blocks(white)
+    limit = FITTED * BLOCK
+    beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
+    total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
+    return total
+
+
+def weights(white: Floats) -> Floats:
+    """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
+    sums = blocks(white)
+    each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
+    return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
+
+
+def typical(residuals: Floats) -> Floats:
+    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
+    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
+    kept = squares[:, :max(1, round(TYPICAL * squares.shape[1]))]
+    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
+    return rms
+
+
+def fit(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
+    """The most likely parameters near `start` (p,), scaled (default: the centres)."""
+    x = np.zeros(len(free)) if start is None else np.array(start, float)
+    return improved(problem, linearised(problem, free, x), rounds)
+
+
+def improved(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
+    """A fit after so many further rounds, or fewer if it converges."""
+    for _ in range(rounds):
+        gradient, hessian = _normal(now)
+        trials = np.array([_stepped(now, hessian, gradient, damping) for damping in DAMPINGS])
+        white = problem.whitened(problem.residuals(now.free, trials))
+        costs = misfit(white) + (trials**2) @ _prior(now.free)
+        k = int(np.argmin(costs))
+        gained = now.cost - float(costs[k])
+        if gained < max(ENOUGH, CLOSE * now.cost):
+            final = _moved(problem, now, trials[k]) if gained > 0.0 else now
+            return replace(final, converged=True)
+        now = linearised(problem, now.free, trials[k], _widths(now.free, hessian))
+    return now
+
+
+def linearised(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | None = None) -> Fit:
+    """The model at `x` (p,) with its Jacobian by differences of `step`, away from a bound."""
+    free = tuple(free)
+    step = np.array([f.step for f in free]) if step is None else step
+    signs = np.array([-1.0 if f.centre + f.scale * (v + h) > f.high else 1.0
+                      for f, v, h in zip(free, x, step, strict=True)])
+    moved = np.vstack([x, x + np.diag(signs * step)])
+    residuals = problem.residuals(free, moved)
+    white = problem.whitened(residuals)
+    jacobian = (white[1:] - white[0]) / (signs * step)[:, None, None]
+    held = float(misfit(white[:1])[0])
+    return Fit(free, x, held + float(x**2 @ _prior(free)), held, _covariance(free, jacobian, white[0]), residuals[0],
+               white[0], jacobian)
+
+
+def _moved(problem: Problem, fit: Fit, x: Floats) -> Fit:
+    """The fit at `x`, close enough to keep its Jacobian."""
+    residuals = problem.residuals(fit.free, x[None])
+    white = problem.whitened(residuals)
+    held = float(misfit(white)[0])
+    return Fit(fit.free, x, held + float(x**2 @ _prior(fit.free)), held, fit.covariance, residuals[0], white[0],
+               fit.jacobian)
+
+
+def _prior(free: Sequence[Free]) -> Floats:
+    return np.array([f.prior**-2 for f in free])
+
+
+def _normal(fit: Fit) -> tuple[Floats, Floats]:
+    """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
+    heavy = fit.jacobian * weights(fit.white)
+    prior = _prior(fit.free)
+    flat = fit.jacobian.reshape(len(fit.x), -1)
+    heavy = heavy.reshape(len(fit.x), -1)
+    return heavy @ fit.white.reshape(-1) + prior * fit.x, heavy @ flat.T + np.diag(prior)
+
+
+def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
+    flat = (jacobian * np.sqrt(weights(white))).reshape(len(free), -1)
+    inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior(free))), np.float64)
+    return inverse
+
+
+def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
+    widest = np.array([f.step for f in free])
+    widths: Floats = np.clip(WIDTH / np.sqrt(np.maximum(np.diag(hessian), 1e-12)), NARROWEST * widest, widest)
+    return widths
+
+
+def _stepped(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
+    """A damped Gauss-Newton step within the bounds: what runs into one stays there, and the rest is solved again."""
+    low, high = ends(fit.free)
+    damped = hessian + np.diag(damping * np.diag(hessian) + 1e-12 * np.trace(hessian) + 1e-12)
+    x, open_ = fit.x.copy(), np.ones(len(fit.x), bool)
+    for _ in range(len(x)):
+        move = x - fit.x
+        right = -gradient[open_] - damped[np.ix_(open_, ~open_)] @ move[~open_]
+        x[open_] = fit.x[open_] + cho_solve(cho_factor(damped[np.ix_(open_, open_)]), right)
+        out = open_ & ((x < low) | (x > high))
+        x = np.clip(x, low, high)
+        if not out.any():
+            break
+        open_ &= ~out
+        if not open_.any():
+            break
+    return x

@@ -1,0 +1,189 @@
+"""The model run on what was measured: from the current (the plant alone) and from the command alone (the whole loop).
+
+A replay from the current keeps the phase of stick-slip and leaves the controller out of the question. Its position
+adds up every bias for ever, so the ram is drawn to the measured position at ANCHOR; what it would drift without is told
+as a speed. The solver is checked first: with steps half as long the replay must not move; and where a ram that stops or
+goes on hangs on a thousandth of its friction, neither model nor solver can say which, so such windows are not judged.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.noise_floor import WINDOW
+from fdi.trace.cycles import SIGNALS, Cycles, bridged
+from plant.effects import CATALOGUE, at
+from plant.lanes import Lanes
+from plant.model import Model
+from plant.state import Input
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Columns = dict[str, Floats]  # by signal, (n,)
+
+ANCHOR = 20.0  # 1/s; white noise of the position comes back as 1.005 times itself, a bias of speed as 50 ms of it
+STEPS, FINEST = 50, 800  # a cycle
+WELL_BELOW = 0.2  # of the floor, that halving the step may move a replay
+FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
+KNIFE = 1e-3  # of a friction level; no simulator, no oil and no seal is known as well as that
+EDGE = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}  # less than that is moved by a little friction without any edge
+SWEEP = 4000  # positions
+SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
+QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
+
+
+class Replay(NamedTuple):
+    """A model's replay of one trace; columns (n,) by signal."""
+
+    model: Columns  # XJ anchored, P12, XS
+    residual: Columns  # measured less model, NaN where not measured
+    steps: int  # a cycle
+    solver_error: Mapping[str, float]  # RMS, by halving the step
+    undecided: Flags  # rows that hang on a knife's edge
+    blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
+
+
+def open_loop(c: Cycles, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
+    """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
+    lanes = Lanes(model.replace(QUIET), (), steps)
+    out = lanes.replay(np.empty((1, 0)), c.cor, c.load, c.xj if known_start(c) else None, anchor)
+    return {name: out[0, :, i] for i, name in enumerate(SIGNALS)}
+
+
+def known_start(c: Cycles) -> bool:
+    """Whether the first position is known; else the replay starts in the middle."""
+    return not np.isnan(c.xj[0])
+
+
+def checked(c: Cycles, model: Model, floor: Mapping[str, float]) -> Replay:
+    """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
+    values = edges(model)
+    lanes = Lanes(model.replace(QUIET), frictions(model), STEPS)
+    position = c.xj if known_start(c) else None
+    runs = lanes.replay(values, c.cor, c.load, position, ANCHOR)
+    others = [lanes.replay(values[:1], cor, c.load, position, ANCHOR) for cor in guesses(c)]
+    runs = np.concatenate([runs, *others])
+    undecided = np.zeros(len(c), bool)
+    for i, name in enumerate(SIGNALS):
+        if name in floor:
+            moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
+            undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(c.measured(name))
+    coarse, steps = runs[0], STEPS
+    while True:
+        finer = Lanes(model.replace(QUIET), frictions(model), 2 * steps)
+        fine = finer.replay(values[:1], c.cor, c.load, position, ANCHOR)[0]
+        error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(SIGNALS) if name in floor}
+        small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
+        coarse, steps = fine, 2 * steps
+        if small or steps >= FINEST:
+            break
+    found = {name: coarse[:, i] for i, name in enumerate(SIGNALS)}
+    guessed = runs[len(values):] - runs[:1]
+    blind = {name: rms(guessed[:, ~undecided, i]) if len(guessed) else 0.0 for i, name in enumerate(SIGNALS)}
+    return Replay(found, residuals(c, found), steps, error, undecided, blind)
+
+
+def guesses(c: Cycles) -> list[Floats]:
+    """The current with what its filled rows may have been instead; none if every row was recorded.
+
+    The fill misses a row by as much as it would miss every other recorded row around: that error, with random signs.
+    """
+    if not c.filled.any():
+        return []
+    there = np.flatnonzero(~c.filled)
+    odd = there[1::2]
+    thinned = c.cor.copy()
+    thinned[c.filled], thinned[odd] = np.nan, np.nan
+    again, lost = bridged(thinned, len(c))
+    error = np.where(lost, 0.0, c.cor - again)
+    near = odd[np.clip(np.searchsorted(odd, np.arange(len(c))), 0, len(odd) - 1)]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(c))
+    return [c.cor + np.where(c.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
+
+
+def read_noise(model: Model, xj: Floats) -> float:
+    """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
+
+    A sweep through it, as neither is in a replay.
+    """
+    level = model["sensors.position_noise"]
+    law, memory = at("reading", model.effects)
+    if not any(CATALOGUE[name].port == "reading" for name in model.effects):
+        return level
+    noise = level * np.random.default_rng(0).standard_normal(SWEEP)
+    true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
+    s, p, out = model.state(), model.record()[0], np.empty(SWEEP)
+    for k, x in enumerate((true + noise).tolist()):
+        u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
+        out[k], memory = law(x, memory, s, u, p)
+    return rms(out - true)
+
+
+def residuals(c: Cycles, model: Columns) -> Columns:
+    """Measured less model, of the chosen signals."""
+    return {name: c.measured(name) - model[name] for name in c.signals}
+
+
+def frictions(model: Model) -> tuple[str, ...]:
+    """The friction levels that the model's plant has."""
+    return tuple(name for name in FRICTIONS if name in model.values)
+
+
+def edges(model: Model) -> Floats:
+    """(m, frictions) values: the model's, and each level a little higher and lower; dynamic stays below static."""
+    names = frictions(model)
+    base = np.array([model[name] for name in names])
+    shifts = KNIFE * np.eye(len(names))
+    values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
+    for static, dynamic in (FRICTIONS[:2], FRICTIONS[2:]):
+        if static in names and dynamic in names:
+            a, b = names.index(static), names.index(dynamic)
+            values[:, b] = np.minimum(values[:, a], values[:, b])
+    return values
+
+
+def _windows_above(moved: Floats, floor: float) -> Flags:
+    """Rows of windows in which one of the runs (m, n) is moved by more than the floor, RMS."""
+    n = moved.shape[1]
+    starts = np.arange(0, n, WINDOW)
+    sizes = np.diff(np.append(starts, n))
+    power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0) / sizes
+    out: Flags = np.repeat(power > floor**2, sizes)
+    return out
+
+
+def drift(c: Cycles, model: Model, steps: int = STEPS) -> tuple[float, float]:
+    """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
+    free = c.measured("xj") - open_loop(c, model, steps, 0.0)["xj"]
+    there = ~np.isnan(free)
+    t = c.t[there] - c.t[there].mean()
+    return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
+
+
+def closed_loop(c: Cycles, model: Model, steps: int = STEPS) -> Columns:
+    """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
+    before = round(SETTLED / c.period)
+    com = np.concatenate([np.full(before, c.com[0]), c.com])
+    load = np.concatenate([np.full(before, c.load[0]), c.load])
+    lanes = Lanes(model.replace(QUIET), (), steps)
+    out = lanes.closed_loop(np.empty((1, 0)), com, load)[0, before:]
+    whole = {"xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3]}
+    left = {name: c.measured(name) - whole[name] for name in c.signals}
+    return left | {"cor": c.measured("cor") - whole["cor"]}
+
+
+def derivative(x: Floats, size: int, order: int) -> Floats:
+    """First or second derivative of x (n,) per sample, of the parabola through `size` samples (Savitzky and Golay)."""
+    k = np.arange(size) - size // 2
+    weights = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))[order] * order
+    out: Floats = np.correlate(np.pad(x, size // 2, "edge"), weights, "valid")
+    return out
+
+
+def rms(x: Floats) -> float:
+    """Root mean square of what is there; NaN for nothing."""
+    there = x[~np.isnan(x)]
+    return float(np.sqrt(np.mean(there**2))) if len(there) else float("nan")

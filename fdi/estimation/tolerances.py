@@ -1,0 +1,89 @@
+"""Could it be nothing but scatter? The error after a quick refit of what differs from one unit to the next.
+
+Two Gauss-Newton steps from the model, each parameter tied to its value by its own tolerance, judged by a replay and not
+by the linear forecast. `rig explain` does the same with every effect beside it.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.replay import ANCHOR, QUIET, known_start, rms
+from fdi.trace.cycles import SIGNALS, Cycles
+from plant.lanes import Lanes
+from plant.model import Model, meaning
+
+Floats = NDArray[np.float64]
+
+STEPS = 20  # a cycle; only sizes matter here
+ROUNDS = 2
+STEP = 0.3  # tolerances, of the differences that the Jacobian is made of
+FURTHEST = 3.0  # tolerances; a parameter that would have to go further is no scatter
+ALIKE = 20  # neighbouring samples that say the same thing
+LARGE = 6.0  # floors; residuals beyond count less, the refit shall not chase single stops of the ram
+SCATTER = 1.15  # floors, that scatter may leave to count as the whole explanation
+
+
+class Scatter(NamedTuple):
+    """What a refit within the tolerances makes of the error."""
+
+    error: dict[str, float]  # by signal, SI unit
+    ratio: dict[str, float]  # over the floor
+    moved: dict[str, float]  # parameter "group.field" to its change in tolerances
+    enough: bool  # within reach of the floor
+
+
+def tolerances(model: Model) -> dict[str, float]:
+    """The parameters that scatter from unit to unit, with one tolerance in SI units."""
+    known = {name: model.kind.tolerance(name, meaning(name, plant=model.plant)) * abs(model[name])
+             for name in model.names()}
+    return {name: size for name, size in known.items() if size > 0.0}
+
+
+def scatter(c: Cycles, model: Model, floor: Mapping[str, float]) -> Scatter:
+    """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
+    known = tolerances(model)
+    base = np.array([model[name] for name in known])
+    size = np.array(list(known.values()))
+    lanes = Lanes(model.replace(QUIET), list(known), STEPS)
+    measured = np.array([c.measured(name) for name in c.signals])
+    columns = [SIGNALS.index(name) for name in c.signals]
+    scale = np.array([floor[name] for name in c.signals])[:, None]
+    position = c.xj if known_start(c) else None
+
+    def residual(x: Floats) -> Floats:
+        """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
+        out = lanes.replay(_possible(list(known), base + x * size), c.cor, c.load, position, ANCHOR)
+        left: Floats = np.nan_to_num((measured - out.transpose(0, 2, 1)[:, columns]) / scale)
+        return left.reshape(len(x), -1)
+
+    x = np.zeros(len(base))
+    now = residual(x[None])[0]
+    for _ in range(ROUNDS):
+        slope = (residual(x + STEP * np.eye(len(base))) - now) / STEP
+        weight = 1.0 / np.sqrt(1.0 + (now / LARGE) ** 2)
+        normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
+        step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
+        tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -FURTHEST, FURTHEST)
+        found = residual(tried)
+        costs = 2 * LARGE**2 * (np.sqrt(1 + (found / LARGE) ** 2) - 1).sum(axis=1) / ALIKE
+        best = int(np.argmin(costs + (tried**2).sum(axis=1)))
+        x, now = tried[best], found[best]
+    rows = now.reshape(len(scale), -1)
+    ratio = {name: rms(np.where(np.isnan(y), np.nan, r)) for name, r, y in zip(c.signals, rows, measured, strict=True)}
+    error = {name: ratio[name] * floor[name] for name in ratio}
+    moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
+    return Scatter(error, ratio, moved, max(ratio.values()) < SCATTER)
+
+
+def _possible(names: list[str], values: Floats) -> Floats:
+    """Dynamic friction stays below static friction."""
+    for body in ("jack", "spool"):
+        pair = [f"{body}.{kind}_friction" for kind in ("static", "dynamic")]
+        if all(name in names for name in pair):
+            a, b = (names.index(name) for name in pair)
+            values[:, b] = np.minimum(values[:, a], values[:, b])
+    return values

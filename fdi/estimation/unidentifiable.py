@@ -1,0 +1,116 @@
+"""What may be scaled in the plant without any signal showing it: directions along which priors alone decide.
+
+Torques, pressures and forces inside the servovalve are not measured. A filter that lets through less and pilot gains
+that are larger by as much are the same plant to every sensor; so are stronger springs behind a stronger motor. Slopes
+by differences do not show it, as each parameter shifts a hundred small stops of the spool; so along these directions
+slopes are nought by construction, where a trial confirms it.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.fit import Fit, misfit
+from fdi.estimation.problem import Free, Problem, ends
+
+Floats = NDArray[np.float64]
+
+TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
+LEVEL = 500.0  # sum of squares in whitened units, that this way may change; what shows makes more
+ROUNDS = 6
+LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
+# Powers with which parameters move together; that of Kintas is one of what the filter lets through, 1 - Kintas.
+FLAT: tuple[Mapping[str, float], ...] = (
+    {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
+    {"spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.pressure_gain": 1.0, "supply.pressure": 1.0},
+    {"torque_motor.gain": 1.0, "feedback_spring.stiffness": 1.0, "flapper.stiffness": 1.0, "flapper.damping": 1.0,
+     "flapper.inertia": 1.0},
+    {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.mass": 1.0, "jack.damping": 1.0, "jack.static_friction": 1.0,
+     "jack.dynamic_friction": 1.0, "jack.leakage": 1.0},
+)
+
+
+def powers(problem: Problem) -> list[Mapping[str, float]]:
+    """`FLAT` for the filter's law of this model."""
+    law = problem.model.values.get("filter.law", 0.5)
+    return [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else flat for flat in FLAT]
+
+
+def scaled(free: Sequence[Free], x: Floats, said: Mapping[str, float], logarithm: float) -> Floats:
+    """Scaled unknowns (p,) after those in `said` have been multiplied by their powers of exp(`logarithm`)."""
+    moved = x.copy()
+    for k, f in enumerate(free):
+        if f.name in said:
+            value, factor = f.centre + f.scale * float(x[k]), float(np.exp(said[f.name] * logarithm))
+            new = 1.0 - (1.0 - value) * factor if f.name == "filter.clogging" else value * factor
+            moved[k] = (new - f.centre) / f.scale
+    return moved
+
+
+def tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Mapping[str, float]], Floats]:
+    """The directions that hold at `x` (p,), and their tangents of scaled unknowns as columns (p, k).
+
+    Left out is a direction that a bound stops, or that a trial replay does not find flat.
+    """
+    if problem.model.plant != "eha":
+        return [], np.empty((len(x), 0))
+    low, high = ends(free)
+    names, found, trials = {f.name for f in free}, [], []
+    for said in powers(problem):
+        if next(iter(said)) not in names:
+            continue
+        for way in (TRIED, -TRIED):
+            trial = scaled(free, x, said, way)
+            if ((trial >= low - 1e-9) & (trial <= high + 1e-9)).all() and (trial != x).any():
+                found.append(said)
+                trials.append(trial)
+                break
+    if not found:
+        return [], np.empty((len(x), 0))
+    white = problem.whitened(problem.residuals(free, np.vstack([x, *trials])))
+    flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < LEVEL * white.shape[2] / 13500.0
+    held = [said for said, level in zip(found, flat, strict=True) if level]
+    ways = [(scaled(free, x, said, 1e-6) - x) / 1e-6 for said in held]
+    return held, np.array(ways).T if ways else np.empty((len(x), 0))
+
+
+def without_slope(jacobian: Floats, flat: Floats) -> Floats:
+    """A Jacobian (p, s, n) with its slope along the flat directions (p, k) taken out."""
+    if not flat.size:
+        return jacobian
+    rows = jacobian.reshape(len(jacobian), -1)
+    basis = np.linalg.qr(flat)[0]
+    left: Floats = (rows - basis @ (basis.T @ rows)).reshape(jacobian.shape)
+    return left
+
+
+def relaxed(problem: Problem, found: Fit) -> Fit:
+    """The fit moved along the flat directions to where the priors want it, if that leaves no more than before."""
+    free, x = found.free, found.x
+    said, _ = tangents(problem, free, x)
+    if not said:
+        return found
+    prior = np.array([f.prior**-2 for f in free])
+    low, high = ends(free)
+    for _ in range(ROUNDS):  # Gauss-Newton on the priors alone, along the curved directions
+        ways = np.array([(scaled(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
+        step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]
+        for way in (1.0, 0.5, 0.25, 0.1):
+            there = x
+            for s, part in zip(said, step, strict=True):
+                there = scaled(free, there, s, way * float(part))
+            if ((there >= low) & (there <= high)).all() and there**2 @ prior < x**2 @ prior:
+                x = there
+                break
+        else:
+            break
+    residuals = problem.residuals(free, x[None])
+    white = problem.whitened(residuals)
+    held = float(misfit(white)[0])
+    cost = held + float(x**2 @ prior)
+    if cost >= found.cost:
+        return found
+    return replace(found, x=x, cost=cost, misfit=held, residuals=residuals[0], white=white[0])

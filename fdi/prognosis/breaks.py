@@ -1,0 +1,118 @@
+"""What does not belong to a trend: traces out of line, sizes that jump for good, repairs.
+
+Each is a column that may be added to the regression with a factor of its own. Its evidence, summed over all laws,
+wanders and noises, is held against that without it; the strongest is believed if it outweighs the odds against it.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import log_ndtr
+
+from fdi.prognosis.growth_laws import basis, shapes
+from fdi.prognosis.regression import NOISES, STEP, WANDERS, Scaled, covariance, odds
+
+Floats = NDArray[np.float64]
+
+ODDS = 0.01  # prior probability that a series holds any one kind of break
+AT_LAST = 0.2  # that the last size is not in line: not much is lost by asking for another trace
+MOST = 5  # breaks looked for
+FEWEST = 3  # sizes in line among which another can be out of it
+
+
+class Break(NamedTuple):
+    """One of them, by the row of the series as it was given."""
+
+    kind: str  # "outlier" | "step" | "repair" | "last": which of them it is, the next trace will tell
+    row: int
+    size: float  # of the jump, in the series' unit
+
+
+class Cleaned(NamedTuple):
+    """The series with what does not belong to it marked as such."""
+
+    data: Scaled
+    first: int  # row of the given series that it starts with
+    breaks: tuple[Break, ...]
+
+
+def clean(data: Scaled) -> Cleaned:
+    """Mark breaks one by one: an outlier's row becomes loose, a step gets a column, before a repair all goes."""
+    first, found = 0, []
+    for _ in range(MOST):
+        strongest = _strongest(data) if len(data.u) - len(data.loose) >= FEWEST else None
+        if strongest is None:
+            break
+        kind, at, size = strongest
+        found.append(Break(kind, first + at, size))
+        if kind == "step":
+            data = data._replace(steps=(*data.steps, at))
+        elif kind == "repair":
+            data, first = _since(data, at), first + at
+        else:
+            data = data._replace(loose=(*data.loose, at))
+    return Cleaned(data, first, tuple(sorted(found, key=lambda b: b.row)))
+
+
+def _since(data: Scaled, at: int) -> Scaled:
+    """What comes from a row on, on its own scale of time."""
+    u = data.u[at:] - data.u[at]
+    return Scaled(u / (u[-1] or 1.0), data.y[at:], data.sigma[at:], tuple(row - at for row in data.steps if row > at),
+                  *(tuple(row - at for row in rows if row >= at) for rows in (data.loose, data.bounded)))
+
+
+def _strongest(data: Scaled) -> tuple[str, int, float] | None:
+    """Kind, row and size of the break with the most evidence, if it is enough."""
+    n = len(data.u)
+    spikes = np.eye(n)
+    jumps = np.tril(np.ones((n, n)))[:, 1:-1]  # from row j on; the first is no jump, at the last one cannot tell
+    v = np.column_stack([spikes, jumps])
+    gain, size = _gains(data, v)
+    gain = gain + np.log(ODDS / np.repeat([n, max(n - 2, 1)], [n, n - 2]))
+    gain[n - 1] += np.log(AT_LAST / ODDS * n)
+    gain[[*data.loose, *(n + row - 1 for row in data.steps if row < n - 1)]] = -np.inf  # known already
+    if n == 3:  # each of three is out of line with the other two
+        gain[:] = np.where(np.abs(size) > STEP, gain, -np.inf)
+    best = int(np.argmax(gain))
+    if not gain[best] > 0.0:
+        return None
+    if best < n:
+        return ("last" if best == n - 1 else "outlier"), best, float(size[best])
+    return ("step" if size[best] > 0 else "repair"), best - n + 1, float(size[best])
+
+
+def _gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
+    """Log evidence that each column of v, shape (n, m), adds, and its factor under the best law: shape (m,) both."""
+    every, _ = shapes()
+    g = basis(every, data.u)
+    usual = np.array([shape.rise for shape in every])
+    plain, with_it, factors = [], [], []
+    for i in range(len(NOISES)):
+        for j in range(len(WANDERS)):
+            factor = np.linalg.cholesky(covariance(data, i, j))
+            white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
+            chance = odds(i, j) - np.log(np.diag(factor)).sum() - 0.5 * white[:, 0] @ white[:, 0]
+            alone, both, size = _two(white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):], usual)
+            plain.append(chance + alone)
+            with_it.append(chance[:, None] + both)
+            factors.append(size)
+    base = np.logaddexp.reduce(plain, axis=None)
+    stack = np.concatenate(with_it)
+    best = stack.argmax(axis=0)
+    return np.logaddexp.reduce(stack, axis=0) - base, np.concatenate(factors)[best, np.arange(v.shape[1])]
+
+
+def _two(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[Floats, Floats, Floats]:
+    """What the rise, and rise and a column's factor, add to the evidence, (k,) and (k, m); and that factor, (k, m)."""
+    gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP ** -2, g.T @ v
+    gy, vy = g.T @ y, v.T @ y
+    alone = 0.5 * gy ** 2 / gg - 0.5 * np.log(gg * usual ** 2) + log_ndtr(gy / np.sqrt(gg))
+    left = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
+    rest = gy[:, None] - gv * (vy / vv)
+    both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP ** 2) + 0.5 * rest ** 2 / left
+            - 0.5 * np.log(left * usual[:, None] ** 2) + log_ndtr(rest / np.sqrt(left)))
+    rise = np.maximum(rest / left, 0.0)
+    return alone, both, (vy - gv * rise) / vv

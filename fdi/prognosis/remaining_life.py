@@ -1,0 +1,101 @@
+"""What a posterior says of the future: paths of the size, and when each first reaches a limit."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from fdi.prognosis.growth_laws import basis
+from fdi.prognosis.regression import NOISES, WANDERS, Posterior
+
+Floats = NDArray[np.float64]
+
+PATHS = 2000
+FAR = 50.0  # times the time seen so far; what comes later is called never
+AHEAD = np.concatenate([[0.0], np.logspace(-2.5, np.log10(FAR), 80)])  # from the last trace, in u
+
+
+PACE, FREEDOM = 0.12, 3.0  # Student's scale and freedom of the logarithm of how fast the course found goes on from here
+
+
+class Paths(NamedTuple):
+    """Sizes the fault may have from the last trace on, (paths, times), at times AHEAD; scaled as bayes.Scaled."""
+
+    sizes: Floats
+    rate: Floats  # now, (paths,), per u
+
+
+class Own(NamedTuple):
+    """Deviation of a size by the unit's tolerances: base + share * size."""
+
+    base: float = 0.0
+    share: float = 0.0
+
+
+def draw(posterior: Posterior, own: Own, seed: int = 0, paths: int = PATHS) -> Paths:
+    """Paths of equal probability."""
+    rng = np.random.default_rng(seed)
+    weights = posterior.weights
+    part, shape = np.unravel_index(_stratified(weights.ravel(), paths, rng), weights.shape)
+    ahead = basis(posterior.shapes, 1.0 + AHEAD).T
+    slopes = (basis(posterior.shapes, np.array([1.0])) - basis(posterior.shapes, np.array([0.98])))[0] / 0.02
+    sizes, rate = np.empty((paths, len(AHEAD))), np.empty(paths)
+    for i in np.unique(part):
+        p, rows = posterior.parts[i], np.flatnonzero(part == i)
+        kind, strength = WANDERS[p.wander]
+        k = shape[rows]
+        rise = _positive(p.rise[k], p.deviation[k], rng.uniform(size=len(rows)))
+        rise[[posterior.shapes[j].law == "none" for j in k]] = 0.0
+        root = np.linalg.cholesky(p.spread + np.diag([1e-12, 1e-12]))
+        level = p.level[:, None] - p.pull[:, k] * rise + root @ rng.standard_normal((2, len(rows)))
+        wander = _wander(kind, strength, level[1], rng)
+        sizes[rows] = rise[:, None] * ahead[k] + level[0][:, None] + wander
+        rate[rows] = rise * slopes[k] + (level[1] if kind == "integrated" else 0.0)
+    common = np.sqrt([NOISES[p.noise][0] for p in posterior.parts])[part] * rng.standard_normal(paths)
+    sizes -= common[:, None] * (own.base + own.share * sizes)
+    pace = np.exp(np.clip(PACE * rng.standard_t(FREEDOM, paths), -2.0, 2.0))
+    sizes = np.array([np.interp(AHEAD, AHEAD * slower, row) for slower, row in zip(pace, sizes, strict=True)])
+    return Paths(sizes, rate / pace)
+
+
+def reached(paths: Paths, limit: float) -> Floats:
+    """When each path first reaches the limit, in u from the last trace on: 0 if it has, infinity if it never does."""
+    above = paths.sizes >= limit
+    first = above.argmax(axis=1)
+    rows = np.arange(len(first))
+    before = np.maximum(first - 1, 0)
+    low, high = paths.sizes[rows, before], paths.sizes[rows, first]
+    share = np.where(first > 0, (limit - low) / np.where(high > low, high - low, 1.0), 0.0)
+    when: Floats = AHEAD[before] + share * (AHEAD[first] - AHEAD[before])
+    return np.where(above.any(axis=1), when, np.inf)
+
+
+def _stratified(weights: Floats, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Row numbers in proportion to the weights, less random than independent draws."""
+    ends = np.cumsum(weights)
+    return np.minimum(np.searchsorted(ends / ends[-1], (np.arange(count) + rng.uniform(size=count)) / count),
+                      len(weights) - 1)
+
+
+def _positive(mean: Floats, deviation: Floats, uniform: Floats) -> Floats:
+    """Normal numbers given that they are above 0."""
+    below = ndtr(-mean / deviation)
+    drawn: Floats = mean + deviation * ndtri(np.clip(below + uniform * (1.0 - below), 1e-300, 1.0 - 1e-16))
+    return np.maximum(drawn, 0.0)
+
+
+def _wander(kind: str, strength: float, slope: Floats, rng: np.random.Generator) -> Floats:
+    """How far the wander goes from where it is now, (paths, times)."""
+    n, h = len(slope), np.diff(AHEAD)
+    if kind == "still":
+        return np.zeros((n, len(AHEAD)))
+    noise = rng.standard_normal((n, len(h)))
+    if kind == "wiener":
+        moves = strength * np.sqrt(h) * noise
+    else:
+        turns = np.sqrt(3.0 * h) * strength * noise  # steps of the slope; the place moves by half of each, and a bit
+        slopes = slope[:, None] + np.cumsum(np.column_stack([np.zeros(n), turns[:, :-1]]), axis=1)
+        moves = h * (slopes + turns / 2) + strength * np.sqrt(3.0 * h ** 3 / 12) * rng.standard_normal((n, len(h)))
+    return np.column_stack([np.zeros(n), np.cumsum(moves, axis=1)])

@@ -1,0 +1,151 @@
+"""One fault's trend: where its size stands, how it grows, and the time left to MidBand and MaxBand."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.diagnosis import levels
+from fdi.diagnosis.faults import Estimate, Fault, Level
+from fdi.prognosis import remaining_life
+from fdi.prognosis.breaks import Break, Cleaned, clean
+from fdi.prognosis.course import fitted
+from fdi.prognosis.regression import Posterior, Scaled, regress
+
+Floats = NDArray[np.float64]
+
+FEWEST = 3  # traces that make a trend: two points lie on every line
+DOUBT = 0.05  # largest probability that nothing grows at which a trend is told
+LATEST = 200  # traces; older ones are left out, they no longer tell where the size goes
+LEVER = 0.15  # of (MaxBand - healthy); over less, intervals do not show how they go with the size
+WIDTH = 1.96  # standard deviations of a 95 % interval
+LIMITS = {"maintenance": "middle", "non_nominal": "most"}  # level that begins there: field of Fault
+
+
+class Remaining(NamedTuple):
+    """Time from the last trace to a limit, in the axis' unit; infinity: not within 50 times the time seen so far."""
+
+    limit: float  # size
+    value: float  # median
+    low: float
+    high: float
+    drawn: Floats  # as many equally probable times
+
+    def within(self, t: float) -> float:
+        """Probability that the limit is reached within t."""
+        return float((self.drawn <= t).mean())
+
+
+class Curve(NamedTuple):
+    """A size over time: middle and the ends of its 95 % interval, shape (m,) each; t on the axis of the traces."""
+
+    t: Floats
+    low: Floats
+    middle: Floats
+    high: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """What the traces say of one fault. Times are on the axis of the traces, sizes in the fault's unit."""
+
+    fault: Fault
+    verdict: str  # "TREND" | "NO_TREND" | "TOO_FEW"
+    t: Floats
+    sizes: tuple[Estimate, ...]
+    used: NDArray[np.bool_]  # rows that the trend is made of
+    breaks: tuple[Break, ...]  # sizes in the fault's unit
+    laws: Mapping[str, float]  # probability of each, that nothing grows included; {} if too few
+    now: Estimate
+    rate: Estimate | None  # per unit of time, now
+    remaining: Mapping[str, Remaining]  # by the level that begins there; {} if too few
+    past: Curve | None
+    future: Curve | None
+
+    @property
+    def level(self) -> Level:
+        """Of the size now, by the rule of `rig fdi`; where the interval cannot tell, by the value."""
+        found = levels.level(self.fault, self.now)
+        return levels.of_value(self.fault, self.now.value) if found is None else found
+
+
+def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:
+    """The trend of a fault from its sizes at `times` (in order, any unit), at least one."""
+    t = np.array(times[-LATEST:], dtype=float)
+    sizes = tuple(estimates[-LATEST:])
+    data, unit = _scaled(fault, t, sizes)
+    found = clean(data) if t[-1] > t[0] else Cleaned(data, 0, ())
+    breaks = tuple(b._replace(size=b.size * unit) for b in found.breaks)
+    used = np.arange(len(t)) >= found.first
+    used[[found.first + row for row in found.data.loose]] = False
+    if used.sum() < FEWEST or np.ptp(t[used]) == 0.0:
+        return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
+    span = float(t[-1] - t[found.first])
+    posterior = regress(found.data)
+    paths, laws = _drawn(found, posterior, _own(data, used)), posterior.laws()
+    remaining = {level: _remaining(getattr(fault, field), fault, unit, paths, span)
+                 for level, field in LIMITS.items()}
+    middle = np.linspace(0.0, 1.0, 60)
+    past = Curve(t[found.first] + span * middle, *(fault.healthy + unit * fitted(found.data, posterior, middle)))
+    now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], 0.0)  # neither fault can be less
+    return Trend(fault, "TREND" if laws["none"] < DOUBT else "NO_TREND", t, sizes, used, breaks, laws,
+                 _quantiles(now), _quantiles(paths.rate * unit / span), remaining, past,
+                 _fan(fault, unit, paths, float(t[-1]), span))
+
+
+def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:
+    """The series in the regression's units, and the size that is 1 there."""
+    unit = fault.most - fault.healthy
+    value, low, high = np.array(sizes).T
+    sigma = np.maximum(high - value, value - low) / WIDTH / unit  # one side may end at what is possible at all
+    span = float(t[-1] - t[0]) or 1.0
+    bounded = tuple(int(row) for row in np.flatnonzero(value <= low))
+    return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
+
+
+def _own(data: Scaled, used: NDArray[np.bool_]) -> remaining_life.Own:
+    """A line through the intervals' deviations over the sizes; their mean where these hardly differ."""
+    y, sigma = data.y[used], data.sigma[used]
+    if np.ptp(y) < LEVER:
+        return remaining_life.Own(float(sigma[-1]))
+    share, base = np.polyfit(y, sigma, 1)
+    return remaining_life.Own(float(base), float(share))
+
+
+def _drawn(found: Cleaned, posterior: Posterior, own: remaining_life.Own) -> remaining_life.Paths:
+    """Paths from the last trace on.
+
+    A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
+    """
+    last = found.breaks[-1] if found.breaks else None
+    if last is None or last.kind != "last" or last.size < 0.0:
+        return remaining_life.draw(posterior, own)
+    at = len(found.data.u) - 1
+    tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
+    third = remaining_life.PATHS // 3
+    jumped = regress(tight._replace(steps=(*tight.steps, at)))
+    three = [remaining_life.draw(p, own, i, third) for i, p in enumerate((posterior, jumped, regress(tight)))]
+    return remaining_life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
+
+
+def _quantiles(drawn: Floats) -> Estimate:
+    low, value, high = np.quantile(drawn, [0.025, 0.5, 0.975], method="nearest")
+    return Estimate(float(value), float(low), float(high))
+
+
+def _remaining(limit: float, fault: Fault, unit: float, paths: remaining_life.Paths, span: float) -> Remaining:
+    drawn = remaining_life.reached(paths, (limit - fault.healthy) / unit) * span
+    value, low, high = _quantiles(drawn)
+    return Remaining(limit, value, low, high, drawn)
+
+
+def _fan(fault: Fault, unit: float, paths: remaining_life.Paths, start: float, span: float) -> Curve:
+    """The future up to where most paths have reached MaxBand, or twice the time seen so far again."""
+    until = float(np.quantile(remaining_life.reached(paths, 1.0), 0.5, method="nearest"))
+    ahead = remaining_life.AHEAD
+    shown = np.flatnonzero(ahead <= min(max(1.5 * until, 0.3), 2.0))
+    low, middle, high = fault.healthy + unit * np.quantile(paths.sizes[:, shown], [0.025, 0.5, 0.975], axis=0)
+    return Curve(start + span * ahead[shown], low, middle, high)

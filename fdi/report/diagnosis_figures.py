@@ -1,0 +1,198 @@
+"""The drawings of a diagnosis, as SVG text that stands inside an HTML page."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from fdi.diagnosis.bands import Judged, columns
+from fdi.diagnosis.envelope import NEAREST, Bands, RampBand, StepBand, Width, judged_rows, lasting_most, speed, waver
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Event, Fault
+from fdi.diagnosis.precursors import Precursor
+from fdi.diagnosis.rms_grid import Grid
+from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
+from fdi.trace.cycles import Cycles
+from fdi.trace.sections import Section, sections
+
+Floats = NDArray[np.float64]
+
+AMBER, BLUE, SPEED = "#d9730d", "#1f6feb", "#0f8b8d"
+SHADES = {"middle": AMBER, "most": RED}
+UM, MM, MS = 1e6, 1e3, 1e3
+ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
+
+
+def overview(c: Cycles, judged: Judged) -> str:
+    """Command and position of the whole trace, the stays outside the bands shaded."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 2.4), layout="constrained")
+        ax = figure.subplots()
+        ax.plot(*thin(c.t, c.com * MM), color=COMMAND, lw=2.2, label="Com, command")
+        ax.plot(*thin(c.t, c.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
+        ax.set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
+        _shade(ax, judged.events, 1.0, 0.0)
+        ax.set_ylabel("position [mm]")
+        ax.set_xlabel("time [s]")
+        ax.legend(loc="upper right", ncols=2, frameon=False)
+        return svg(figure, "overview")
+
+
+def steps(c: Cycles, bands: Bands, judged: Judged) -> str:
+    """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
+    if not bands.steps:
+        return ""
+    place = _places(c, bands)
+    with rc_context(STYLE):
+        across = min(2, len(bands.steps))
+        down = -(-len(bands.steps) // across)
+        figure = Figure(figsize=(11, 2.5 * down), layout="constrained")
+        axes = figure.subplots(down, across, squeeze=False).ravel()
+        for ax, step in zip(axes, bands.steps, strict=False):
+            _step(ax, c, bands, step, place[step.section], judged)
+        for ax in axes[len(bands.steps):]:
+            ax.set_axis_off()
+        axes[0].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
+        return svg(figure, "steps")
+
+
+def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged: Judged) -> None:
+    xj, t = c.measured("xj"), step.t * MS
+    centre, spread = step.centre(judged.friction, bands.friction)
+    middle, most, there = bands.margins(step, spread)
+    rows = s.start + np.rint(step.t / c.period).astype(int)
+    rows = np.minimum(rows, s.stop - 1)
+    ax.fill_between(t, -NEAREST * spread * UM, NEAREST * spread * UM, color=GREEN, alpha=0.15, lw=0, label="healthy")
+    side = np.sign(step.middle)
+    for limit, colour, label in ((middle, AMBER, "MidBand"), (most, RED, "MaxBand")):
+        ax.plot(t, np.where(there, side * limit, np.nan) * UM, color=colour, lw=1.6, label=label)
+    ax.plot(t, (xj[rows] - centre) * UM, color=INK, lw=1.0, label="measured")
+    ax.set_xlim(0.0, float(t[-1]))
+    _shade(ax, judged.events, MS, float(c.t[s.start]), "position")
+    ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(c.t[s.start]):.4g} s", fontsize=9)
+    ax.set_xlabel("time from the step [ms]")
+    ax.set_ylabel("off the healthy\nresponse [µm]")
+
+
+def ramps(c: Cycles, bands: Bands, judged: Judged) -> str:
+    """Each judged ramp: following error and speed within their limits, and events."""
+    if not bands.ramps:
+        return ""
+    place = _places(c, bands)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 4.6), layout="constrained")
+        axes = figure.subplots(2, len(bands.ramps), sharex="col", sharey="row", squeeze=False)
+        for pair, ramp in zip(axes.T, bands.ramps, strict=True):
+            _ramp(pair, c, ramp, place[ramp.section], judged)
+        axes[0, 0].set_ylabel("error [µm]")
+        axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
+        axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
+        return svg(figure, "ramps")
+
+
+def _ramp(axes: Sequence[Axes], c: Cycles, ramp: RampBand, s: Section, judged: Judged) -> None:
+    rows, way, xj = judged_rows(s, c.period), np.sign(s.rate), c.measured("xj")
+    error = way * (c.com[rows] - xj[rows])
+    fast = way * speed(xj, c.period)[rows] - abs(s.rate)
+    scale = ramp.scale(float(waver(error)), float(lasting_most(fast)))
+    signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
+    for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
+        _widths(ax, width, unit, nearer)
+        ax.plot(*thin(c.t[rows], values * unit), color=INK, lw=0.8, label="measured")
+        ax.set_xlim(float(c.t[rows.start]), float(c.t[rows.stop - 1]))
+        _shade(ax, judged.events, 1.0, 0.0, name)
+    axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(c.t[rows.start]):.4g} s", fontsize=9)
+    axes[-1].set_xlabel("time [s]")
+
+
+def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
+    middle = width.centre * unit
+    ax.axhspan(middle - width.healthy * unit, middle + width.healthy * unit, color=GREEN, alpha=0.15, lw=0,
+               label="healthy")
+    for limit, colour, label in ((width.middle, AMBER, "MidBand"), (width.most, RED, "MaxBand")):
+        if np.isfinite(limit):
+            ax.axhline(middle + nearer * limit * unit, color=colour, lw=1.2, label=label)
+            ax.axhline(middle - nearer * limit * unit, color=colour, lw=1.2)
+
+
+def _places(c: Cycles, bands: Bands) -> dict[int, Section]:
+    """The trace's sections by their number in the bands."""
+    com = columns(c)[0]
+    own = [s for s in sections(com, c.period) if s.kind in ("step", "ramp")]
+    return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
+
+
+def _shade(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal: str = "") -> None:
+    """Stays outside over the whole height: one drawing a band, as there may be hundreds."""
+    low, high = ax.get_xlim()
+    for band, colour in SHADES.items():
+        ends = [((e.t_in - begin) * unit, (e.t_out - begin) * unit) for e in events
+                if e.band == band and signal in ("", e.signal)]
+        spans = [(a, b - a) for a, b in ends if b > low and a < high]
+        if spans:
+            ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), color=colour, alpha=0.18, lw=0,
+                           zorder=-1)
+
+
+def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: Judged | None) -> str:
+    """Both faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
+    marks: dict[str, list[tuple[str, Estimate]]] = {}
+    for fault in (CLOGGING, FRICTION):
+        own = [("refined", sizes[fault.name])]
+        if grid is not None:
+            found = (("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
+                     ("grid, ramps", grid.ramp and grid.ramp.minimum))
+            own += [(label, _exact(float(getattr(point, fault.symbol)))) for label, point in found if point]
+        if judged is not None and fault == FRICTION:
+            own.append(("bands, ramps", _exact(judged.friction)))
+        marks[fault.name] = own
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 1.9), layout="constrained")
+        for ax, fault in zip(figure.subplots(1, 2), (CLOGGING, FRICTION), strict=True):
+            _sizes(ax, fault, marks[fault.name])
+        return svg(figure, "estimates")
+
+
+def _sizes(ax: Axes, fault: Fault, marks: list[tuple[str, Estimate]]) -> None:
+    end = max(ENDS[fault.name], *(1.05 * e.high for _, e in marks))
+    for low, high, colour in ((0.0, fault.middle, GREEN), (fault.middle, fault.most, AMBER), (fault.most, end, RED)):
+        ax.axvspan(low, high, color=colour, alpha=0.13, lw=0)
+    for row, (label, e) in enumerate(marks):
+        ax.errorbar(e.value, row, xerr=[[max(e.value - e.low, 0.0)], [max(e.high - e.value, 0.0)]], color=INK,
+                    marker="o" if label == "refined" else "D", ms=6 if label == "refined" else 4, capsize=3)
+    ax.set_yticks(range(len(marks)), [label for label, _ in marks])
+    ax.set_ylim(len(marks) - 0.5, -0.5)
+    ax.set_xlim(0.0, end)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("Kintas" if fault == CLOGGING else "FSS [N]")
+
+
+def _exact(value: float) -> Estimate:
+    return Estimate(value, value, value)
+
+
+def telling(found: Mapping[str, Precursor]) -> str:
+    """How many healthy standard deviations Table 2's lesser faults move each precursor by; "" without bands."""
+    known = [p for p in found.values() if np.isfinite(p.clogging_ratio) and np.isfinite(p.friction_ratio)]
+    if not known:
+        return ""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 0.8 + 0.3 * len(known)), layout="constrained")
+        ax = figure.subplots()
+        rows = np.arange(len(known))
+        series = ((f"Kintas {CLOGGING.middle:g}", [abs(p.clogging_ratio) for p in known], BLUE, -0.2),
+                  (f"FSS {FRICTION.middle:g} N", [abs(p.friction_ratio) for p in known], AMBER, 0.2))
+        for label, values, colour, offset in series:
+            ax.barh(rows + offset, values, height=0.38, color=colour, label=label)
+        ax.axvline(3.0, color=INK, lw=0.8, ls=":")
+        ax.set_xscale("log")
+        ax.set_xlim(left=0.1)
+        ax.set_yticks(rows, [p.words for p in known])
+        ax.invert_yaxis()
+        ax.grid(axis="y", visible=False)
+        ax.set_xlabel("shift over healthy scatter (dotted: 3, below it a single test does not tell)")
+        ax.legend(loc="lower right", frameon=False)
+        return svg(figure, "telling")

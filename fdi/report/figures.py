@@ -1,0 +1,192 @@
+"""The drawings of a report, as SVG text that stands inside an HTML page."""
+from __future__ import annotations
+
+import io
+import math
+import re
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from fdi.trace.trace import Trace
+
+Floats = NDArray[np.float64]
+INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
+STYLE: Any = {  # matplotlib's types want each key as a literal
+    "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
+    "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
+    "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+FAULT = "#ffd8a8"
+BRIDGED = 5  # cycles
+SHORTEST = 0.1  # us, the left end of a histogram; no clock here tells less
+COLUMNS = 1400  # a line is drawn by its extremes in this many columns; more cannot be seen
+PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
+          ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
+          ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
+          ("load", "load [kN]", 1e-3, "#57606a"))
+
+
+def signals(trace: Trace) -> str:
+    """Command and position, error, current, pressure and spool over one time axis, with sections and checks."""
+    error, calm = trace.com - trace.xj, _calm(trace)
+    values: dict[str, Floats] = {"xj": trace.xj, "error": error, "cor": trace.cor, "p12": trace.p12, "xs": trace.xs}
+    if np.nan_to_num(trace.load).any():
+        values["load"] = trace.load
+    if calm:
+        values["close"] = error
+    panels = [panel for panel in PANELS if panel[0] in values and not np.isnan(values[panel[0]]).all()]
+    heights = [1.7] * len(panels) + [0.15 * len(trace.checks) + 0.25] * bool(trace.checks)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 0.8 + sum(heights)), layout="constrained")
+        axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
+            if name == "xj":
+                ax.plot(*thin(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
+            ax.plot(*thin(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
+            _missing(ax, trace, values[name])
+            ax.set_ylabel(label)
+            if name == "close":
+                ax.set_ylim(-calm * scale, calm * scale)
+            _sections(ax, trace)
+            for fault, t0, t1 in faults(trace):
+                ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
+                if ax is axes[0]:
+                    foot = ax.get_xaxis_transform()
+                    ax.text(t0, 0.03, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
+        if trace.checks:
+            _windows(axes[-1], trace)
+        axes[-1].set_xlabel("time from the start of the main phase [s]")
+        axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
+        figure.align_ylabels()
+        return svg(figure, "signals")
+
+
+def faults(trace: Trace) -> list[tuple[str, float, float]]:
+    """The faults that the run injected: name, begin and end in s; one that is never over ends with the trace."""
+    begun: dict[str, float] = {}
+    spans = []
+    for event in trace.events:
+        name, _, word = event.text.rpartition(" ")
+        if event.kind == "fault" and word == "begins":
+            begun[name] = event.t
+        elif event.kind == "fault" and name in begun:
+            spans.append((name, begun.pop(name), event.t))
+    return spans + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
+
+
+def timing(trace: Trace) -> str:
+    """Histograms of lateness, response and work; "" for a trace without timing."""
+    columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
+               ("controller's response", trace.timing.response, "#d9730d"),
+               ("bench's own work", trace.timing.work, "#57606a"))
+    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, SHORTEST), colour)
+             for name, values, colour in columns if (values > 0).any()]
+    if not drawn:
+        return ""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 2.5), layout="constrained")
+        axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+        for ax, (name, values, colour) in zip(axes, drawn, strict=True):
+            low, high = math.log10(values.min()), math.log10(max(float(values.max()), 1.0))
+            ax.hist(values, bins=np.logspace(low, high + 0.02, 60).tolist(), color=colour, log=True)
+            ax.set_xscale("log")
+            ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
+            ax.set_xlabel(f"{name} [µs]")
+        axes[0].set_ylabel("cycles (dotted: p99)")
+        return svg(figure, "timing")
+
+
+def thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """The smallest and largest value of each of COLUMNS pieces, in their order: looks like the whole line."""
+    if len(t) <= 2 * COLUMNS:
+        return t, values
+    rows: list[int] = []
+    for piece in np.array_split(np.arange(len(t)), COLUMNS):
+        inside = values[piece]
+        if np.isnan(inside).all():
+            rows.append(int(piece[0]))
+        else:
+            rows += sorted({int(piece[np.nanargmin(inside)]), int(piece[np.nanargmax(inside)])})
+            rows += [int(piece[np.isnan(inside)][0])] if np.isnan(inside).any() else []
+    chosen = np.unique(rows)
+    return t[chosen], values[chosen]
+
+
+def _bridged(values: Floats) -> Floats:
+    """Straight lines over up to BRIDGED missing samples: a line of single samples would not be seen at all."""
+    known = np.flatnonzero(~np.isnan(values))
+    if not len(known):
+        return values
+    rows = np.arange(len(values))
+    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
+    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
+    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
+    return np.where(near, np.interp(rows, known, values[known]), values)
+
+
+def _missing(ax: Axes, trace: Trace, values: Floats) -> None:
+    """A red mark at the foot of the panel wherever samples are missing."""
+    pieces = np.array_split(np.isnan(values), min(COLUMNS, len(values)))
+    lost = np.array([piece.any() for piece in pieces])
+    starts = np.cumsum([0, *map(len, pieces)])
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
+    spans = [(float(trace.t[starts[a]]), float(starts[b] - starts[a]) * trace.period) for a, b in edges]
+    if spans:
+        ax.broken_barh(spans, (0.0, 0.04), transform=ax.get_xaxis_transform(), color=RED, lw=0.5, zorder=3)
+
+
+def _calm(trace: Trace) -> float:
+    """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
+    ramps = [np.arange(s.start, s.stop) for s in trace.sections() if s.kind == "ramp"]
+    error = np.abs(trace.com - trace.xj)[np.concatenate(ramps)] if ramps else np.empty(0)
+    error = error[~np.isnan(error)]
+    return 2.0 * float(np.percentile(error, 99)) if len(error) else 0.0
+
+
+def _sections(ax: Axes, trace: Trace) -> None:
+    for section in trace.sections():
+        if section.kind in ("ramp", "dynamic"):
+            ax.axvspan(float(trace.t[section.start]), float(trace.t[section.stop - 1]),
+                       color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
+
+
+def _windows(ax: Axes, trace: Trace) -> None:
+    """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
+    first, last = float(trace.t[0]), float(trace.t[-1])
+    room, span = 0.005 * (last - first), last - first
+    for row, check in enumerate(trace.checks):
+        t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
+        if math.isnan(check.t0) and math.isnan(check.value):
+            x, side, colour, name = first + room, "left", RED, f"{check.name}: not measured"
+        else:
+            ax.barh(row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED)
+            name = check.name
+            if last - t1 > 0.25 * span:
+                x, side, colour = t1 + room, "left", INK
+            elif t0 - first > 0.25 * span:
+                x, side, colour = t0 - room, "right", INK
+            else:
+                x, side, colour = t0 + room, "left", "white"
+        ax.text(x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True).set_in_layout(False)
+    ax.set_ylim(len(trace.checks) - 0.4, -0.6)
+    ax.set_yticks([])
+    ax.set_ylabel("checks")
+
+
+def svg(figure: Figure, salt: str) -> str:
+    """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures."""
+    out = io.StringIO()
+    with rc_context(STYLE | {"svg.hashsalt": salt}):  # ids must differ between the drawings of a page
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = out.getvalue()
+    return text[text.index("<svg"):]
+
+
+def smaller(drawing: str) -> str:
+    """The same drawing with one decimal of a point in its lines, for a file that is kept; words stay as they are."""
+    return re.sub(r'(?<= d=")[^"]*', lambda line: re.sub(r"(\d+\.\d)\d+", r"\1", line[0]), drawing)

@@ -1,0 +1,200 @@
+"""The paper's figures redrawn from runs of the rig, as SVG text that stands inside an HTML page.
+
+Figs. 7 and 8: what either fault does to a step and to a slow ramp. Figs. 10 to 12: a trace in the bands, position on a
+step, position on a ramp, speed on a ramp. Figs. 14 and 15: the RMS maps of the two worked cases.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from fdi.diagnosis.bands import Excursion
+from fdi.diagnosis.envelope import Bands, StepBand
+from fdi.diagnosis.rms_grid import LEFT, RIGHT, Grid, Map
+from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
+from fdi.trace.sections import Section
+from fdi.trace.trace import Trace
+
+Floats = NDArray[np.float64]
+COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
+AMBER = "#d9730d"
+SHOWN = 0.1  # s of a step
+LEVELS = 7  # contours
+
+
+def steps(traces: Mapping[str, Trace], number: int = 0) -> str:
+    """Fig. 7: position over the first 0.1 s of a step, one line a trace, the same command in each.
+
+    Args:
+        traces: by what the legend says.
+        number: which of the command's steps, from 0.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9, 3.6), layout="constrained")
+        near, far = figure.subplots(1, 2, width_ratios=(3, 2))
+        for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
+            s = _section(trace, "step", number)
+            rows = slice(s.start, s.start + round(SHOWN / trace.period))
+            t = (np.arange(s.start, rows.stop) - s.start) * trace.period * 1e3
+            for ax in (near, far):
+                ax.plot(t, trace.xj[rows] * 1e3, color=colour, lw=1.2, label=label)
+        for ax in (near, far):
+            ax.axhline(s.last * 1e3, color=COMMAND, lw=1.0, ls=":")
+            ax.set_xlabel("time from the step [ms]")
+        size = s.last - s.first
+        far.set_ylim(*sorted(((s.last - 0.02 * size) * 1e3, (s.last + 0.14 * size) * 1e3)))
+        far.set_title("overshoot, close up", fontsize=9)
+        near.set_ylabel("position [mm]")
+        near.legend(loc="center right", frameon=False)
+        return svg(figure, "steps")
+
+
+def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
+    """Fig. 8: position over a slow ramp and its error, one line a trace; as `steps`."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9, 4.6), layout="constrained")
+        way, error = figure.subplots(2, 1, sharex=True)
+        for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
+            s = _section(trace, "ramp", number)
+            t, rows = _time(trace, s), slice(s.start, s.stop)
+            way.plot(*thin(t, trace.xj[rows] * 1e3), color=colour, lw=1.0, label=label)
+            error.plot(*thin(t, (trace.com - trace.xj)[rows] * 1e6), color=colour, lw=1.0)
+        way.plot(t, trace.com[rows] * 1e3, color=COMMAND, lw=1.0, ls=":", label="command")
+        way.set_ylabel("position [mm]")
+        error.set_ylabel("error [µm]")
+        error.set_xlabel("time [s]")
+        way.legend(loc="lower right" if s.rate > 0 else "upper right", frameon=False)
+        return svg(figure, "ramps")
+
+
+def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
+    """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): a trace in the bands.
+
+    A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
+
+    Args:
+        excursions: of the trace, from `fdi.diagnosis.bands.excursions`; positive is towards the fault.
+        friction: N, that a step is allowed, from there too.
+        bands: what they are excursions from.
+        trace: their trace.
+        kind: of the sections, "step" or "ramp".
+        signal: "position" or "speed".
+
+    Returns:
+        SVG, or "" where there is no such section.
+    """
+    chosen = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.judged]
+    if not chosen:
+        return ""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9, 3.2), layout="constrained")
+        axes = figure.subplots(1, len(chosen), sharey=kind == "ramp", squeeze=False)[0]
+        for ax, e in zip(axes, chosen, strict=True):
+            if kind == "step":
+                band = _band(bands, trace, e)
+                _on_step(ax, trace, e, band, band.centre(friction, bands.friction)[0])
+            else:
+                _on_ramp(ax, trace, e)
+            size = (e.section.last - e.section.first) * 1e3
+            ax.set_title(f"{kind} of {size:+.2g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
+        unit = "mm" if kind == "step" else "departure, µm" if signal == "position" else "departure, mm/s"
+        axes[0].set_ylabel(f"{signal} [{unit}]")
+        axes[0].legend(loc="best", frameon=True, edgecolor="none", fontsize=7)
+        return svg(figure, f"banded {kind} {signal}")
+
+
+def _band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
+    """The band that a step was held against."""
+    own = [s for s in trace.sections() if s.kind in ("step", "ramp")]
+    known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
+    return next(step for step in bands.steps if step.section == known[own.index(e.section)])
+
+
+def _on_step(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Floats) -> None:
+    """Position near a step's end, the healthy response with the friction there is, and the limits where they hold."""
+    rows = slice(e.start, e.start + len(e.departure))
+    t, x = (trace.t[rows] - trace.t[e.section.start]) * 1e3, trace.xj[rows] * 1e3
+    held = np.isfinite(e.departure)
+    healthy = np.interp(t * 1e-3, band.t, centre) * 1e3
+    side = np.sign(np.interp(t * 1e-3, band.t, band.middle)) * 1e3
+    ax.plot(t, healthy, color=GREEN, lw=1.0, label="healthy")
+    ax.plot(t, x, color=INK, lw=1.0, label="measured")
+    for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
+        ax.plot(t, np.where(held, healthy + side * limit, np.nan), color=colour, lw=1.6, label=label)
+    with np.errstate(invalid="ignore"):
+        beyond = np.where(e.departure > e.middle, x, np.nan)
+    ax.plot(t, beyond, color=RED, lw=3.5, alpha=0.5, label="outside")
+    size = abs(e.section.last - e.section.first) * 1e3
+    ax.set_ylim(e.section.last * 1e3 - 0.3 * size, e.section.last * 1e3 + 0.3 * size)
+    ax.set_xlabel("time from the step [ms]")
+
+
+def _on_ramp(ax: Axes, trace: Trace, e: Excursion) -> None:
+    """Departure from the healthy centre over time, either way."""
+    scale = 1e6 if e.signal == "position" else 1e3
+    t = trace.t[e.start:e.start + len(e.departure)]
+    ax.fill_between(t, 0.0 * e.middle, e.middle * scale, color=GREEN, alpha=0.10, lw=0)
+    for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
+        ax.plot(t[[0, -1]], limit[[0, -1]] * scale, color=colour, lw=1.0, label=label)
+    ax.plot(*thin(t, e.departure * scale), color=INK, lw=0.8, label="measured")
+    with np.errstate(invalid="ignore"):
+        beyond = np.where(e.departure > e.middle, e.departure, np.nan)
+    ax.plot(*thin(t, beyond * scale), color=RED, lw=1.6, label="outside")
+    ax.set_ylim(0.0, 1.1 * scale * max(float(np.nanmax(e.departure)), float(e.most[0])))
+    ax.set_xlabel("time [s]")
+
+
+def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
+    """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
+
+    Args:
+        grid: from `fdi.diagnosis.rms_grid.search`.
+        truth: the faults' sizes (Kintas, FSS in N), where they are known.
+    """
+    drawn = [(name, m, letter) for name, m, letter in (
+        ("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C")) if m]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(3.7 * len(drawn), 3.5), layout="constrained")
+        axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
+        for ax, (name, m, letter) in zip(axes, drawn, strict=True):
+            _map(ax, grid, m, letter)
+            if m is grid.joint:
+                ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
+            ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} µm at {letter}", fontsize=9)
+            ax.set_xlabel("Kintas")
+            if truth:
+                ax.plot(*truth, "x", color="white", ms=9, mew=1.6, label="injected")
+        if grid.step and grid.ramp:
+            for ax in axes[:2]:
+                ax.plot(*zip(LEFT, RIGHT, strict=True), color="white", lw=0.8, ls="--")
+                ax.plot(grid.merged.kintas, grid.merged.fss, "D", color="#ffd33d", ms=5, mec=INK, label="G")
+        axes[0].set_ylabel("FSS [N]")
+        for ax in axes:
+            ax.legend(loc="upper right", fontsize=7)
+        return svg(figure, "maps")
+
+
+def _map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
+    """One map as an image of its logarithm, with contours and its minimum."""
+    half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
+    box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
+    level: Any = np.log10(m.rms.T * 1e6)
+    ax.imshow(level, origin="lower", extent=box, aspect="auto", cmap="viridis", interpolation="none")
+    if min(level.shape) > 1:
+        ax.contour(grid.kintas, grid.fss, level, LEVELS, colors="white", linewidths=0.4, alpha=0.6)
+    ax.plot(m.minimum.kintas, m.minimum.fss, "o", color=RED, ms=6, mec="white", label=letter)
+    ax.grid(False)
+
+
+def _section(trace: Trace, kind: str, number: int) -> Section:
+    return [s for s in trace.sections() if s.kind == kind][number]
+
+
+def _time(trace: Trace, s: Section) -> Floats:
+    return trace.t[s.start:s.stop]

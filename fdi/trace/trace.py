@@ -1,0 +1,283 @@
+"""A captured run as numpy columns: the one thing that crosses from the rig to analysis."""
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.trace.csv_table import read_csv, write_csv
+from fdi.trace.foreign import read_foreign, recorded_by
+from fdi.trace.mcap_log import Log, open_log
+from fdi.trace.sections import Section, sections
+from plant.errors import InputError
+
+Floats = NDArray[np.float64]
+Messages = list[tuple[int, Any]]  # (time ns, protobuf message)
+
+REQUIRED = ("t", "com", "xj", "cor")
+OPTIONAL = ("p12", "xs", "load")
+UNITS = {"t": "s", "com": "m", "xj": "m", "cor": "A", "p12": "Pa", "xs": "m", "load": "N"}
+SETUP, MAIN, CLEANUP = 0, 1, 2
+
+
+class Gap(NamedTuple):
+    """Cycles that have no row at all."""
+
+    t0: float  # s, last row before
+    t1: float  # s, first row after
+    cycles: int
+
+
+class Event(NamedTuple):
+    """Something that happened once."""
+
+    t: float  # s
+    level: str  # INFO, WARN, ERROR
+    kind: str
+    text: str
+
+
+class Nmt(NamedTuple):
+    """A node's NMT state from this time on."""
+
+    t: float  # s
+    node: int
+    code: int  # CiA 301: 0 boot-up, 4 stopped, 5 operational, 127 pre-operational
+    name: str
+
+
+class Check(NamedTuple):
+    """A judged measurement; NaN limits and window ends mean none."""
+
+    name: str
+    kind: str  # overshoot, settling_time, ...
+    signal: str
+    value: float
+    unit: str
+    low: float
+    high: float
+    passed: bool
+    t0: float  # s
+    t1: float  # s
+    detail: str
+
+
+class Timing(NamedTuple):
+    """When each cycle ran: columns of shape (cycles,), wall-clock seconds."""
+
+    t: Floats  # s, on the trace's own axis
+    lateness: Floats
+    response: Floats  # NaN: no answer
+    work: Floats
+    overrun: NDArray[np.bool_]
+
+
+_NONE = np.empty(0)
+NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One row per cycle, also for cycles that are missing: their samples are NaN. Row k holds Com_k, XJ_k, Cor_k.
+
+    Columns have shape (n,) and SI units; a signal that was not measured is NaN throughout. t = 0 is where
+    the main phase starts.
+    """
+
+    t: Floats
+    com: Floats
+    xj: Floats
+    cor: Floats
+    p12: Floats
+    xs: Floats
+    load: Floats
+    period: float  # s
+    phase: NDArray[np.int64]  # 0 set-up, 1 main, 2 clean-up
+    gaps: tuple[Gap, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # what reading had to leave out
+    events: tuple[Event, ...] = ()
+    checks: tuple[Check, ...] = ()
+    nmt: tuple[Nmt, ...] = ()
+    timing: Timing = NO_TIMING
+    attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
+    units: Mapping[str, str] = field(default_factory=lambda: dict(UNITS))
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @classmethod
+    def read(cls, path: str | Path, *, all: bool = False) -> Trace:
+        """Read trace.mcap (its main phase, or every phase with `all`), a run's folder, .csv or .csv.gz.
+
+        Raises InputError, naming file, line or field, for what cannot be a trace.
+        """
+        path = Path(path)
+        if path.is_dir():
+            path /= "trace.mcap"
+        if path.suffix == ".mcap":
+            return _from_log(open_log(path), all)
+        if path.name.endswith((".csv", ".csv.gz")):
+            return _from_csv(path)
+        raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
+        """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
+        grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
+        return _trace(grid, period, [], provenance=dict(provenance))
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the columns that hold at least one sample, t aside."""
+        return tuple(name for name in (*REQUIRED[1:], *OPTIONAL) if not np.isnan(getattr(self, name)).all())
+
+    def column(self, name: str) -> Floats:
+        """A column by name. Raises KeyError."""
+        if name not in UNITS:
+            raise KeyError(name)
+        values: Floats = getattr(self, name)
+        return values
+
+    def sections(self) -> list[Section]:
+        """Hold, step, ramp and dynamic sections of the command in this trace."""
+        return sections(self.com, self.period)
+
+    def write_csv(self, path: str | Path) -> None:
+        """Write t and the measured signals; missing cycles become gaps in t. Raises InputError."""
+        names = ("t", *REQUIRED[1:], *(name for name in OPTIONAL if name in self.signals))
+        there = ~np.all([np.isnan(self.column(name)) for name in names[1:]], axis=0)
+        write_csv(Path(path), {name: self.column(name)[there] for name in names})
+
+
+def _from_csv(path: Path) -> Trace:
+    plant = recorded_by(path)
+    if plant and plant.table:
+        columns, unknown = read_foreign(path, plant.table)
+    else:
+        columns, unknown = read_csv(path, REQUIRED, OPTIONAL)
+    t = columns.pop("t")
+    if len(t) < 2:
+        raise InputError(path, "t", "at least two rows")
+    typical = float(np.percentile(np.diff(t), 50, method="lower"))
+    rows = np.concatenate([[0], np.cumsum(np.rint(np.diff(t) / typical).astype(int))])
+    if (np.diff(rows) < 1).any():
+        line = int(np.argmin(np.diff(rows))) + 3
+        raise InputError(f"{path}: line {line}", "t", f"one row per cycle of {typical:g} s")
+    period = round(float(t[-1] - t[0]) / float(rows[-1]), 9)
+    grid, gaps = _on_grid(path, rows, {**columns, "t": t})
+    lost = np.isnan(grid["t"])
+    grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
+    return _trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
+                  units=UNITS | ({"cor": plant.unit} if plant else {}),
+                  notes=tuple(f"column {name} is not known and was left out" for name in unknown))
+
+
+def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Gap]]:
+    """Spread columns, shape (m,), over all cycles 0..rows[-1]: NaN where there is none; and the gaps, in rows."""
+    n = int(rows[-1]) + 1
+    if n > 100 * len(rows) + 100_000:
+        raise InputError(path, "t", f"gaps that leave more than {len(rows)} of {n} cycles")
+    out = {}
+    for name, values in columns.items():
+        out[name] = np.full(n, math.nan)
+        out[name][rows] = values
+    return out, [Gap(float(a), float(b), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1]
+
+
+def _trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: object) -> Trace:
+    t = grid["t"]
+    nothing = np.full(len(t), math.nan)
+    columns = {name: grid.get(name, nothing) for name in (*REQUIRED, *OPTIONAL)}
+    more.setdefault("phase", np.full(len(t), MAIN))
+    in_seconds = tuple(Gap(float(t[int(g.t0)]), float(t[int(g.t1)]), g.cycles) for g in gaps)
+    return Trace(**columns, period=period, gaps=in_seconds, **more)  # type: ignore[arg-type]
+
+
+def _from_log(log: Log, everything: bool) -> Trace:
+    signals, timing, rest = _messages(log)
+    run = dict(log.metadata.get("run", {}))
+    if not signals:
+        raise InputError(log.path, "/signals", "at least one cycle")
+    names = ("com", "xj", "cor", "p12", "xs", "load")
+    table = np.array([(time_ns, m.cycle, m.phase, *(getattr(m, name) for name in names)) for time_ns, m in signals])
+    table = table[np.argsort(table[:, 1], kind="stable")]
+    cycle, phase = table[:, 1].astype(int), table[:, 2].astype(int)
+    if (np.diff(cycle) == 0).any():
+        raise InputError(log.path, "/signals.cycle", f"each cycle once, not {cycle[:-1][np.diff(cycle) == 0][0]} again")
+    period = _period(log, run, table[:, 0] * 1e-9, cycle)
+    main = np.flatnonzero(phase == MAIN)
+    if not everything and not len(main):
+        raise InputError(log.path, "/signals.phase", "a main phase; this run ended in its set-up")
+    first = main[0] if len(main) else 0
+    kept = slice(None) if everything else slice(main[0], main[-1] + 1)
+    seconds = _seconds(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
+    rows = cycle[kept] - cycle[kept][0]
+    grid, gaps = _on_grid(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
+                          | {"phase": phase[kept].astype(float)})
+    grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
+    numbers = grid.pop("phase")
+    filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
+    return _trace(grid, period, gaps, phase=filled.astype(int), provenance=_provenance(log, run),
+                  units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
+                  timing=_timing([m for _, m in timing], cycle[kept], int(cycle[first]), period),
+                  events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
+                  nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
+                  checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
+
+
+def _messages(log: Log) -> tuple[Messages, Messages, dict[str, Messages]]:
+    found: dict[str, Messages] = {name: [] for name in ("/signals", "/timing", "/events", "/nmt", "/checks")}
+    for topic, time_ns, message in log.messages(*found):
+        found[topic].append((time_ns, message))
+    return found.pop("/signals"), found.pop("/timing"), found
+
+
+def _period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
+    """The run's own figure, else the median over the cycles, to the microsecond."""
+    try:
+        return float(run["period"])
+    except KeyError:
+        return round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
+    except ValueError as error:
+        raise InputError(log.path, "metadata run.period", f"seconds, not {run['period']!r}") from error
+
+
+def _provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
+    """The record `run` as it is; other metadata records with their name in front (`verdict.status`)."""
+    more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
+            for key, value in record.items()}
+    return {"source": log.path.name, **run, **more}
+
+
+def _seconds(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:
+    """Log time, ns, to s on the rows' own axis, where a cycle is one period long however long it took.
+
+    Rows were logged at `time_ns` and stand at `t`, shape (rows,) both; a real-time run that was late by whole periods
+    has jumps in the first and none in the second. Before the first row and after the last a second is a second.
+    """
+    logged = np.maximum.accumulate(time_ns - zero_ns) / 1e9
+
+    def seconds(at_ns: float) -> float:
+        at = (at_ns - zero_ns) / 1e9
+        beyond = min(at - logged[0], 0.0) + max(at - logged[-1], 0.0)
+        return round(float(np.interp(at, logged, t) + beyond), 9)
+
+    return seconds
+
+
+def _timing(records: list[Any], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
+    """Of the cycles that have a row; t = 0 at cycle `zero`."""
+    wanted = set(cycles.tolist())
+    kept = [((m.cycle - zero) * period, m.lateness, m.response, m.work, m.overrun) for m in records
+            if m.cycle in wanted]
+    if not kept:
+        return NO_TIMING
+    t, lateness, response, work, overrun = (np.array(column) for column in zip(*kept, strict=True))
+    return Timing(np.round(t, 9), lateness, response, work, overrun)

@@ -1,0 +1,75 @@
+"""`rig node`: one node of the bench on a bus, to face real hardware."""
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from rig.cli import options
+
+if TYPE_CHECKING:
+    from rig.network.frame import Node, Send
+
+HELP = "run one node (plant or controller) on a bus, to face real hardware"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this command alone."""
+    parser.add_argument("node", choices=("plant", "controller"), help="which node to be")
+    parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+                        help="such as socketcan:vcan0 or udp_multicast (default: what EHA_RIG_BUS names)")
+    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # ends when this process does
+    options.add_model(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Be the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it.
+
+    --model, --set and --seed are what it is until a rig loads something else, for a bus with another master.
+    """
+    import signal
+
+    from plant import InputError
+    from rig.network.bus import choose, open_can
+    from rig.network.clock import WallClock
+    from rig.network.link import Link
+    from rig.network.wire import serve
+    from rig.run.participants import EMBEDDED
+    from rig.run.priority import elevated
+
+    bus, _ = choose(args.bus)
+    if bus.partition(":")[0] in EMBEDDED:
+        raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+    make = maker(args)
+    clock = WallClock()
+    link = Link(open_can(bus), clock.now)
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda got, frame: ended.append(got))
+    node = make(link.send)
+    if not args.quiet:
+        print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
+    try:
+        with elevated():
+            serve(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
+    finally:
+        link.close()
+    if not args.quiet:
+        print(f"{args.node}: frames lost on the way in {link.overflows}, not sent {link.unsent}, "
+              f"error frames {link.error_frames}")
+    return 0
+
+
+def maker(args: argparse.Namespace) -> Callable[[Send], Node]:
+    """What builds the node that the options describe."""
+    from rig.nodes.emulator import Emulator
+    from rig.nodes.firmware import Firmware, gains_of
+    from rig.nodes.scenario import Scenario, require_servovalve
+    from rig.sequences.faults import Plan
+
+    model = options.model_of(args)
+    require_servovalve(model)
+    if args.node == "plant":
+        return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
+    return lambda send: Firmware(send, gains_of(model), model)

@@ -1,0 +1,73 @@
+"""`rig simulate`: run a model on a command, without a bus, and write a trace."""
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from rig.cli import options
+
+HELP = "run a model on a command, write a trace"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this command alone."""
+    options.add_model(parser)
+    parser.add_argument("--command", dest="command_file", metavar="FILE",
+                        help="CSV with t,com and optionally load; default: the main phase of preflight. Of rows up to "
+                             "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
+    parser.add_argument("--steps", type=options.whole, default=None, metavar="N",
+                        help="plant steps a cycle (default 100)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a model closed loop over a command and write t,com,xj,cor,p12,xs,load (default: simulation.csv)."""
+    from pathlib import Path
+
+    from fdi.trace.trace import Trace
+    from plant import InputError, simulate
+    from plant.model import STEPS
+
+    model = options.model_of(args)
+    com, load, name = command_of(args.command_file, model["controller.period"])
+    if args.steps == 0:
+        raise InputError("--steps", "0", "at least 1 step a cycle")
+    columns = simulate(model, com, load, args.seed, args.steps or STEPS)
+    out = Path(args.out or "simulation.csv")
+    if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
+        raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
+    trace = Trace.of(columns._asdict(), model["controller.period"], {
+        "model": model.name, "seed": str(args.seed), "command": name})
+    if out.suffix == ".mcap":
+        from rig.recorder.convert import write_mcap
+
+        write_mcap(trace, out)
+    else:
+        trace.write_csv(out)
+    error = columns.com - columns.xj
+    summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * model["controller.period"],
+               "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
+    if args.json:
+        print(json.dumps(summary))
+    elif not args.quiet:
+        print(f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
+              f"{summary['rms_error'] * 1e6:.1f} um RMS, {summary['max_error'] * 1e6:.0f} um at most")
+    return 0
+
+
+def command_of(file: str | None, period: float) -> tuple[Any, Any, str]:
+    """Demand and load of every cycle of `period` s, and what to call them."""
+    import numpy as np
+
+    from plant.profile import on_cycles, read_command
+    from plant.segments import RATE
+
+    if file is not None:
+        com, load = read_command(file, period)
+        return com, load, file
+    from rig.sequences import load_sequence
+
+    sequence = load_sequence("preflight")
+    command, force = sequence.main_profile().command, sequence.load_profile()
+    t = np.arange(len(command)) / RATE  # the bench's cycles
+    return on_cycles(t, command, period), on_cycles(t, force, period), "preflight"

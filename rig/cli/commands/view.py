@@ -1,0 +1,52 @@
+"""`rig view`: a trace in the rerun viewer."""
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+HELP = "open the rerun viewer on a trace (or save its recording, or a picture of it)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this command alone."""
+    parser.add_argument("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV")
+    parser.add_argument("--save", metavar="FILE.rrd", help="write the recording and do not open the viewer")
+    parser.add_argument("--headless", action="store_true", help="open no window; with --screenshot")
+    parser.add_argument("--screenshot", metavar="FILE.png",
+                        help="draw without a display, check that every view holds its lines, save the picture")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Open the viewer on 127.0.0.1, or do what --save and --screenshot say."""
+    from plant.errors import InputError
+
+    if args.headless and not args.screenshot:
+        raise InputError("--headless", "", "--screenshot FILE.png with it")
+    from fdi.output import writable
+    from fdi.trace.trace import Trace
+    from rig.view import rerun_log, viewer
+
+    source = Path(args.trace)
+    trace = Trace.read(source, all=True)
+    save = args.save or args.out
+    if save is not None:
+        rrd = writable(save, "--save" if args.save else "--out", source=source)
+    elif args.screenshot:
+        rrd = writable(Path(args.screenshot).with_suffix(".rrd"), "--screenshot", source=source)
+    else:
+        rrd = (source if source.is_dir() else source.parent) / (source.name.split(".")[0] + ".rrd")
+    if args.screenshot:
+        writable(args.screenshot, "--screenshot", source=source)
+    rerun_log.write_rrd(trace, rrd)
+    answer: dict[str, object] = {"rrd": str(rrd)}
+    if args.screenshot:
+        answer["screenshot"] = args.screenshot
+        answer["pixels"] = viewer.screenshot(trace, rrd, Path(args.screenshot))
+    elif save is None:
+        viewer.open_viewer(rrd)
+    if args.json:
+        print(json.dumps(answer))
+    elif not args.quiet:
+        print("\n".join(str(path) for path in (rrd, args.screenshot) if path))
+    return 0

@@ -1,0 +1,1 @@
+"""Buses, links, wire, clock, codec and the CANopen master."""

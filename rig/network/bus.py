@@ -1,0 +1,165 @@
+"""Buses: the embedded one, that needs nothing from the machine, and python-can's, opened from one line of text."""
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import can
+
+from plant.errors import InputError, RigError
+from rig.network.frame import Frame, Node, Send
+from rig.network.udp import LoopbackBus
+
+VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
+BITRATE = 1_000_000  # bit/s
+_GROUP = "239.74.163.2"  # python-can's IPv4 default
+_NETWORK = Path("/sys/class/net")
+_ARPHRD_CAN = "280"
+_SPECS = "auto, embedded, virtual[:NAME], udp_multicast[:GROUP], socketcan:INTERFACE or a python-can INTERFACE:CHANNEL"
+
+AnyNode = TypeVar("AnyNode", bound=Node)
+Receive = Callable[[Frame], None]
+
+
+class Embedded:
+    """An in-process bus in one thread. Frames wait in one queue and are delivered in the order they were sent.
+
+    There is no arbitration and no bit time: the order is the nodes' doing, which is what makes a lockstep run repeat.
+    """
+
+    def __init__(self) -> None:
+        self._receivers: list[Receive] = []
+        self._others: list[list[Receive]] = []  # for each node, everybody else
+        self._queue: deque[tuple[list[Receive], int, bytes]] = deque()
+
+    def attach(self, receive: Receive) -> Send:
+        """A node joins: `receive` gets every frame of the others; what is returned sends."""
+        others = list(self._receivers)
+        for each in self._others:
+            each.append(receive)
+        self._receivers.append(receive)
+        self._others.append(others)
+        enqueue = self._queue.append
+
+        def send(cob_id: int, data: bytes) -> None:
+            enqueue((others, cob_id, data))
+
+        return send
+
+    def add(self, make: Callable[[Send], AnyNode]) -> AnyNode:
+        """Build a node that needs its `send` at birth, and attach it: `add(lambda send: Device(2, EDS[2], send))`."""
+        nodes: list[AnyNode] = []
+        send = self.attach(lambda frame: nodes[0].receive(frame))
+        nodes.append(make(send))
+        return nodes[0]
+
+    def deliver(self, t_ns: int) -> int:
+        """Hand the queued frames to all nodes but their senders, as of `t_ns`, until no node has more to say.
+
+        Returns the number of frames.
+        """
+        queue, count = self._queue, 0
+        while queue:
+            others, cob_id, data = queue.popleft()
+            frame = Frame(t_ns, cob_id, data)
+            for receive in others:
+                receive(frame)
+            count += 1
+        return count
+
+
+def choose(spec: str = "auto") -> tuple[str, str]:
+    """The bus to use for what the user wrote, and a sentence saying why.
+
+    `auto` is the bus that EHA_RIG_BUS names, else the embedded one: nothing sends on hardware unasked. Raises
+    InputError for a spec that means nothing, RigError for a CAN interface that is not there, also when the variable
+    names it: a bench that was told to use hardware must not pass on its own simulation.
+    """
+    configured = os.environ.get(VARIABLE, "")
+    if spec == "auto" and configured in ("", "auto"):
+        live = can_interfaces()
+        unasked = f"; {', '.join(live)} up, but not taken unasked" if live else ""
+        return "embedded", f"embedded bus: no --bus and no {VARIABLE}{unasked}"
+    where, taken = (VARIABLE, configured) if spec == "auto" else ("--bus", spec)
+    kind, channel = _split(taken, where)
+    if kind == "socketcan":
+        _require_live(channel)
+    return taken, f"{taken}, as {VARIABLE} says" if where == VARIABLE else f"{taken}, as asked"
+
+
+def open_can(spec: str) -> can.BusABC:
+    """Open a python-can bus: `virtual[:NAME]`, `udp_multicast[:GROUP]` (this machine only), `socketcan:INTERFACE`, or
+    any other interface python-can knows, at 1 Mbit/s.
+
+    Raises InputError for a bad spec, RigError if the bus cannot be had.
+    """
+    kind, channel = _split(spec, "--bus")
+    if kind == "embedded":
+        raise InputError("--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+    if kind == "socketcan":
+        _require_live(channel)
+    try:
+        if kind == "virtual":
+            return can.Bus(interface="virtual", channel=channel)
+        if kind == "udp_multicast":
+            return LoopbackBus(channel)
+        return can.Bus(interface=kind, channel=channel, bitrate=BITRATE)
+    except (can.CanError, OSError, ImportError, ValueError) as error:
+        raise RigError(f"{spec}: {error}".replace("\n", " ")) from error
+
+
+def can_interfaces() -> list[str]:
+    """The kernel's CAN interfaces that are up, real and virtual."""
+    found = _NETWORK.glob("*/type") if _NETWORK.exists() else []
+    names = sorted(path.parent.name for path in found if path.read_text().strip() == _ARPHRD_CAN)
+    return [name for name in names if not socketcan_problem(name)]
+
+
+def socketcan_problem(interface: str) -> str:
+    """Why a kernel CAN interface cannot be used and how to get it, in one line; empty if it can."""
+    virtual = interface.startswith("vcan")
+    up = f"sudo ip link set {interface} up" + ("" if virtual else f" type can bitrate {BITRATE}")
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return "this kernel has no SocketCAN; tests/vcan/guest.sh COMMAND runs a command on a guest kernel with vcan0"
+    folder = _NETWORK / interface
+    if not folder.exists():
+        make = f"sudo modprobe vcan && sudo ip link add {interface} type vcan && " if virtual else ""
+        return f"there is no interface {interface} here; {make}{up}"
+    if (folder / "type").read_text().strip() != _ARPHRD_CAN:
+        return f"{interface} is not a CAN interface"
+    if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
+        return f"{interface} is down; {up}"
+    return ""
+
+
+def _require_live(interface: str) -> None:
+    problem = socketcan_problem(interface)
+    if problem:
+        raise RigError(f"socketcan:{interface}: {problem}")
+
+
+def _split(spec: str, where: str) -> tuple[str, str]:
+    """Kind and channel of a spec, defaults filled in. Raises InputError."""
+    kind, _, channel = spec.partition(":")
+    if kind == "embedded" and not channel:
+        return kind, ""
+    if kind == "virtual":
+        return kind, channel or "eha-rig"
+    if kind == "udp_multicast":
+        group = channel or _GROUP
+        try:
+            if ipaddress.IPv4Address(group).is_multicast:
+                return kind, group
+        except ValueError:
+            pass
+        raise InputError(where, spec, "an IPv4 multicast group, such as udp_multicast:239.0.0.1")
+    if kind in can.VALID_INTERFACES and channel:
+        return kind, channel
+    raise InputError(where, spec, _SPECS)

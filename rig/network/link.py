@@ -1,0 +1,120 @@
+"""A node on a python-can bus, in the caller's own thread: python-can's notifier thread is ms late."""
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+
+import can
+from can.interfaces.socketcan import SocketcanBus
+
+from plant.errors import RigError
+from rig.network.frame import Frame
+
+_CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
+_TIMESPEC = struct.Struct("@qq")
+_EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
+_CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40  # asm-generic/socket.h
+_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
+_QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
+
+
+class Link:
+    """Frames of one bus, with the times of `clock` (ns since the run began). The link owns the bus.
+
+    Counted, to be read at any time: `error_frames` of the controller; `overflows`, frames lost on the way in;
+    `dropped`, frames that are not classical 11-bit data frames; `unsent`, frames the full transmit queue refused.
+    """
+
+    def __init__(self, bus: can.BusABC, clock: Callable[[], int]) -> None:
+        self.error_frames = self.dropped = self.unsent = 0
+        self._bus, self._clock = bus, clock
+        self._in_controller = self._in_kernel = 0  # where frames overflowed
+        self._socket: socket.socket | None = None
+        if isinstance(bus, SocketcanBus):
+            self._socket = bus.socket
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+
+    @property
+    def overflows(self) -> int:
+        return self._in_controller + self._in_kernel + int(getattr(self._bus, "overflows", 0))
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Put one frame on the bus. Raises RigError when the bus is gone."""
+        try:
+            if self._socket is not None:
+                frame = _CAN_FRAME.pack(cob_id, len(data), data)
+                self._socket.send(frame, socket.MSG_DONTWAIT)
+            else:
+                self._bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+        except OSError as error:
+            if error.errno not in _QUEUE_FULL:
+                raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
+            self.unsent += 1
+        except can.CanError as error:
+            raise RigError(str(error)) from error
+
+    def poll(self, timeout: float = 0.0) -> list[Frame]:
+        """All frames waiting; if there are none, wait up to `timeout` seconds for the first.
+
+        On socketcan the kernel's time of reception counts, elsewhere the time of this call. Raises RigError when the
+        bus is gone.
+        """
+        try:
+            return self._poll_messages(timeout) if self._socket is None else self._poll_socket(self._socket, timeout)
+        except can.CanError as error:
+            raise RigError(str(error)) from error
+        except OSError as error:
+            raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Give the bus back."""
+        self._bus.shutdown()
+
+    def _poll_messages(self, timeout: float) -> list[Frame]:
+        frames = []
+        message = self._bus.recv(timeout)
+        while message is not None:
+            if message.is_error_frame:
+                self.error_frames += 1
+            elif message.is_extended_id or message.is_remote_frame or message.is_fd:
+                self.dropped += 1
+            else:
+                frames.append(Frame(self._clock(), message.arbitration_id, bytes(message.data)))
+            message = self._bus.recv(0)
+        return frames
+
+    def _poll_socket(self, raw: socket.socket, timeout: float) -> list[Frame]:
+        frames: list[Frame] = []
+        if timeout > 0:
+            select.select([raw], [], [], timeout)
+        epoch = time.time_ns() - self._clock()  # the kernel stamps with the wall clock
+        while True:
+            try:
+                data, ancillary, _, _ = raw.recvmsg(_CAN_FRAME.size, _ANCILLARY, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return frames
+            t_ns = self._clock()
+            for _, kind, value in ancillary:
+                if kind == _SO_TIMESTAMPNS:
+                    seconds, ns = _TIMESPEC.unpack(value)
+                    t_ns = seconds * 1_000_000_000 + ns - epoch
+                elif kind == _SO_RXQ_OVFL:
+                    self._in_kernel = int.from_bytes(value, "little")
+            identifier, length, payload = _CAN_FRAME.unpack(data)
+            if identifier < _ERROR:
+                frames.append(Frame(t_ns, identifier, payload[:length]))
+            else:
+                self._count(identifier, payload)
+
+    def _count(self, identifier: int, payload: bytes) -> None:
+        """An error frame, or one the bench has no use for."""
+        if identifier & _ERROR:
+            self.error_frames += 1
+            self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
+        else:
+            self.dropped += 1

@@ -1,0 +1,226 @@
+"""Node 1, the rig: NMT master, SYNC producer, SDO client; services by the `canopen` library, cyclic frames by hand.
+
+The library gets its frames through `Network.notify` and blocks nowhere: its SDO client waits by letting the wire bring
+frames in, so one thread does all and the embedded bus needs no other.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import canopen
+from canopen.emcy import EmcyError
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from dbc import EDS
+from plant.errors import RigError
+from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from rig.device.nmt import NmtState
+from rig.network import codec
+from rig.network.frame import Frame
+from rig.network.wire import Wire
+from rig.nodes import firmware
+from rig.nodes.emulator import SCENARIO
+from rig.nodes.firmware import GAINS, Gains
+
+NODE, CONTROLLER, PLANT = 1, 2, 3
+HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
+PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
+BOOT_TIMEOUT = 2.0  # s
+SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
+_OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
+NAMES = {NODE: "rig", CONTROLLER: "controller", PLANT: "plant"}
+
+
+class BusError(RigError):
+    """A node does not answer, or answers with a refusal."""
+
+
+class _Sdo(SdoClient):
+    """The library's client, but waiting means letting frames come in."""
+
+    def read_response(self) -> Any:
+        network: Any = self.network
+        wire: Wire = network.wire
+        wire.wait(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
+        if self.responses.empty():
+            raise SdoCommunicationError("No SDO response received")
+        return super().read_response()
+
+
+class _Node(canopen.RemoteNode):
+    """The library's remote node with that client."""
+
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> SdoClient:
+        client = _Sdo(rx_cobid, tx_cobid, self.object_dictionary)
+        self.sdo_channels.append(client)
+        return client
+
+
+class _Network(canopen.Network):
+    """The library's network on our wire."""
+
+    def __init__(self, wire: Wire, sent: Callable[[int, bytes], None]) -> None:
+        super().__init__()
+        self.wire, self._sent = wire, sent
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self._sent(can_id, bytes(data))
+
+
+class Master:
+    """The rig on the bus. `on_frame` sees every frame, sent or received; the other hooks what the master notices.
+
+    `stamped`: frames come with the time of their reception, which is kept; else `now()` is what the log shall say.
+    """
+
+    def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
+        self.wire, self._now, self._stamped = wire, now, stamped
+        self.on_frame: Callable[[Frame], None] = lambda frame: None
+        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
+        self.on_state: Callable[[int, int], None] = lambda node, state: None
+        self.on_lost: Callable[[int], None] = lambda node: None
+        self.on_back: Callable[[int], None] = lambda node: None
+        self.on_rival: Callable[[int], None] = lambda cob_id: None
+        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+        self.silent = False  # a fault: no heartbeat of ours
+        self.states = {CONTROLLER: -1, PLANT: -1}
+        self._booted: set[int] = set()
+        self._rivals: set[int] = set()  # COB-IDs of ours that somebody else sends
+        self.network = _Network(wire, self.send)
+        self._nodes = {node: self._join(node) for node in (CONTROLLER, PLANT)}
+        self._beat = HeartbeatProducer(NODE, lambda cob_id, data: None if self.silent else self.send(cob_id, data))
+        self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
+        self._state = NmtState.PRE_OPERATIONAL
+        # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
+        self._services = {base + node: length for base, length in ((0x080, 8), (0x580, 8), (0x700, 1))
+                          for node in self._nodes}
+        wire.receive = self.receive
+
+    def _join(self, node: int) -> Any:  # the library's node; its types are too loose to help
+        remote = _Node(node, str(EDS[node]))
+        self.network.add_node(remote)
+        remote.emcy.add_callback(lambda error: self.on_emcy(node, error))
+        remote.nmt.add_heartbeat_callback(lambda state: self._heard(node, state))
+        return remote
+
+    def _heard(self, node: int, state: int) -> None:
+        if state == NmtState.INITIALISING:
+            self._booted.add(node)
+        if self.states[node] != state:
+            self.states[node] = state
+            self.on_state(node, state)
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Put a frame on the bus."""
+        self.on_frame(Frame(self._now(), cob_id, data))
+        self.wire.send(cob_id, data)
+
+    def receive(self, frame: Frame) -> None:
+        """A frame came in."""
+        if not self._stamped:
+            frame = Frame(self._now(), frame.cob_id, frame.data)
+        self.on_frame(frame)
+        cyclic = self.on_cyclic.get(frame.cob_id)
+        if cyclic is not None:
+            cyclic(frame)
+            return
+        if frame.cob_id in _OURS and frame.cob_id not in self._rivals:
+            self._rivals.add(frame.cob_id)
+            self.on_rival(frame.cob_id)
+        if self._services.get(frame.cob_id) != len(frame.data):
+            return
+        if frame.cob_id in self._watch.cob_ids:
+            self._watch.receive(Frame(self.wire.clock.now(), frame.cob_id, frame.data))
+        self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
+
+    def tick(self) -> None:
+        """Send the heartbeat when it is due, and notice who has fallen silent."""
+        now = self.wire.clock.now()
+        self._beat.tick(now, self._state)
+        self._watch.tick(now)
+
+    def reset(self) -> None:
+        """Reset communication of all nodes and wait for their boot-up.
+
+        Raises:
+            BusError: a node did not boot.
+        """
+        self._booted.clear()
+        self.network.nmt.send_command(130)
+        self.wire.wait(lambda: self._booted >= {CONTROLLER, PLANT}, BOOT_TIMEOUT)
+        silent = [f"node {node} ({NAMES[node]})" for node in (CONTROLLER, PLANT) if node not in self._booted]
+        if silent:
+            raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
+
+    def present(self, node: int, seconds: float) -> bool:
+        """Whether a node answers an NMT reset of its communication."""
+        self._booted.discard(node)
+        self._nodes[node].nmt.send_command(130)
+        return self.wire.wait(lambda: node in self._booted, seconds)
+
+    def rival(self, seconds: float) -> bool:
+        """Whether another rig is at work on the bus; listens only, up to `seconds`."""
+        return self.wire.wait(lambda: bool(self._rivals), seconds)
+
+    def configure(self, scenario: bytes, gains: Gains | None, period_ns: int, limit_ms: int = HEARTBEAT_LIMIT) -> None:
+        """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
+
+        `period_ns` 0: nodes must not miss a SYNC, for in lockstep they come when they come. `limit_ms`: silence after
+        which a node counts as gone. A foreign controller (no `gains`) may refuse what it does not have.
+
+        Raises:
+            BusError: a node refused or did not answer.
+        """
+        self._download(PLANT, SCENARIO, 0, scenario, SCENARIO_TIMEOUT)
+        for sub, value in enumerate(gains or (), 1):
+            self._write(CONTROLLER, GAINS, sub, value)
+        for node in (CONTROLLER, PLANT):
+            foreign = node == CONTROLLER and gains is None
+            settings = ((0x1006, 0, period_ns // 1000), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, HEARTBEAT))
+            for index, sub, value in settings:
+                try:
+                    self._write(node, index, sub, value)
+                except BusError:
+                    if not foreign:
+                        raise
+        self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
+        self._beat.configure(HEARTBEAT, self.wire.clock.now())
+
+    def start(self) -> None:
+        """All nodes OPERATIONAL; ours too."""
+        self.command(1, NmtState.OPERATIONAL)
+
+    def stop(self) -> None:
+        """All nodes PRE-OPERATIONAL."""
+        self.command(128, NmtState.PRE_OPERATIONAL)
+
+    def command(self, specifier: int, state: NmtState) -> None:
+        """An NMT command to all nodes."""
+        self._state = state
+        self.network.nmt.send_command(specifier)
+
+    def errors(self) -> list[int]:
+        """Nodes with an error, by the register in their last EMCY: code 0 takes back one error, others may stand."""
+        return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
+
+    def _write(self, node: int, index: int, sub: int, value: Any) -> None:
+        try:
+            entry = self._nodes[node].sdo[index]
+            (entry[sub] if sub else entry).raw = value
+        except (SdoAbortedError, SdoCommunicationError, KeyError) as error:
+            raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X} sub {sub}: {error}") from error
+
+    def _download(self, node: int, index: int, sub: int, data: bytes, seconds: float) -> None:
+        sdo = self._nodes[node].sdo
+        usual, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
+        try:
+            sdo.download(index, sub, data)
+        except (SdoAbortedError, SdoCommunicationError) as error:
+            raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X}: {error}") from error
+        finally:
+            sdo.RESPONSE_TIMEOUT = usual
+
+
+assert firmware.NODE == CONTROLLER

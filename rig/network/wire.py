@@ -1,0 +1,135 @@
+"""The rig's end of a bus: send, let frames come in, wait. One kind with the nodes inside, one for a real bus."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from rig.network.bus import Embedded
+from rig.network.clock import Clock, WallClock
+from rig.network.frame import Frame, Node, Send
+from rig.network.link import Link
+
+MS = 1_000_000  # ns
+_PATIENCE = 5  # cycles: a node that is gone must not make clean-up last minutes
+Done = Callable[[], bool]
+
+
+class Wire(Protocol):
+    """What the master and the loop need of a bus."""
+
+    clock: Clock
+    send: Send
+    receive: Callable[[Frame], None]  # where incoming frames go; set by the master
+
+    def wait(self, done: Done, seconds: float) -> bool:
+        """Let frames come in until `done()`; False when it took longer than `seconds`."""
+
+    def settle(self, t_ns: int, done: Done) -> None:
+        """Lockstep: let the frames of the cycle at `t_ns` come in, until `done()` or nothing more can come."""
+
+    def run_until(self, t_ns: int) -> None:
+        """Real time: let frames come in until the clock says `t_ns`."""
+
+    def close(self) -> None:
+        """Give the bus back."""
+
+
+def _nowhere(frame: Frame) -> None:
+    """Nobody listens yet."""
+
+
+class EmbeddedWire:
+    """All nodes in this process and thread. With a virtual clock a run repeats bit for bit."""
+
+    def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
+        self.clock, self._period = clock, period_ns
+        self.receive: Callable[[Frame], None] = _nowhere
+        self._bus = Embedded()
+        self.send = self._bus.attach(lambda frame: self.receive(frame))
+        self._nodes = [self._bus.add(make) for make in makers]
+
+    def wait(self, done: Done, seconds: float) -> bool:
+        """See `Wire`; the time waited is the clock's."""
+        end = self.clock.now() + round(seconds * 1e9)
+        while True:
+            self._let(self.clock.now())
+            if done():
+                return True
+            if self.clock.now() >= end:
+                return False
+            self.clock.sleep_until(self.clock.now() + MS)
+
+    def settle(self, t_ns: int, done: Done) -> None:
+        """See `Wire`; what is late by less than a cycle comes in too."""
+        self.clock.sleep_until(t_ns)
+        self._let(t_ns)
+        self._let(t_ns + self._period - 1)
+
+    def run_until(self, t_ns: int) -> None:
+        """See `Wire`."""
+        self._let(self.clock.now())
+        while self.clock.now() < t_ns:
+            self.clock.sleep_until(min(t_ns, self.clock.now() + MS))
+            self._let(self.clock.now())
+
+    def close(self) -> None:
+        """See `Wire`; nothing to give back."""
+
+    def _let(self, t_ns: int) -> None:
+        """Deliver what is there, run the nodes' timers, deliver what came of them."""
+        self._bus.deliver(t_ns)
+        for node in self._nodes:
+            node.tick(t_ns)
+        self._bus.deliver(t_ns)
+
+
+class LinkWire:
+    """A bus between programs or machines. Waiting is in wall time, whatever the pace."""
+
+    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
+        self.clock: Clock = clock
+        self.link, self._grace = link, grace
+        self._missed = 0  # cycles in a row without all frames
+        self.receive: Callable[[Frame], None] = _nowhere
+        self.send: Send = link.send
+
+    def wait(self, done: Done, seconds: float) -> bool:
+        """See `Wire`."""
+        end = self.clock.now() + round(seconds * 1e9)
+        while not done():
+            left = end - self.clock.now()
+            if left <= 0:
+                return False
+            self._poll(min(left * 1e-9, 0.05))
+        return True
+
+    def settle(self, t_ns: int, done: Done) -> None:
+        """See `Wire`; a frame that does not come within the grace time is missing, and then less is waited for it."""
+        patient = self._missed < _PATIENCE
+        self._missed = 0 if self.wait(done, self._grace if patient else 0.1 * self._grace) else self._missed + 1
+
+    def run_until(self, t_ns: int) -> None:
+        """See `Wire`."""
+        self._poll(0.0)
+        while (left := t_ns - self.clock.now()) > 0:
+            self._poll(left * 1e-9)
+
+    def close(self) -> None:
+        """See `Wire`."""
+        self.link.close()
+
+    def _poll(self, timeout: float) -> None:
+        for frame in self.link.poll(timeout):
+            self.receive(frame)
+
+
+def serve(node: Node, link: Link, clock: Clock, stop: Done) -> None:
+    """Run one node on a link until `stop()`: the whole of `rig node`."""
+    tick = clock.now() + MS
+    while not stop():
+        for frame in link.poll(max(0.0, (tick - clock.now()) * 1e-9)):
+            node.receive(frame)
+        now = clock.now()
+        if now >= tick:
+            node.tick(now)
+            tick = max(tick + MS, now)

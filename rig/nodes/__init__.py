@@ -1,0 +1,1 @@
+"""The nodes of the bench: plant emulator and reference firmware, and the scenario that the emulator is given."""

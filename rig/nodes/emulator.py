@@ -1,0 +1,183 @@
+"""Node 3, the plant emulator: the actuator behind a CANopen interface.
+
+At each SYNC it reads its transducers and sends them, then moves the plant one cycle with the current that was latched:
+the answer to cycle k acts from cycle k+1. All that is to go wrong was loaded before the start (object 0x2210), so a
+fault costs no bus time and begins in exactly the cycle the sequence says.
+"""
+from __future__ import annotations
+
+import heapq
+from math import isfinite
+from typing import cast
+
+from dbc import EDS
+from plant import Actuator, Model
+from plant.errors import InputError
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
+from rig.network import codec
+from rig.network.codec import Flags
+from rig.network.frame import Frame, Send
+from rig.nodes.scenario import Scenario
+from rig.sequences.faults import Delay, Plan, Schedule
+
+NODE = 3
+SCENARIO, COUNTERS = 0x2210, 0x2211
+MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
+_NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
+_HEARTBEAT = 0x700 + NODE
+
+
+class Emulator:
+    """A plant node. `receive` and `tick` are its whole outside; `scenario` holds until the rig loads another."""
+
+    def __init__(self, send: Send, scenario: Scenario | None = None) -> None:
+        self._send = send
+        self.device = Device(NODE, EDS[NODE], self._transmit)
+        self.device.on_sync = self._on_sync
+        self.device.on_write = self._on_write
+        self.device.on_nmt = self._on_nmt
+        self._od = self.device.od.values
+        self._held: list[tuple[int, int, int, bytes]] = []  # late frames: due, order, COB-ID, data
+        self._late: list[tuple[int, int, Frame]] = []
+        self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
+
+    def load_scenario(self, scenario: Scenario) -> None:
+        """Take a plant with its faults and loads; it is compiled now, not in the first cycle.
+
+        Raises:
+            InputError: one that cannot be run; the one before stays.
+        """
+        plant, faults = Actuator(scenario.model, scenario.seed), Schedule(scenario.plan, scenario.model.values)
+        plant.warm()
+        self._scenario, self._load = scenario, scenario.load()
+        self._begin(plant, faults)
+
+    def _restart(self) -> None:
+        s = self._scenario
+        self._begin(Actuator(s.model, s.seed), Schedule(s.plan, s.model.values))
+
+    def _begin(self, plant: Actuator, faults: Schedule) -> None:
+        self._plant, self._faults = plant, faults
+        self._cycle = 0  # of the SYNC to come
+        self._changed = -1  # the last cycle whose parameters are in force
+        self._begun = False  # SYNCs are counted from the first start
+        self._first = True  # of the cycles after a start: no drive can have answered yet
+        self._moved = True
+        self._missed = 0  # drive frames missing in a row
+        self._current = 0.0
+        self._counts = {"missing": 0, "late": 0}
+        self._held.clear()
+        self._late.clear()
+        for sub in (1, 2):
+            self._od[COUNTERS, sub] = 0
+
+    def receive(self, frame: Frame) -> None:
+        """A frame of another node arrived: a fault may keep it away, for a while or for good."""
+        if frame.cob_id == codec.DRIVE:
+            action = self._faults.frame("drive", self._cycle - 1)
+            if isinstance(action, Delay):
+                heapq.heappush(self._late, (frame.t_ns + action.ns, len(self._late), frame))
+            if action is not None:
+                return
+        elif frame.cob_id == codec.SYNC and self._begun and self.device.state is not NmtState.OPERATIONAL:
+            self._cycle += 1  # time goes on while the plant pauses
+        self.device.receive(frame)
+        if not self._moved:  # after the answer to a SYNC has gone out
+            self._move()
+
+    def tick(self, t_ns: int) -> None:
+        """It is now `t_ns`: late frames that are due go on their way."""
+        while self._late and self._late[0][0] <= t_ns:
+            self.device.receive(heapq.heappop(self._late)[2])
+        while self._held and self._held[0][0] <= t_ns:
+            _, _, cob_id, data = heapq.heappop(self._held)
+            self._send(cob_id, data)
+        self.device.tick(t_ns)
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        """Send a frame unless a fault has it lost or late."""
+        name = _NAMES.get(cob_id)
+        if name is not None:
+            action = self._faults.frame(name, self._cycle)
+            if isinstance(action, Delay):
+                heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
+            if action is not None:
+                return
+        elif cob_id == _HEARTBEAT and not self._faults.heartbeat_alive("plant", self._cycle):
+            return
+        self._send(cob_id, data)
+
+    def _on_nmt(self, old: NmtState, new: NmtState) -> None:
+        """The first start begins a run; after a pause the plant goes on from where it stood."""
+        if new is NmtState.OPERATIONAL:
+            self._begun = self._first = True
+        elif new is NmtState.INITIALISING:
+            self._restart()
+
+    def _on_write(self, index: int, sub: int, data: bytes) -> None:
+        if index != SCENARIO:
+            return
+        if self.device.state is NmtState.OPERATIONAL:
+            raise SdoAbort(Abort.STATE)
+        try:
+            self.load_scenario(Scenario.from_bytes(data))
+        except InputError as error:
+            raise SdoAbort(Abort.VALUE) from error
+
+    def _on_sync(self) -> None:
+        """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""
+        k, od = self._cycle, self._od
+        flags = Flags(0) if self._first else self._judge(k)
+        self._first = False
+        for name, value in self._faults.parameters_at(k, self._changed).items():
+            self._plant.set(name, value)
+        self._changed = k
+        xj, p12, xs = self._plant.sample()
+        if not isfinite(xj + p12 + xs):
+            self._diverged()
+            return
+        faulty = self._faults.signal
+        od[0x2200, 0] = codec.raw_position(faulty("xj", xj, k))
+        od[0x2201, 0] = codec.raw_pressure(faulty("p12", p12, k))
+        od[0x2202, 0] = codec.raw_spool(faulty("xs", xs, k))
+        od[0x2203, 0] = int(flags)
+        od[0x2204, 0] = k & 0xFFFF
+        self._moved = False
+
+    def _judge(self, k: int) -> Flags:
+        """Whether the latched drive answers the cycle before this one; the current to use until the next SYNC.
+
+        A missing or late answer leaves the current as it was; after three in a row there is none (EMCY 0x8250) until
+        answers come again.
+        """
+        fresh = self.device.pdo.rpdos[1].fresh
+        if fresh and cast(int, self._od[0x2207, 0]) == (k - 1) & 0xFFFF:
+            self._current = codec.current(cast(int, self._od[0x2205, 0]))
+            if self._missed >= MISSED_LIMIT:
+                self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
+            self._missed = 0
+            return Flags(0)
+        self._missed += 1
+        self._count("late" if fresh else "missing")
+        flags = Flags.DRIVE_LATE if fresh else Flags.DRIVE_MISSING
+        if self._missed >= MISSED_LIMIT:
+            self._current = 0.0
+            flags |= Flags.CURRENT_ZEROED
+            self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
+        return flags
+
+    def _diverged(self) -> None:
+        """The plant has no value any more (a parameter far out, a law that divides by zero): no number is made up."""
+        self.device.emcy.raise_(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+        self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more
+
+    def _count(self, what: str) -> None:
+        self._counts[what] += 1
+        self._od[COUNTERS, 1 if what == "missing" else 2] = self._counts[what]
+
+    def _move(self) -> None:
+        """The plant goes on to the next cycle, under the load of this one."""
+        k = self._cycle
+        self._plant.advance(self._current, self._load[k] if k < len(self._load) else 0.0)
+        self._moved = True
+        self._cycle += 1

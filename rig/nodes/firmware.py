@@ -1,0 +1,126 @@
+"""Node 2, the reference firmware: a position loop in a CANopen device, so that the bench works alone.
+
+It answers each feedback frame with a drive frame. The control word (CiA 408) lets current flow only in device mode
+ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises.
+"""
+from __future__ import annotations
+
+import struct
+from math import isfinite
+from typing import NamedTuple, cast
+
+from dbc import EDS
+from plant.controller import Loop, answer
+from plant.model import Model
+from plant.run import Demand
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
+from rig.network import codec
+from rig.network.codec import Control, Status
+from rig.network.frame import Send
+
+NODE = 2
+GAINS = 0x2110
+LOST_AFTER = 3  # SYNCs in a row without feedback
+
+
+class Gains(NamedTuple):
+    """Object 0x2110 sub 1..5: the fields of `plant.parameters.Controller`."""
+
+    proportional_gain: float
+    integral_gain: float
+    derivative_gain: float
+    current_limit: float
+    period: float
+
+
+def gains_of(model: Model) -> Gains:
+    """What a model's [controller] says."""
+    return Gains(*(model[f"controller.{field}"] for field in Gains._fields))
+
+
+class Firmware:
+    """A controller node. `receive` and `tick` are its whole outside; `gains` hold until the rig writes others.
+
+    `model`: whose effects in the firmware this one has (port `command`); none by default.
+    """
+
+    def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
+        self._taken = Demand(model or Model())
+        self.device = Device(NODE, EDS[NODE], send)
+        self.device.on_sync = self._on_sync
+        self.device.on_rpdo = self._on_rpdo
+        self.device.on_nmt = self._on_nmt
+        self.device.on_heartbeat_lost = self._trip
+        self.device.on_write = self._on_write
+        self._od = self.device.od.values
+        self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
+        self._lost = False  # feedback, announced by EMCY; a restart does not take that back
+        self._restart()
+        self.receive, self.tick = self.device.receive, self.device.tick
+
+    def _restart(self) -> None:
+        self._loop = Loop()
+        self._taken.restart()
+        self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
+        self._silent = 0  # SYNCs since the last feedback
+        self._fault = False
+        self._acknowledged = True
+
+    def _on_nmt(self, old: NmtState, new: NmtState) -> None:
+        if new is NmtState.OPERATIONAL:
+            self._restart()
+        elif new is NmtState.INITIALISING:
+            self._lost = False
+
+    def _on_write(self, index: int, sub: int, data: bytes) -> None:
+        """A gain that is no number would make a current that is none."""
+        if index == GAINS and not isfinite(struct.unpack("<d", data)[0]):
+            raise SdoAbort(Abort.VALUE)
+
+    def _trip(self, node: int = 0) -> None:
+        self._fault = True
+
+    def _on_sync(self) -> None:
+        """The command of this cycle is latched; feedback follows. Without it the loop must not stay as it was."""
+        self._silent += 1
+        if self._silent > LOST_AFTER:
+            self._lost = True
+            self._trip()
+            self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x02")
+            self._drive(0.0, self._status())
+
+    def _on_rpdo(self, n: int) -> None:
+        """Feedback arrived: close the loop."""
+        if self._lost:
+            self._lost = False
+            self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
+        self._silent = 0
+        status = self._status()
+        if status & Status.MODE:
+            demand = codec.position(cast(int, self._od[0x2100, 0]))
+            position = codec.position(cast(int, self._od[0x2102, 0]))
+            current, self._loop = answer(self._loop, self._taken(demand, position), position, self._gains)
+        else:
+            current, self._loop = 0.0, Loop()
+            self._taken.restart()
+        self._drive(current, status)
+
+    def _status(self) -> int:
+        """Status word: the level bits of the control word as far as no fault forbids them."""
+        control = cast(int, self._od[0x6040, 0])
+        reset = bool(control & Control.RESET)
+        if self._fault and reset and not self._acknowledged and not self.device.emcy.active:
+            self._fault = False
+        self._acknowledged = reset
+        if self._fault:
+            return 0
+        asked = control & Control.ACTIVE  # the levels build on each other: 1, 3, 7
+        return (asked if asked & (asked + 1) == 0 else 0) | Status.READY
+
+    def _drive(self, current: float, status: int) -> None:
+        od = self._od
+        od[0x2104, 0] = codec.raw_current(current)
+        od[0x6041, 0] = status
+        od[0x2105, 0] = od[0x2101, 0]
+        self.device.transmit(1)
+

@@ -1,0 +1,157 @@
+"""The cycle of the bench: command, SYNC, answers, row. The only loop, for every bus and both paces.
+
+Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
+fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
+firing a burst. Either way the plant moves one period a SYNC, so a run that was late is late, not wrong.
+"""
+from __future__ import annotations
+
+import heapq
+from math import nan
+from typing import NamedTuple, Protocol
+
+from rig.network import codec
+from rig.network.clock import WallClock
+from rig.network.frame import Frame
+from rig.network.master import Master
+from rig.recorder import Signals, Timing
+from rig.sequences.faults import Delay, Schedule
+
+_XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
+_ALL = _XJ | _XS | _COR
+
+
+class Log(Protocol):
+    """Who is told of a cycle when it is over."""
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        """A cycle is over."""
+
+
+class Step(NamedTuple):
+    """What one cycle is asked to do."""
+
+    phase: int  # 0 set-up, 1 main, 2 clean-up
+    demand: float  # m
+    load: float  # N, what the plant was told to expect
+    control: int  # control word
+
+
+class Loop:
+    """Runs cycles one by one and tells `log` of each when it is closed."""
+
+    def __init__(self, master: Master, faults: Schedule, log: Log, period_ns: int, realtime: bool) -> None:
+        self._master, self._wire = master, master.wire
+        self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
+        self.k = 0  # the cycle to come
+        self.overruns = 0
+        self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
+        self._seen = 0
+        self._wall = WallClock()
+        self._t_ns = self._wire.clock.now() + period_ns  # when the cycle under way, or to come, is due
+        self._sync = 0
+        self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
+        read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
+        master.on_cyclic.update(read)
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
+        return self._wire.clock.now() if self._realtime else self._t_ns
+
+    def cycle(self, step: Step) -> Signals | None:
+        """One cycle; returns the row of the cycle before, which it closes."""
+        lateness = self._wait_until_due()
+        closed = self._close()
+        master, k = self._master, self.k
+        row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
+                      step.load, step.control, 0, 0)
+        timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
+        self._open, self._seen = (self._t_ns, row, timing), 0
+        master.silent = not self._faults.heartbeat_alive("rig", k)
+        self._command(codec.pack_command(step.demand, step.control, k))
+        self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
+        master.send(codec.SYNC, b"")
+        if not self._realtime:
+            self._wire.settle(self._t_ns, lambda: self._seen == _ALL)
+            self._send_held(self._t_ns + self._period)
+        master.tick()
+        self.k += 1
+        self._t_ns += self._period
+        return closed
+
+    def finish(self) -> Signals | None:
+        """Wait for the answers of the last cycle and close it."""
+        self._wait_until_due()
+        return self._close()
+
+    def _wait_until_due(self) -> int:
+        """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
+        if not self._realtime:
+            return 0
+        while self._held and self._held[0][0] < self._t_ns:
+            due = self._held[0][0]
+            self._wire.run_until(due)
+            self._send_held(due + 1)
+        self._wire.run_until(self._t_ns)
+        late = self._wire.clock.now() - self._t_ns
+        lost = late // self._period
+        self.overruns += max(lost, self._overrun(late))
+        self._t_ns += lost * self._period
+        return late
+
+    def _overrun(self, late_ns: int) -> bool:
+        """Late by more than half a cycle: the controller is left too little of it to answer in."""
+        return 2 * late_ns > self._period
+
+    def _command(self, data: bytes) -> None:
+        action = self._faults.frame("command", self.k)
+        if action is None:
+            self._master.send(codec.COMMAND, data)
+        elif isinstance(action, Delay):
+            heapq.heappush(self._held, (self._t_ns + action.ns, self.k, data))
+
+    def _send_held(self, before_ns: int) -> None:
+        """Late commands whose time has come."""
+        while self._held and self._held[0][0] < before_ns:
+            self._master.send(codec.COMMAND, heapq.heappop(self._held)[2])
+
+    def _feedback(self, frame: Frame) -> None:
+        if self._open is not None and not self._seen & _XJ and len(frame.data) == 8:
+            row = self._open[1]
+            row.xj, row.p12 = codec.unpack_feedback(frame.data)
+            self._answered(_XJ, frame)
+
+    def _valve(self, frame: Frame) -> None:
+        if self._open is not None and len(frame.data) == 8:
+            row, state = self._open[1], codec.unpack_valve_state(frame.data)
+            if state.cycle == row.cycle & 0xFFFF:
+                row.xs, row.flags = state.spool, state.flags
+                self._answered(_XS, frame)
+
+    def _drive(self, frame: Frame) -> None:
+        if self._open is not None and len(frame.data) == 8:  # of several the last: the plant latches that one
+            _, row, timing = self._open
+            drive = codec.unpack_drive(frame.data)
+            if drive.cycle == row.cycle & 0xFFFF:
+                row.cor, row.status = drive.current, drive.status
+                if not self._seen & _COR:
+                    timing.response = self._since_sync(frame)
+                self._answered(_COR, frame)
+
+    def _answered(self, what: int, frame: Frame) -> None:
+        complete, self._seen = self._seen == _ALL, self._seen | what
+        if self._seen == _ALL and not complete and self._open is not None:
+            self._open[2].work = self._since_sync(frame)
+
+    def _since_sync(self, frame: Frame) -> float:
+        """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
+        return ((frame.t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
+
+    def _close(self) -> Signals | None:
+        """The cycle under way is over: the next SYNC is due."""
+        if self._open is None:
+            return None
+        t_ns, row, timing = self._open
+        self._open = None
+        self._log.cycle(t_ns, row, timing)
+        return row

@@ -1,0 +1,100 @@
+"""What came of a run: verdict, checks, timing. For the table, for verdict.json and for the exit status."""
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi.output import write_text
+from plant.segments import Array
+from rig.run.history import History
+from rig.run.job import Job
+from rig.run.session import Happening
+from rig.sequences.checks import CheckResult
+
+STATUS = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """A finished run."""
+
+    job: Job
+    folder: Path
+    checks: Sequence[CheckResult]
+    events: Sequence[Happening]
+    aborted: str  # why, or ""
+    safe: bool  # the safe state was entered
+    interrupted: bool
+    timing: dict[str, Any]
+    counters: dict[str, int]
+    speed: float  # multiple of real time, of the cycles alone
+    fdi: dict[str, Any] = field(default_factory=dict)  # what `rig fdi` says of it, if it was asked
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL, INVALID_TIMING or ABORTED. A bench that was late itself blames nobody else for what follows."""
+        late = self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]
+        if late and not self.interrupted:
+            return "INVALID_TIMING"
+        if self.aborted:
+            return "ABORTED"
+        return "PASS" if not self.failures else "FAIL"
+
+    @property
+    def failures(self) -> list[str]:
+        """The checks that did not pass, and an end other than the sequence's own."""
+        failed = [check.name for check in self.checks if not check.passed]
+        meant = self.job.sequence.ends == "safe_state"
+        return failed if self.safe or not meant else [*failed, "the run was to end in the safe state"]
+
+    @property
+    def why(self) -> str:
+        """The reason of a verdict other than PASS, in words."""
+        late = (f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
+                f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller")
+        words = {"FAIL": "; ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
+        return words.get(self.verdict, "")
+
+    @property
+    def status(self) -> int:
+        """Exit status of `rig run`."""
+        return INTERRUPTED if self.interrupted else STATUS[self.verdict]
+
+    def to_json(self) -> dict[str, Any]:
+        """As interface and verdict.json have it; a number that is not there is null."""
+        return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
+                "checks": [_plain(check._asdict()) for check in self.checks],
+                "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
+                "events": [_plain(event._asdict()) for event in self.events],
+                "run": self.job.settings(), "fdi": self.fdi}
+
+    def save(self) -> None:
+        """Write verdict.json."""
+        write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
+
+
+def timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:
+    """Percentiles of lateness and response in us, as `rig run --json` gives them."""
+    return {"cycles": len(history), "overruns": overruns, "scheduler": scheduler,
+            "lateness_us": _percentiles(history.column("lateness")),
+            "response_us": _percentiles(history.column("response"))}
+
+
+def _percentiles(seconds: Array) -> dict[str, float | None]:
+    """Of the values that are there, in us."""
+    values = seconds[~np.isnan(seconds)] * 1e6
+    if not len(values):
+        return dict.fromkeys(("p50", "p99", "p99_9", "max"))
+    p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
+    return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
+
+
+def _plain(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}

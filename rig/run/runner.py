@@ -1,0 +1,114 @@
+"""A job from start to finish: nodes and bus, log, session, checks, verdict.json, report.html."""
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from plant import Actuator, Columns, InputError
+from rig.network.clock import WallClock
+from rig.network.codec import Flags
+from rig.recorder import Check, Recorder
+from rig.recorder.provenance import provenance
+from rig.run.history import History
+from rig.run.job import Job
+from rig.run.outcome import Outcome, timing
+from rig.run.participants import crew
+from rig.run.priority import elevated, scheduler, undisturbed
+from rig.run.session import MAIN, Progress, Session
+from rig.sequences.checks import CheckResult, evaluate
+
+
+def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
+    """Do a job; what comes of it lies in `folder`.
+
+    Raises:
+        RigError: bad input, a bus or node that is not there, or a log that cannot be written. The log is closed first.
+    """
+    if job.plant != "external":  # here, where a law that cannot be compiled can be told in words
+        Actuator(job.scenario.model).warm()
+    with taken(folder), crew(job) as wire, log(job, folder) as recorder:
+        session = Session(job, wire, recorder, progress, stop)
+        progress("bring-up", 0, 0)
+        session.bring_up()
+        assert session.loop is not None
+        stopwatch = WallClock()
+        with contextlib.ExitStack() as rights:
+            if job.realtime:
+                rights.enter_context(elevated())
+                rights.enter_context(undisturbed())
+            scheduled = scheduler()
+            session.play()
+        spent = stopwatch.now() * 1e-9
+        loop = session.loop
+        history = session.history
+        checks = judge(job, session)
+        for check in checks:
+            recorder.put(session.now(), _record(check))
+        outcome = Outcome(
+            job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
+            interrupted=session.interrupted, timing=timing(history, loop.overruns, scheduled),
+            counters=_counters(history), speed=len(history) * job.period_ns * 1e-9 / spent)
+        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
+                                      "overruns": str(loop.overruns)})
+    outcome.save()
+    return outcome
+
+
+def judge(job: Job, session: Session) -> list[CheckResult]:
+    """The job's checks on the main phase."""
+    main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
+    t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
+    sequence = job.sequence
+    return evaluate(sequence.checks, Columns(t, *main), sequence.sections(), session.events, sequence.fault_starts())
+
+
+@contextlib.contextmanager
+def taken(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, and locked against a second run.
+
+    Raises:
+        InputError: it cannot be made or written, or another run is writing there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise InputError("--out", str(folder), "a folder that no other run is writing to") from error
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def log(job: Job, folder: Path) -> Iterator[Recorder]:
+    """The run's log in place of an earlier run's results, closed whatever happens."""
+    for name in ("verdict.json", "report.html"):  # of the run before
+        (folder / name).unlink(missing_ok=True)
+    recorder = Recorder(folder / "trace.mcap", job.attachments(), provenance(**job.settings()))
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def _counters(history: History) -> dict[str, int]:
+    """Cycles whose answers did not come, from what the rig itself saw and what the plant flagged."""
+    flags = history.column("flags").astype(int)
+    return {"no_feedback": int(np.isnan(history.column("xj")).sum()),
+            "no_drive": int(np.isnan(history.column("cor")).sum()),
+            "plant_drive_missing": int((flags & Flags.DRIVE_MISSING != 0).sum()),
+            "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
+
+
+def _record(check: CheckResult) -> Check:
+    return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
+                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)

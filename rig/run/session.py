@@ -1,0 +1,211 @@
+"""One run from bring-up to clean-up on a bus that is already there: the sequencer.
+
+Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe
+state (no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it
+ends.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from canopen.emcy import EmcyError
+
+from plant.profile import Profile
+from plant.segments import RATE
+from rig.device.nmt import NmtState
+from rig.network.clock import WallClock
+from rig.network.codec import Control
+from rig.network.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
+from rig.network.wire import Wire
+from rig.nodes import firmware
+from rig.nodes.scenario import FORCE
+from rig.recorder import Event, Recorder, Signals, Timing
+from rig.recorder import NmtState as NmtRecord
+from rig.run.history import History
+from rig.run.job import Job
+from rig.run.loop import Loop, Step
+from rig.sequences.faults import Schedule
+from rig.sequences.guards import Watch
+
+SETUP, MAIN, CLEANUP = 0, 1, 2
+PHASES = ("setup", "main", "cleanup")
+_ENABLING = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
+Progress = Callable[[str, int, int], None]  # phase or section, cycles done, cycles in all
+
+
+class Happening(NamedTuple):
+    """An event of the run; `t` in s of main."""
+
+    t: float
+    level: str
+    kind: str
+    text: str
+
+
+class Session:
+    """Plays a job's sequence on a wire. `stop()` is asked every cycle whether the operator wants to end."""
+
+    def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
+        self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
+        self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
+        self.scenario = job.scenario
+        self._plan = self.scenario.plan
+        self._faults = Schedule(self._plan, self.scenario.model.values)
+        self._watch = Watch(job.sequence.guards)
+        self.loop: Loop | None = None
+        self.events: list[Happening] = []
+        self.history = History()
+        self.aborted = ""  # why main ended early
+        self.interrupted = False
+        self.safe = False  # no current from here on, until clean-up
+        self._powered = True  # clean-up may use current
+        self._playing = True  # until the nodes are stopped by us
+        self._demand = 0.0  # m, of the last cycle
+        self._operational: set[int] = set()
+        self._edges = sorted(self._faults.edges)
+        self._clock = wire.clock
+        self._master = Master(wire, self.now, job.realtime)
+        self._master.on_frame = recorder.frame
+        self._master.on_emcy = self._emcy
+        self._master.on_state = self._state
+        self._master.on_lost = self._silent
+        self._master.on_rival = lambda cob_id: self._trouble("bus", f"somebody else sends 0x{cob_id:03X}, a frame of "
+                                                             f"node {NODE} {NAMES[NODE]}")
+        self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began."""
+        return self.loop.now() if self.loop else self._clock.now()
+
+    def say(self, level: str, kind: str, text: str) -> None:
+        """Something happened."""
+        t_ns = self.now()
+        self.events.append(Happening(self._main_time(), level, kind, text))
+        self.recorder.put(t_ns, Event(level, kind, text))
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        """The loop has closed a cycle."""
+        self.history.add(signals, timing)
+        self.recorder.cycle(t_ns, signals, timing)
+
+    def bring_up(self) -> None:
+        """Reset, configure and start the nodes.
+
+        Raises:
+            BusError: a node does not answer or refuses.
+        """
+        job = self.job
+        self.say("INFO", "phase", "bring-up")
+        self._master.reset()
+        gains = firmware.gains_of(job.model) if job.controller == "builtin" else None
+        patient = not job.realtime and isinstance(self._clock, WallClock)
+        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
+                               PATIENT if patient else HEARTBEAT_LIMIT)
+        self._master.start()
+        self.loop = Loop(self._master, self._faults, self, job.period_ns, job.realtime)
+
+    def play(self) -> None:
+        """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""
+        assert self.loop is not None
+        try:
+            self._run(SETUP, self._setup) and self._run(MAIN, self._main)
+        finally:
+            try:
+                self._powered = self._recovered()
+                self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
+                self.loop.finish()
+            finally:
+                self._playing = False
+                self._master.stop()
+                self.say("INFO", "phase", "end")
+
+    def _recovered(self) -> bool:
+        """Try to have all nodes OPERATIONAL and without error again; whether clean-up may use current."""
+        if self.safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
+            self._master.start()
+        return not self.safe or not self._master.errors()
+
+    def _control(self, phase: int, i: int) -> int:
+        """Control word of the phase's cycle `i`."""
+        if self.safe if phase != CLEANUP else not self._powered:
+            return 0
+        if phase == CLEANUP and self.safe and i == 0:
+            return int(Control.RESET)
+        started = self.loop.k if self.loop else 0  # without set-up main is where it is enabled
+        return int(_ENABLING[started]) if started < len(_ENABLING) else int(Control.ACTIVE)
+
+    def _run(self, phase: int, profile: Profile) -> bool:
+        """The cycles of one phase; False when it was ended early."""
+        assert self.loop is not None
+        self.say("INFO", "phase", PHASES[phase])
+        for section in profile.sections:
+            self.say("INFO", "section", f"{PHASES[phase]}: {section.name}")
+            shown = section.name if phase == MAIN else PHASES[phase]
+            for i in range(section.start, section.stop):
+                self._announce_faults()
+                self._demand = float(profile.command[i])
+                load = self.scenario.force[self.loop.k] * FORCE if phase == MAIN else 0.0
+                closed = self.loop.cycle(Step(phase, self._demand, load, self._control(phase, i)))
+                if self.loop.k % 50 == 0:
+                    self._progress(shown, self.loop.k, max(self._plan.stop, self.loop.k))
+                if phase != CLEANUP and self._must_end(closed):
+                    return False
+        return True
+
+    def _must_end(self, row: Signals | None) -> bool:
+        if self._stop() and not self.aborted:
+            self.interrupted = True
+            self._abort("operator", "stopped by the operator")
+        if row is not None:
+            measured = {name: getattr(row, name) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+            passed = self._watch.see({**measured, "error": row.com - row.xj})
+            if passed:
+                self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
+        return bool(self.aborted)
+
+    def _abort(self, kind: str, why: str) -> None:
+        self.aborted = self.aborted or why
+        self.say("ERROR", kind, why)
+
+    def _trouble(self, kind: str, what: str) -> None:
+        """A node is in trouble: no current from here on, and the end of main unless the sequence is about that."""
+        self.say("ERROR", kind, what)
+        if not self.safe:
+            self.safe = True
+            self.say("WARN", "safe_state", f"no current from here on: {what}")
+        if self.job.sequence.ends != "safe_state" and not self.aborted:
+            self._abort("abort", what)
+
+    def _emcy(self, node: int, error: EmcyError) -> None:
+        if error.code & 0xFF00 == 0:
+            left = "an error is gone, others stand" if error.register else "no error any more"
+            self.say("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
+        else:
+            self._trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
+
+    def _silent(self, node: int) -> None:
+        self._trouble("heartbeat", f"node {node} {NAMES[node]} is silent")
+
+    def _state(self, node: int, state: int) -> None:
+        known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
+        name = known.get(state, f"state {state}") if state else "boot-up"
+        self.recorder.put(self.now(), NmtRecord(node, state, name))
+        if state == NmtState.OPERATIONAL:
+            self._operational.add(node)
+        elif node in self._operational:
+            self._operational.discard(node)
+            if self._playing:  # a watchdog's reset, a node switched off and on, somebody else's command
+                self._trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}")
+
+    def _announce_faults(self) -> None:
+        assert self.loop is not None
+        while self._edges and self._edges[0].cycle <= self.loop.k:
+            edge = self._edges.pop(0)
+            self.say("WARN" if edge.begins else "INFO", "fault", f"{edge.label} {'begins' if edge.begins else 'ends'}")
+
+    def _main_time(self) -> float:
+        """Now, s of main; negative before it."""
+        if self.loop is None:
+            return -self._plan.start / RATE
+        return (self.loop.k - self._plan.start) / RATE

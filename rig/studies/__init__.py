@@ -1,0 +1,1 @@
+"""Studies over many runs: blind trial, campaign, prognosis scores and benchmarks."""

@@ -1,0 +1,46 @@
+"""What a campaign does with a run: a judgement, from trace and healthy model to a flat row."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fdi.diagnosis.faults import FAULTS, Level
+from fdi.trace.trace import Trace
+from plant import Model
+from plant.threads import threads
+
+WORKS: Mapping[str, str] = {"fdi": "rig.studies.campaign.judge:fdi"}
+"""Short names of judgements."""
+CANNOT_TELL = "cannot_tell"
+
+
+def fdi(trace: Trace, model: Model) -> dict[str, Any]:
+    """What `rig fdi` says of the trace: levels, ruling fault, sizes with intervals, events, what else is off.
+
+    Raises:
+        InputError: a trace that cannot be judged.
+    """
+    from fdi.diagnosis.diagnosis import diagnose
+
+    found = diagnose(trace, model, workers=threads())
+    row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
+    for fault in FAULTS:
+        size = found.sizes[fault.name]
+        row[f"level_{fault.name}"] = _word(found.levels[fault.name])
+        row |= {fault.symbol: size.value, f"{fault.symbol}_low": size.low, f"{fault.symbol}_high": size.high}
+    if found.judged is not None:
+        levels, by = found.judged.levels, found.judged.severity
+        row |= {f"band_{fault.name}": _word(levels.get(fault.name)) for fault in FAULTS}
+        row |= {f"severity_{fault.name}": by[fault.name] for fault in FAULTS if fault.name in by}
+    if found.grid is not None:
+        row |= {"grid_kintas": found.grid.merged.kintas, "grid_fss": found.grid.merged.fss}
+    return row | {
+        "events": [event._asdict() for event in found.events], "event_count": len(found.events),
+        "correlation": found.refined.correlation, "left_over": max(found.refined.ratio.values()),
+        "simulations": found.refined.simulations, "others": sorted(found.others),
+        "precursors": {name: precursor.value for name, precursor in found.precursors.items()},
+        "notes": list(found.notes)}
+
+
+def _word(level: Level | None) -> str:
+    return CANNOT_TELL if level is None else level.word

@@ -1,0 +1,72 @@
+"""Other ways to the fault sizes, one table: what each finds of a trace, its error, its simulations, its time."""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+from fdi.diagnosis.diagnosis import Diagnosis
+from plant.errors import InputError
+from rig.network.clock import WallClock
+
+Progress = Callable[[str, int, int], None]
+
+
+class Row(NamedTuple):
+    """One method; None where it does not tell."""
+
+    method: str
+    kintas: float | None
+    fss: float | None  # N
+    left: float | None  # RMS of what is left of the signals, in floors
+    error_kintas: float | None  # RMS on simulated units that training did not see
+    error_fss: float | None  # N
+    right: dict[str, float] | None  # share of right levels on these, by fault
+    levels: dict[str, str] | None
+    simulations: int
+    seconds: float
+
+
+def optimisers(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
+    """Least squares and the global optimisers, each from the grid's answer."""
+    from fdi.diagnosis import optimisers as ways
+
+    record, model = d.record, d.model
+    start = (d.grid.merged.kintas, d.grid.merged.fss) if d.grid else (0.1, 15.0)
+    for number, method in enumerate(ways.METHODS):
+        name = method.__name__.replace("_", " ")
+        progress(name, number, len(ways.METHODS))
+        if not ways.available(method):
+            continue
+        found, seconds = timed(partial(method, model, record, start, d.floor, seed))
+        yield Row(found.method, found.kintas, found.fss, found.left, None, None, None, None, found.simulations, seconds)
+
+
+def comparators(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
+    """The learners; the time of each holds that of simulating what both learn from.
+
+    Raises:
+        InputError: scikit-learn is not installed, or the trace shows no precursors.
+    """
+    from fdi.diagnosis import comparators as learners
+
+    if not learners.available():
+        raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
+    data, before = timed(lambda: learners.lesson(d.cycles, d.model, seed, progress))
+    for learner in learners.LEARNERS:
+        progress(learner.__name__.replace("_", " "), 1, 1)
+        found, seconds = timed(partial(learner, data, seed))
+        yield Row(found.method, _known(found.kintas), _known(found.fss), None, _known(found.error_kintas),
+                  _known(found.error_fss), found.right, {name: level.word for name, level in found.levels.items()},
+                  found.simulations, before + seconds)
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """What some work gives, and how long it took, s."""
+    clock = WallClock()
+    start = clock.now()
+    return work(), 1e-9 * (clock.now() - start)
+
+
+def _known(x: float) -> float | None:
+    return x if x == x else None

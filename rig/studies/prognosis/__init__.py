@@ -1,0 +1,1 @@
+"""How good remaining lives are, scored on simulated units."""

@@ -1,0 +1,135 @@
+"""Simulated units whose fault grows by a known law: what a trend is scored on.
+
+Three of the laws are among those that are fitted, four are not. Sizes are measured with the errors that `rig fdi` has:
+most of an error is the unit's own (its tolerances) and the same in each of its traces.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
+
+Floats = NDArray[np.float64]
+Law = Callable[[Floats, np.random.Generator], Floats]
+
+WIDTH = 1.96
+FINE = 4000  # points of a true course
+INTERVAL = 7.0  # days between traces, about
+
+
+class Error(NamedTuple):
+    """Of a refined size: deviation `base + share * size`, and the part of its variance that is the unit's own."""
+
+    base: float
+    share: float
+    common: float
+
+
+# as measured with rig fdi on XJ, P12 and XS: twelve traces of each of two units, tolerances of 1.5 %, coloured noise
+ERRORS = {CLOGGING.name: Error(0.03, -0.03, 0.995), FRICTION.name: Error(0.0, 0.032, 0.95)}
+
+
+class Unit(NamedTuple):
+    """One unit: its true course over its life, and what the traces say of it."""
+
+    law: str
+    fault: Fault
+    onset: float  # days
+    course_t: Floats  # days
+    course: Floats
+    t: Floats  # days, of the traces
+    sizes: tuple[Estimate, ...]
+
+    def reached(self, limit: float) -> float:
+        """When the size first reaches the limit, days."""
+        return float(self.course_t[int((self.course >= limit * (1.0 - 1e-9)).argmax())])
+
+
+def linear(x: Floats, rng: np.random.Generator) -> Floats:
+    """Of a fault from its onset, x = 0, to MaxBand, x = 1."""
+    return x
+
+
+def exponential(x: Floats, rng: np.random.Generator) -> Floats:
+    """1.5 to 4.5 e-foldings."""
+    bend = rng.uniform(1.5, 4.5)
+    return np.asarray(np.expm1(bend * x) / np.expm1(bend))
+
+
+def power(x: Floats, rng: np.random.Generator) -> Floats:
+    """An exponent from 0.6 to 2.8."""
+    return np.asarray(x ** rng.uniform(0.6, 2.8))
+
+
+def crack(x: Floats, rng: np.random.Generator) -> Floats:
+    """Growth in proportion to the size to the power 1.5, as a crack's by Paris with an exponent of 3."""
+    start = rng.uniform(0.08, 0.25)
+    root = 1.0 - (1.0 - np.sqrt(start)) * x
+    return np.asarray((start / root ** 2 - start) / (1.0 - start))
+
+
+def logistic(x: Floats, rng: np.random.Generator) -> Floats:
+    """An S that would flatten at 1.15 to 1.6 times MaxBand."""
+    steep, middle = rng.uniform(4.0, 8.0), rng.uniform(0.4, 0.7)
+    s = 1.0 / (1.0 + np.exp(-steep * (np.linspace(0.0, 1.5, 3000) - middle)))
+    s = s - s[0]
+    end = float(np.interp(s[-1] / rng.uniform(1.15, 1.6), s, np.linspace(0.0, 1.5, 3000)))
+    grown = np.interp(x * end, np.linspace(0.0, 1.5, 3000), s)
+    return np.asarray(grown / grown[-1])
+
+
+def kinked(x: Floats, rng: np.random.Generator) -> Floats:
+    """Two rates: the second, 1.5 to 4 times the first, begins somewhere in the middle of the life."""
+    at, ratio = rng.uniform(0.25, 0.6), rng.uniform(1.5, 4.0)
+    s = x + (ratio - 1.0) * np.maximum(x - at, 0.0)
+    return np.asarray(s / s[-1])
+
+
+def gamma(x: Floats, rng: np.random.Generator) -> Floats:
+    """A gamma process: many small jumps, 60 of the mean size to MaxBand."""
+    s = np.cumsum(rng.gamma(60.0 / len(x), size=len(x)))
+    return np.asarray(s / s[-1])
+
+
+FITTED: dict[str, Law] = {"linear": linear, "exponential": exponential, "power": power}
+OTHERS: dict[str, Law] = {"crack": crack, "logistic": logistic, "two rates": kinked, "gamma process": gamma}
+LAWS = FITTED | OTHERS
+
+
+def unit(law: str, seed: int) -> Unit:
+    """A unit whose fault begins in the first third of the traces and ends at MaxBand after 15 to 40 more of them."""
+    rng = np.random.default_rng([seed, 17])
+    fault = (CLOGGING, FRICTION)[seed % 2]
+    traces = int(rng.integers(15, 41))
+    onset = INTERVAL * traces * rng.uniform(0.0, 0.4)
+    life = INTERVAL * traces
+    course_t = np.concatenate([[0.0], onset + life * np.linspace(0.0, 1.0, FINE)])
+    shape = np.concatenate([[0.0], LAWS[law](np.linspace(0.0, 1.0, FINE), rng)])
+    course = fault.healthy + (fault.most - fault.healthy) * shape
+    t = np.arange(0.0, onset + life, INTERVAL)
+    t = np.sort(np.maximum(t + rng.uniform(-2.0, 2.0, len(t)), 0.0))
+    return Unit(law, fault, onset, course_t, course, t, measured(fault, np.interp(t, course_t, course), rng))
+
+
+def healthy(seed: int, traces: int = 25) -> Unit:
+    """A unit in which nothing grows."""
+    rng = np.random.default_rng([seed, 11])
+    fault = (CLOGGING, FRICTION)[seed % 2]
+    t = INTERVAL * np.arange(traces) + rng.uniform(-2.0, 2.0, traces)
+    true = np.full(traces, fault.healthy)
+    return Unit("none", fault, np.inf, t, true, t, measured(fault, true, rng))
+
+
+def measured(fault: Fault, true: Floats, rng: np.random.Generator) -> tuple[Estimate, ...]:
+    """What the refinement would say of true sizes, shape (n,), in traces of one unit."""
+    error = ERRORS[fault.name]
+    sigma = error.base + error.share * true
+    own = rng.standard_normal()
+    noise = np.sqrt(error.common) * own + np.sqrt(1.0 - error.common) * rng.standard_normal(len(true))
+    found = np.maximum(true + sigma * noise, 0.0)  # neither size can be less
+    half = WIDTH * (error.base + error.share * found)
+    return tuple(Estimate(float(x), max(float(x - h), 0.0), float(x + h)) for x, h in zip(found, half, strict=True))

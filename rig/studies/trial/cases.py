@@ -1,0 +1,217 @@
+"""Cases of the blind trial: `python -m rig.studies.trial.cases --out DIR --count N --seed S` writes traces.
+
+A case is a folder with est.csv.gz (preflight command), repeat.csv.gz (the same, other noise) and holdout.csv.gz
+(another command); truth.toml says what is hidden. Everything follows from the seed.
+"""
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.studies.trial import command, hidden
+from rig.studies.trial.hidden import Hidden
+from rig.studies.trial.truth import PERIOD, Run, nominal_symbols, simulate
+
+Array = NDArray[np.float64]
+
+KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
+SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
+FLOORS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+"""RMS noise of the sensors: m, Pa, m."""
+SCATTERED = ("GM", "JF", "BF", "KF", "KSF", "GQF", "GPF", "GQ", "GP", "PSR", "AJ", "MJ", "CJ", "FSJ", "FDJ", "CLK")
+BETWEEN = 20  # cycles over which positions are compared when their slow drift shall not count
+HUM_HZ, HUM_PHASE = 50.0, 1.0
+LOADED = 0.1  # of the cases that do not need a known load have one
+
+
+class Level(NamedTuple):
+    """How far the bench is from ideal."""
+
+    scatter: float  # standard deviation of the plant's parameters, relative
+    colour: float  # correlation of the position sensor's noise from one cycle to the next
+    hum: float  # m, amplitude of the mains on the position sensor
+
+
+LEVELS = {"exact": Level(0.0, 0.0, 0.0), "bench": Level(0.015, 0.8, 0.7e-6)}
+
+
+class Case(NamedTuple):
+    """What is hidden in a case, and all else that makes its traces."""
+
+    seed: int
+    kind: str
+    effects: tuple[Hidden, ...]
+    signals: str
+    level: Level
+    plant: dict[str, float]  # symbols of the healthy plant that differ from nominal
+    load: float  # N, of the known load
+
+
+def draw(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
+         sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
+    """The case of a seed; `kind`, the effects' names and the level ("exact", "bench") leave the rest to chance.
+
+    `sizes` are fractions of the logarithmic range that a size is drawn from; of two effects both are in its upper half.
+    """
+    rng = np.random.default_rng([seed, 3])
+    kind = kind or ("one" if effects else str(rng.choice(list(KINDS), p=list(KINDS.values()))))
+    drawn = _level(rng)
+    quality = LEVELS[level] if level else drawn
+    signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
+    plant = scattered(quality.scatter, rng)
+    low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
+    found = tuple(hidden.draw(name, nominal_symbols() | plant, rng, low, sizes[1])
+                  for name in effects or _names(kind, rng))
+    needed = max((effect.known_load for effect in found), default=0.0)
+    chance = float(rng.uniform(2000, 8000)) if rng.random() < LOADED and quality.scatter > 0 else 0.0
+    return Case(seed, kind, found, signals, quality, plant, needed or chance)
+
+
+def scattered(spread: float, rng: np.random.Generator) -> dict[str, float]:
+    """The symbols of a healthy plant, each off its nominal value by the standard deviation `spread`, relative."""
+    return {symbol: nominal_symbols()[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED}
+
+
+def _level(rng: np.random.Generator) -> Level:
+    """Scatter 0 to 2 %; noise white in one case of three, else coloured and with hum."""
+    scatter, white = float(rng.uniform(0, 0.02)), rng.random() < 1 / 3
+    colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
+    return Level(scatter, 0.0, 0.0) if white else Level(scatter, colour, hum)
+
+
+def _names(kind: str, rng: np.random.Generator) -> list[str]:
+    if kind == "nothing":
+        return []
+    if kind == "outside":
+        return [str(rng.choice(list(hidden.OUTSIDE)))]
+    while True:
+        names = [str(name) for name in rng.choice(list(hidden.CATALOGUE), 2 if kind == "two" else 1, replace=False)]
+        if not any(pair <= set(names) for pair in hidden.EXCLUDES):
+            return names
+
+
+def symbols(case: Case, without: Iterable[str] = ()) -> dict[str, float]:
+    """The plant's symbols that differ from nominal, some of the hidden effects left out."""
+    changes = dict(case.plant)
+    for effect in case.effects:
+        if effect.name not in without:
+            changes |= {key: value for key, value in effect.changes.items() if key not in hidden.NOT_SIMULATED}
+    return changes
+
+
+class Measured(NamedTuple):
+    """A trace, and the noise in it, both one row a cycle."""
+
+    trace: Run
+    noise: dict[str, Array]
+
+
+def measure(case: Case, name: str) -> Measured:
+    """Trace `name` ("est", "repeat" or "holdout") of a case as its bench records it."""
+    turn = ("est", "repeat", "holdout").index(name)
+    rng = np.random.default_rng([case.seed, 5, turn])
+    com = np.round(command.holdout(rng) if name == "holdout" else command.preflight(), 12)
+    n = len(com)
+    noise = {"xj": coloured(n, case.level, rng)} | {s: FLOORS[s] * rng.standard_normal(n) for s in ("p12", "xs")}
+    run = simulate(com, symbols(case), noise["xj"], command.known_load(n, case.load))
+    return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
+
+
+def coloured(n: int, level: Level, rng: np.random.Generator) -> Array:
+    """Noise of the position sensor, (n,) m: first order, of the floor's RMS, and hum."""
+    white, colour = FLOORS["xj"] * rng.standard_normal(n), level.colour
+    out, last = np.empty(n), float(white[0])
+    for k, x in enumerate((np.sqrt(1 - colour**2) * white).tolist()):
+        out[k] = last = colour * last + x if k else last
+    out += level.hum * np.sin(2 * np.pi * HUM_HZ * PERIOD * np.arange(n) + HUM_PHASE)
+    return out
+
+
+def ratios(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, float]:
+    """What an effect does to a trace, over the sensors' floors: replay from the measured Cor of the same plant without.
+
+    `xj_drift` counts the position as it drifts off, `xj` its differences over 20 cycles; `cor` is the answer's
+    departure from the control law, over what the position's floor does to it.
+    """
+    run, noise, floor = measured.trace, measured.noise, FLOORS
+    bare = simulate(run.com, symbols(case, without), None, run.load, run.cor)
+    xj = run.xj - noise["xj"] - bare.xj
+    p = nominal_symbols()
+    law = np.clip(p["GAP"] * (run.com - run.xj), -p["Imax"], p["Imax"])
+    return {"xj": _rms(xj[BETWEEN:] - xj[:-BETWEEN]) / (floor["xj"] * 2**0.5), "xj_drift": _rms(xj) / floor["xj"],
+            "p12": _rms(run.p12 - noise["p12"] - bare.p12) / floor["p12"],
+            "xs": _rms(run.xs - noise["xs"] - bare.xs) / floor["xs"],
+            "cor": _rms(run.cor - law) / (p["GAP"] * floor["xj"])}
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt((x**2).mean()))
+
+
+def write(case: Case, folder: Path) -> None:
+    """The case's traces and truth.toml into `folder`, made if need be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("est", "repeat", "holdout"):
+        measured = measure(case, name)
+        _write_trace(measured.trace, folder / f"{name}.csv.gz")
+        if name == "est":
+            (folder / "truth.toml").write_text(_truth(case, measured), encoding="utf-8")
+
+
+def _write_trace(run: Run, path: Path) -> None:
+    rows = np.column_stack([run.com, run.xj, run.cor, run.p12, run.xs, run.load]).tolist()
+    lines = [f"{k / 1000:.3f},%.9g,%.9g,%.9g,%.9g,%.9g,%.9g" % tuple(row) for k, row in enumerate(rows)]
+    text = "\n".join(["t,com,xj,cor,p12,xs,load", *lines, ""])
+    path.write_bytes(gzip.compress(text.encode(), compresslevel=4, mtime=0))  # no time: repeats to the byte
+
+
+def _truth(case: Case, est: Measured) -> str:
+    """What is hidden, as TOML."""
+    names = [effect.name for effect in case.effects]
+    lines = [f"seed = {case.seed}", f"kind = {json.dumps(case.kind)}", f"effects = {json.dumps(names)}",
+             f"signals = {json.dumps(case.signals)}", f"known_load = {case.load:.6g}", "", "[level]",
+             *(f"{key} = {value:.6g}" for key, value in case.level._asdict().items()), "", "[base_ratio]",
+             *_table(ratios(case, est, names))]
+    for effect in case.effects:
+        lines += ["", "[[hidden]]", f"effect = {json.dumps(effect.name)}", f"size = {effect.size:.6g}",
+                  f"value = {effect.value:.8g}", "[hidden.changes]", *_table(effect.changes)]
+        if len(case.effects) > 1:
+            lines += ["[hidden.ratio]", *_table(ratios(case, est, [effect.name]))]
+    return "\n".join([*lines, "", "[plant]", *_table(case.plant), ""])
+
+
+def _table(values: dict[str, float]) -> list[str]:
+    return [f"{key} = {value:.8g}" for key, value in values.items()]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write cases to a folder; see --help."""
+    parser = argparse.ArgumentParser(prog="python -m rig.studies.trial.cases",
+                                     description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder to make the cases' folders in")
+    parser.add_argument("--count", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0, help="of the first case; the next has the next")
+    parser.add_argument("--kind", choices=list(KINDS))
+    parser.add_argument("--effect", action="append", default=[], choices=[*hidden.CATALOGUE, *hidden.OUTSIDE],
+                        help="the hidden effect; twice for two")
+    parser.add_argument("--level", choices=list(LEVELS), help="default: scatter and noise drawn, too")
+    parser.add_argument("--sizes", type=float, nargs=2, default=(0.0, 1.0), metavar=("LOW", "HIGH"),
+                        help="part of the logarithmic range of sizes, 0 to 1")
+    args = parser.parse_args(arguments)
+    for seed in range(args.seed, args.seed + args.count):
+        kind = args.kind or ("two" if len(args.effect) > 1 else None)
+        case = draw(seed, kind, args.effect, args.level, tuple(args.sizes))
+        write(case, args.out / f"{seed:04d}")
+        print(f"{seed:04d} {case.kind}: {', '.join(f'{e.name} {e.size:.4g}' for e in case.effects)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,134 @@
+"""Running the rerun viewer: its window, or a picture without a display that is checked for errors and empty views."""
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.trace.trace import Trace
+from rig.view.rerun_log import LANES, LIMIT, PASS, PLOTS, SECTIONS, STATES, TEXTS, VERDICTS, ViewerError, lines, rerun
+
+SEEN = 500  # pixels; the marks in a legend have some 60 each
+WORD = 40  # pixels; one level in the list of events has some 60
+FADING = 7.0  # s; the viewer's own greeting covers a corner for that long
+DIMMED = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
+LEVELS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
+LIMITS = "limits"
+
+
+def open_viewer(rrd: Path) -> None:
+    """Open the viewer's window on a recording and leave it open; it listens on 127.0.0.1 only.
+
+    Raises ViewerError without rerun and without a display.
+    """
+    rerun()
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or ask for --screenshot")
+    subprocess.Popen(_command(rrd, "auto"), start_new_session=True)
+
+
+def screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
+    """Draw `rrd`, made of `trace`, without a display and save the picture; -> pixels of what each view is to show.
+
+    Needs a Vulkan driver, lavapipe will do (Debian: mesa-vulkan-drivers libvulkan1). Raises ViewerError when the viewer
+    does not come up within `patience` s, when a view reports a warning or an error, and when one shows no line, no
+    lane or no text. The lines of limits are counted, but one may well lie behind its signal.
+    """
+    rerun()
+    views = _draw(rrd, image, patience)
+    wrong = [f"{view.name}: {report.summary}" for view in views for report in view.reports]
+    if wrong:
+        raise ViewerError(f"views with errors: {'; '.join(wrong)}")
+    pixels = _pixels(trace, image)
+    empty = [title for title, count in pixels.items() if count < {TEXTS: WORD, LIMITS: 0}.get(title, SEEN)]
+    if empty:
+        raise ViewerError(f"{image}: views in which nothing is to be seen: {', '.join(empty)}")
+    return pixels
+
+
+def _pixels(trace: Trace, image: Path) -> dict[str, int]:
+    """View -> how many pixels have the colour of one of its lines, lanes or words."""
+    from matplotlib.image import imread
+
+    shades = (imread(str(image))[..., :3] * 255).astype(int)
+    there = lines(trace)
+    out: dict[str, int] = {}
+    for plot in PLOTS:
+        colours = [line.colour for line in plot.lines if f"{plot.origin}/{line.path}" in there]
+        if colours:
+            out[plot.title] = sum(_count(shades, colour) for colour in colours)
+    out[LANES] = sum(_count(shades, colour, DIMMED, 6) for colour in
+                     {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()})
+    if trace.events or trace.checks:
+        out[TEXTS] = sum(_count(shades, colour) for colour in LEVELS)
+    out[LIMITS] = _count(shades, LIMIT)
+    return out
+
+
+def _count(shades: NDArray[np.int64], colour: int, weight: float = 1.0, off: int = 24) -> int:
+    """Pixels whose channels are all within `off` of a colour."""
+    wanted = weight * np.array([colour >> shift & 0xFF for shift in (24, 16, 8)])
+    return int((np.abs(shades - wanted).max(axis=2) < off).sum())
+
+
+def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
+    """Save the picture; -> the views' states."""
+    from rerun.experimental import ViewerClient
+
+    port = _free_port()
+    image.unlink(missing_ok=True)
+    with tempfile.TemporaryFile("w+") as output:
+        viewer = subprocess.Popen([*_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],
+                                  stdout=output, stderr=output, start_new_session=True)
+        try:
+            views = _when_loaded(viewer, f"rerun+http://127.0.0.1:{port}/proxy", patience)
+            ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image.resolve()))
+        except (ConnectionError, TimeoutError, RuntimeError) as error:
+            output.seek(0)
+            last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it said nothing")
+            raise ViewerError(f"the viewer does not draw: {error}; its last line: {last.strip()}") from error
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
+            viewer.wait()
+    return views
+
+
+def _when_loaded(viewer: subprocess.Popen[bytes], url: str, patience: float) -> list[Any]:
+    """The views once everything has arrived, been drawn, and the greeting has faded."""
+    from rerun.experimental import ViewerClient
+
+    deadline = time.monotonic() + patience
+    while time.monotonic() < deadline:
+        time.sleep(0.5)
+        if viewer.poll() is not None:
+            raise RuntimeError(f"it ended with status {viewer.returncode}")
+        try:
+            state = ViewerClient(url).get_state()
+        except ConnectionError:
+            continue
+        if state.recordings and state.views and not state.loading:
+            time.sleep(FADING)
+            return list(ViewerClient(url).get_state().views)
+    raise TimeoutError(f"not ready after {patience:g} s")
+
+
+def _command(rrd: Path, port: str) -> list[str]:
+    return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", port, "--hide-welcome-screen", str(rrd)]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

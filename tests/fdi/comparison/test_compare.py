@@ -1,0 +1,172 @@
+"""The comparison as a whole: a perfect model is at the floor, and a fault is found in the block that has it."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from noisy_traces import SHORT, backlash, healthy, lagging, recorded
+
+from fdi.comparison.compare import Comparison, compare
+from fdi.report.compare_text import lines, sentence, to_json
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+
+MODEL = Model()
+
+
+@cache
+def faulty(name: str) -> Trace:
+    changes, sensor = FAULTS[name]
+    return recorded(changes, sensor=sensor() if sensor else None)
+
+
+Fault = tuple[dict[str, float], Callable[[], Callable[[float], float]] | None]
+FAULTS: dict[str, Fault] = {
+    "servovalve: spool friction": ({"spool.static_friction": 30.0, "spool.dynamic_friction": 20.0}, None),
+    "servovalve: clogged filter": ({"filter.clogging": 0.2}, None),
+    "servovalve: torque motor": ({"torque_motor.gain": 2.2}, None),
+    "jack: leakage": ({"jack.leakage": 2e-11}, None),
+    "jack: flow gain": ({"valve.pressure_gain": 2e11}, None),
+    "jack: friction": ({"jack.static_friction": 1200.0, "jack.dynamic_friction": 750.0}, None),
+    "jack: mass": ({"jack.mass": 200.0}, None),
+    "jack: drag": ({"jack.damping": 8e3}, None),
+    "sensor: play": ({}, lambda: backlash(60e-6)),
+    "sensor: lag": ({}, lambda: lagging(1e-3)),
+}
+
+
+def at_floor(found: Comparison) -> bool:
+    return found.verdict == "WITHIN_FLOOR" and not found.named and found.scatter is None
+
+
+@pytest.mark.parametrize("colour", ["white", "hum"])
+def test_a_perfect_model_is_at_the_floor(colour: str) -> None:
+    """With a repeat and, where the noise is as the model says, without."""
+    found = compare(healthy(2, colour), MODEL, [healthy(3, colour)])
+    assert at_floor(found), sentence(found)
+    for name, limit in {"xj": 0.05, "p12": 0.02, "xs": 0.02}.items():
+        assert found.signals[name].ratio == pytest.approx(1.0, abs=limit)
+        assert found.signals[name].floor.source == "repeats"
+        assert found.signals[name].solver_error < 0.1 * found.signals[name].floor.value
+    assert all(ratio is not None and ratio < 1.1 for ratio in found.blocks.values())
+    assert abs(found.drift) < 1e-6 and found.signals["xj"].closed_loop_error > 2 * found.signals["xj"].error
+    assert at_floor(compare(healthy(2, colour), MODEL))
+
+
+@pytest.mark.parametrize("colour", ["white", "hum"])
+def test_seeds_do_not_matter(colour: str) -> None:
+    """Short traces, whose estimates scatter the most."""
+    traces = [recorded(com=SHORT, seed=seed, colour=colour) for seed in range(10)]
+    found = [compare(trace, MODEL, repeats) for trace, other in zip(traces[::2], traces[1::2], strict=True)
+             for repeats in ([other], [])]
+    assert [sentence(f) for f in found if not at_floor(f)] == []
+    ratios = np.array([[s.ratio for s in f.signals.values()] for f in found])
+    assert ratios.mean(axis=0) == pytest.approx([1.0, 1.0, 1.0], abs=0.04)
+    assert ratios.std(axis=0).max() < 0.06
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_block_with_the_fault_is_named(fault: str) -> None:
+    block = fault.partition(":")[0]
+    found = compare(faulty(fault), MODEL)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named == (block,), sentence(found)
+    others = [ratio for name, ratio in found.blocks.items() if name != block]
+    assert all(ratio is not None and ratio < 1.3 for ratio in others)
+    assert found.blocks[block] > 1.5  # type: ignore[operator]
+    assert f"the {block} disagrees" in sentence(found)
+
+
+@pytest.mark.parametrize("fault", ["servovalve: spool friction", "jack: leakage", "jack: friction", "jack: mass"])
+def test_the_model_with_the_fault_is_at_the_floor(fault: str) -> None:
+    found = compare(faulty(fault), MODEL.replace(FAULTS[fault][0]))
+    assert at_floor(found), sentence(found)
+
+
+def test_another_firmware_is_the_controllers_fault_alone() -> None:
+    found = compare(recorded({"controller.proportional_gain": 4.2}), MODEL)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("controller",)
+    assert found.scatter is None and "the controller answers otherwise" in sentence(found)
+    assert found.answer.gain == pytest.approx(4.2, rel=1e-6)
+
+
+def test_a_sensors_gain_and_a_valves_cannot_be_told_apart() -> None:
+    found = compare(recorded(sensor=lambda x: 1.02 * x), MODEL)
+    assert set(found.named) == {"jack", "sensor"} and "the jack or the sensor disagree" in sentence(found)
+    assert found.parts["gain"] == pytest.approx(0.02, abs=0.002)
+
+
+def test_scatter_from_unit_to_unit_is_offered_as_a_reason() -> None:
+    """1.5 % in a few parameters is no missing physics; an effect is not explained that way."""
+    unit = {"valve.flow_gain": 0.3 * 1.02, "torque_motor.gain": 2.27 * 0.99, "jack.damping": 2000.0 * 1.02}
+    found = compare(recorded(unit), MODEL)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.scatter is not None and found.scatter.enough
+    assert found.scatter.moved["valve.flow_gain"] == pytest.approx(0.02 / 0.015, abs=0.4)
+    other = compare(faulty("servovalve: spool friction"), MODEL)
+    assert other.scatter is not None and not other.scatter.enough
+
+
+@pytest.mark.parametrize(("kept", "known"), [
+    (("xj",), {"controller"}), (("xj", "xs"), {"controller", "servovalve", "jack", "sensor"}),
+    (("xj", "p12"), {"controller", "servovalve", "jack"}), (("xs",), {"controller", "servovalve", "jack", "sensor"})])
+def test_fewer_signals_give_fewer_blocks(kept: tuple[str, ...], known: set[str]) -> None:
+    found = compare(faulty("servovalve: clogged filter"), MODEL, signals=kept)
+    assert tuple(found.signals) == kept and found.verdict == "MODEL_INCOMPLETE"
+    assert {name for name, ratio in found.blocks.items() if ratio is not None} == known
+    assert set(found.named) == ({"servovalve"} if kept != ("xj",) else set())
+
+
+def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
+    silent = MODEL.replace({"sensors.position_noise": 0.0})
+    found = compare(healthy(2, "hum"), silent)
+    assert found.signals["xj"].floor.lower_bound and found.signals["xj"].floor.source == "data"
+    assert found.verdict == "CANNOT_TELL" and "only a lower bound" in sentence(found)
+    assert compare(healthy(2, "hum"), silent, [healthy(3, "hum")]).verdict == "WITHIN_FLOOR"
+    assert compare(faulty("servovalve: clogged filter"), silent).verdict == "MODEL_INCOMPLETE"
+
+
+def test_a_simulation_without_noise_is_its_own_floor() -> None:
+    quiet = MODEL.replace({f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")})
+    run = simulate(quiet, SHORT)
+    assert compare(Trace.of(run._asdict(), 1e-3, {}), quiet).verdict == "WITHIN_FLOOR"
+
+
+def test_every_other_row_lost_is_no_error() -> None:
+    """The current between is guessed, and the floor says how little is known then."""
+    columns = {name: getattr(healthy(2), name)[::2] for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    found = compare(Trace.of(columns, 2e-3, {}), MODEL)
+    assert found.verdict in ("CANNOT_TELL", "WITHIN_FLOOR") and found.cycles.period == 1e-3
+    slow = MODEL.replace({"controller.period": 0.002})
+    run = simulate(slow, SHORT[::2], seed=1)
+    found = compare(Trace.of(run._asdict(), 2e-3, {}), MODEL)
+    assert at_floor(found) and found.cycles.period == 2e-3
+
+
+def test_rows_lost_at_random_are_no_error() -> None:
+    keep = np.random.default_rng(0).random(13_500) > 0.05
+    columns = {name: np.where(keep, getattr(healthy(2), name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
+    found = compare(Trace.of(columns, 1e-3, {}), MODEL)
+    assert found.verdict == "WITHIN_FLOOR", sentence(found)
+
+
+@pytest.mark.parametrize(("name", "rows"), [("com", 4), ("cor", -3)])
+def test_columns_out_of_step_are_moved(name: str, rows: int) -> None:
+    columns = {n: getattr(healthy(2), n) for n in ("com", "xj", "cor", "p12", "xs")}
+    columns[name] = np.roll(columns[name], rows)
+    found = compare(Trace.of(columns, 1e-3, {}), MODEL)
+    assert found.verdict == "WITHIN_FLOOR"
+    assert any(f"{name.capitalize()} stands {abs(rows)} cycles {'later' if rows > 0 else 'earlier'}" in note
+               for note in found.notes)
+
+
+def test_every_number_has_a_place_in_json_and_words() -> None:
+    found = compare(faulty("sensor: play"), MODEL, [recorded(seed=9, sensor=backlash(60e-6))])
+    told = to_json(found)
+    assert {"verdict", "signals", "solver_error", "where", "blocks"} <= set(told)
+    assert set(told["signals"]["xj"]) >= {"unit", "error", "floor", "ratio", "closed_loop_error"}
+    assert set(told["blocks"]) == {"controller", "servovalve", "jack", "sensor"}
+    assert all({"section", "t0", "t1", "share", "condition"} <= set(place) for place in told["where"])
+    labels = [label for label, _ in lines(found)]
+    assert {"floor", "solver", "where", "when", "residual", "scatter"} <= set(labels)
+    assert "after a reversal" in dict(lines(found))["when"]

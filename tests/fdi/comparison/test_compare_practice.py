@@ -1,0 +1,86 @@
+"""`rig compare` on the practice traces of another simulator: right where the truth is known, honest elsewhere."""
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+from places import SHARED
+
+from fdi.comparison.compare import Comparison, compare
+from fdi.report.compare_text import sentence
+from fdi.trace.trace import Trace
+from plant import Model, load_model
+
+FOLDER = SHARED / "practice"
+RIG = FOLDER.parent / "data/electrohydrostatic_rig"
+pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="no ../shared: no traces of an independent simulator")
+
+LIMIT = Model()["controller.current_limit"]
+TRUE: dict[str, dict[str, float]] = {  # those without plant scatter
+    "00": {"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0},
+    "01": {"filter.clogging": 0.3},
+    "02": {"null_bias.current": 0.03 * LIMIT},
+    "06": {"aero_stiffness.stiffness": 540e3},
+    "10": {"spool.static_friction": 33.0, "spool.dynamic_friction": 22.0, "filter.clogging": 0.21},
+}
+LEVELS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
+BLOCK = {"00": "servovalve", "01": "servovalve", "02": "servovalve", "03": "jack", "04": "jack", "05": "sensor",
+         "06": "jack", "07": "servovalve", "09": "jack", "10": "servovalve"}
+
+
+@cache
+def trace(case: str, name: str) -> Trace:
+    return Trace.read(FOLDER / case / f"{name}.csv.gz")
+
+
+@cache
+def nominal(case: str) -> Comparison:
+    return compare(trace(case, "est"), Model(), [trace(case, "repeat")])
+
+
+@pytest.mark.parametrize("case", TRUE)
+def test_the_truth_is_at_the_floor(case: str) -> None:
+    model = Model().replace(TRUE[case])
+    for name, repeats in (("est", [trace(case, "repeat")]), ("est", []), ("holdout", [])):
+        found = compare(trace(case, name), model, repeats)
+        assert found.verdict == "WITHIN_FLOOR", sentence(found)
+        for signal in found.signals.values():
+            assert signal.ratio == pytest.approx(1.0, abs=0.03)
+            assert signal.floor.value == pytest.approx(LEVELS[signal.name], rel=0.03)
+
+
+@pytest.mark.parametrize("case", BLOCK)
+def test_the_nominal_model_lacks_something_in_the_right_block(case: str) -> None:
+    found = nominal(case)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named[0] == BLOCK[case], sentence(found)
+    assert found.scatter is not None and not found.scatter.enough
+    assert found.answer.ratio < 1.0
+
+
+@pytest.mark.parametrize("case", sorted([*BLOCK, "08"]))
+def test_the_floor_is_the_sensors_noise_however_wrong_the_model(case: str) -> None:
+    """Also where it is coloured with hum of one phase, and stick-slip differs between the repeats by 30 floors."""
+    for signal in nominal(case).signals.values():
+        assert signal.floor.value == pytest.approx(LEVELS[signal.name], rel=0.15)
+
+
+def test_plant_scatter_alone_is_said_to_be_possible() -> None:
+    """08 lacks nothing, but its plant is 1.5 % off the nominal one here and there."""
+    found = nominal("08")
+    assert found.verdict == "MODEL_INCOMPLETE" and found.scatter is not None and found.scatter.enough
+    assert max(abs(moved) for moved in found.scatter.moved.values()) < 3.0
+
+
+@pytest.mark.parametrize(("case", "words"), [("05", "after a reversal"), ("06", "further than 2 mm from the middle"),
+                                             ("07", "accelerates by more than")])
+def test_conditions_in_words(case: str, words: str) -> None:
+    assert words in nominal(case).condition
+
+
+@pytest.mark.skipif(not RIG.exists(), reason="no ../shared/data: no measurements of another actuator")
+def test_measurements_of_another_plant() -> None:
+    """No valve and no known firmware there: signals, places and drift are told, blocks are not."""
+    found = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
+    assert found.verdict == "MODEL_INCOMPLETE" and set(found.blocks.values()) == {None} and not found.named
+    assert found.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
+    assert "the model leaves" in sentence(found).lower() and len(found.where) > 3

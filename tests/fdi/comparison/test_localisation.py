@@ -1,0 +1,136 @@
+"""Where an error is: sections, conditions, and what a residual goes with, with errors put where they must be found."""
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from noisy_traces import LEVELS, healthy, noise
+
+from fdi.comparison.localisation import Motion, condition, derivative, motion, places, whole
+from fdi.comparison.residual_tests import WHITE, colour, cumulative, depend, diagnose, follow, shape, whiten
+from fdi.trace.cycles import Cycles, readings
+from plant import Model
+
+LIMIT = 8e-3
+
+
+@pytest.fixture(scope="module")
+def c() -> Cycles:
+    return readings(healthy(), Model())[0]
+
+
+@pytest.fixture(scope="module")
+def m(c: Cycles) -> Motion:
+    return motion(c, {"xj": c.xj, "p12": c.p12, "xs": c.xs})
+
+
+def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
+    return noise(seed, rows)[:, 0] ** 2 / LEVELS[0] ** 2 + extra
+
+
+def test_derivatives_of_a_parabola() -> None:
+    k = np.arange(100.0)
+    x = 3.0 + 2.0 * k + 0.5 * k**2
+    assert derivative(x, 21, 1)[20:80] == pytest.approx(2.0 + k[20:80])
+    assert derivative(x, 21, 2)[20:80] == pytest.approx(np.ones(60))
+
+
+def test_motion_of_the_ram(c: Cycles, m: Motion) -> None:
+    sine = (c.t > 9.1) & (c.t < 9.4)
+    assert m.v[sine] == pytest.approx(2 * np.pi * 3e-3 * np.cos(2 * np.pi * (c.t[sine] - 9.0 - 0.009)), abs=1.5e-3)
+    assert np.isinf(m.reversed_for[:400]).all()
+    assert m.reversed_for[9300] < 0.1  # just behind the sine's first crest
+
+
+@pytest.mark.parametrize(("chosen", "words"), [
+    (lambda c, m: np.abs(m.v) > 0.05, "ram faster than 50 mm/s"),
+    (lambda c, m: m.reversed_for < 0.02, "within 20 ms after a reversal"),
+    (lambda c, m: np.abs(m.p12) > 1e6, r"\|P12\| above 10 bar"),
+    (lambda c, m: np.abs(m.x) > 2e-3, "ram further than 2 mm from the middle"),
+    (lambda c, m: np.abs(c.cor) > 0.99 * LIMIT, "current at its limit"),
+    (lambda c, m: m.v > 5e-4, "ram extends"),
+])
+def test_the_condition_is_named(c: Cycles, m: Motion, chosen: object, words: str) -> None:
+    rows = chosen(c, m)  # type: ignore[operator]
+    z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
+    said = condition(z2, m, LIMIT)
+    assert said.startswith(("100 %", "99 %")) and re.search(words, said), said
+
+
+def test_noise_and_what_is_everywhere_have_no_condition(c: Cycles, m: Motion) -> None:
+    assert condition(squares(2, len(c), np.zeros(len(c))), m, LIMIT) == ""
+    assert condition(squares(2, len(c), np.full(len(c), 9.0)), m, LIMIT) == ""
+    assert condition(np.full(len(c), np.nan), m, LIMIT) == ""
+
+
+def test_sections_with_their_shares(c: Cycles, m: Motion) -> None:
+    z2 = squares(3, len(c), np.where((c.t >= 4.0) & (c.t < 6.0), 50.0, 0.0))
+    found = places(c, z2, m, LIMIT)
+    assert sum(p.share for p in found) == pytest.approx(1.0, abs=0.01)
+    assert found[0].section == "ramp at 0.5 mm/s"
+    assert (found[0].t0, found[0].t1) == (pytest.approx(4.0, abs=2e-3), pytest.approx(6.0, abs=2e-3))
+    assert found[0].share > 0.85 and found[0].ratio == pytest.approx(7.1, abs=0.3)
+    assert "motion within 3 mm" in [p.section for p in found] and "step to 5 mm" in [p.section for p in found]
+
+
+def test_signals_are_weighed_by_their_floors() -> None:
+    z2 = whole({"xj": np.array([2e-6, np.nan]), "p12": np.array([4e4, np.nan])}, {"xj": 2e-6, "p12": 2e4})
+    assert z2[0] == pytest.approx((1 + 4) / 2) and np.isnan(z2[1])
+
+
+def test_white_noise_stays_within_its_bands(c: Cycles, m: Motion) -> None:
+    outside, reached, dependent = 0, 0, 0
+    for seed in range(100, 120):  # not that of the trace, whose noise is in its own XJ
+        d = diagnose(c, {"xj": noise(seed, len(c))[:, 0]}, {}, m)["xj"]
+        outside += d.departs > d.allowed
+        reached += any(abs(f.correlation) > f.bound for f in d.follows)
+        dependent += bool(d.depends) and d.depends[0].share > 0.02
+    assert outside <= 4 and reached <= 3 and dependent == 0  # 5 %, 1 % of two, none
+
+
+def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Cycles, m: Motion) -> None:
+    r, repeat = (noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
+    alone = diagnose(c, {"xj": r}, {}, m)["xj"]
+    d = diagnose(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
+    assert alone.departs > 5 * alone.allowed and d.departs < 3 * d.allowed
+    assert d.memory == pytest.approx(d.noise_memory, abs=1.5e-3)
+
+
+def test_a_colour_is_taken_out() -> None:
+    x = noise(1, 13_500, "hum")[:, 0]
+    e = whiten(x, colour(x))
+    assert np.abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03 < np.corrcoef(x[1:], x[:-1])[0, 1]
+    assert (colour(np.zeros(100)) == WHITE).all() and np.isfinite(colour(np.sin(np.arange(500.0)))).all()
+
+
+@pytest.mark.parametrize("lag", [1, 7, 30])
+def test_what_follows_an_input_is_found_with_its_lag(c: Cycles, lag: int) -> None:
+    u = np.random.default_rng(0).standard_normal(len(c)).cumsum()
+    left = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
+    found = follow("Cor", u, WHITE, left, 1e-3)
+    assert found.lag == pytest.approx(lag * 1e-3) and found.correlation > 4 * found.bound
+    alone = follow("Cor", u, WHITE, left - 0.5 * np.roll(u, lag), 1e-3)
+    assert abs(alone.correlation) < 1.5 * alone.bound
+
+
+@pytest.mark.parametrize(("law", "word"), [
+    (lambda v: 0.3 * v / 0.05, "proportional to"), (np.sign, "steps with the sign of"),
+    (lambda v: np.abs(v) / 0.05, "even in")])
+def test_dependence_on_speed_and_its_shape(m: Motion, law: object, word: str) -> None:
+    rng = np.random.default_rng(0)
+    v = rng.uniform(-0.1, 0.1, 13_500)
+    left = law(v) + 0.1 * rng.standard_normal(len(v))  # type: ignore[operator]
+    found = depend("speed", v, left)
+    assert found is not None and found.shape == word and found.share > 0.8
+    inside = np.abs(found.means - law(found.centres)) < 4 * found.half + 0.05  # type: ignore[operator]
+    assert inside.mean() > 0.8
+    assert depend("speed", np.zeros(100), left[:100]) is None
+    assert shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
+
+
+def test_the_cumulative_periodogram_of_a_line() -> None:
+    x = np.sin(2 * np.pi * 0.1 * np.arange(5000))
+    frequencies, power, departs, allowed = cumulative(x, 1e-3)
+    assert power[np.searchsorted(frequencies, 99.0)] < 0.01 and power[np.searchsorted(frequencies, 101.0)] > 0.99
+    assert departs > 10 * allowed and allowed == pytest.approx(1.358 / np.sqrt(len(power)), rel=1e-3)

@@ -1,0 +1,255 @@
+"""Bands: what leaves them and what does not, limits from Table 2's faults, files, other commands, a fleet's own."""
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi.diagnosis import bands as judging
+from fdi.diagnosis.bands import Judged, judge, judge_columns
+from fdi.diagnosis.bands_file import default, load, parse, save, text
+from fdi.diagnosis.envelope import LASTING, Bands, check_command, matches, stays
+from fdi.diagnosis.faults import Level
+from fdi.diagnosis.learn_bands import build
+from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.trace.sections import Section, sections
+from fdi.trace.trace import Trace
+from plant import InputError, load_model, simulate
+from plant.profile import build as profile
+from plant.segments import Hold, Ramp, Step
+from rig.sequences import load_sequence
+
+CLOGGING, FRICTION = "filter_clogging", "spool_friction"
+NAN = math.nan
+
+
+@cache
+def command() -> np.ndarray:
+    return load_sequence("preflight").main_profile().command
+
+
+@cache
+def parts() -> list[Section]:
+    return sections(command())
+
+
+@cache
+def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5, count: int = 16) -> np.ndarray:
+    com = command()
+    return runs(load_model(), com, np.zeros_like(com), Kind("", clogging, friction, sliding), count, seed=4321)
+
+
+def judged(x: np.ndarray, bands: Bands | None = None) -> Judged:
+    return judge_columns(command(), x, 1e-3, bands or default(), parts=parts())
+
+
+def levels(found: list[Judged], fault: str) -> list[Level | None]:
+    return [j.levels.get(fault) for j in found]
+
+
+def test_healthy_units_stay_within() -> None:
+    """Tolerances, coloured noise, hum, stuck where the last move left them: no event, no level, nothing rules."""
+    for j in map(judged, units()):
+        assert (j.events, j.ruling) == ((), None)
+        assert set(j.levels.values()) == {Level.ACCEPTABLE}
+        assert len(j.levels) == 2 and j.notes == ()
+
+
+@pytest.mark.parametrize(("size", "expected"), [((0.35, NAN), CLOGGING), ((NAN, 40.0), FRICTION)])
+def test_a_fault_is_named(size: tuple[float, float], expected: str) -> None:
+    """A single fault past MidBand rules, and the other is left in peace."""
+    found = [judged(x) for x in units(*size)]
+    other = ({CLOGGING, FRICTION} - {expected}).pop()
+    assert {j.ruling for j in found} == {expected}
+    assert all(level >= Level.MAINTENANCE for level in levels(found, expected))
+    assert set(levels(found, other)) == {Level.ACCEPTABLE}
+    assert all(e.t_out - e.t_in >= 0.9 * LASTING * 1e-3 and e.excess > 0 for j in found for e in j.events)
+
+
+@pytest.mark.parametrize(("size", "least", "level"), [((0.25, NAN), 0.9, Level.MAINTENANCE),
+                                                      ((0.40, NAN), 1.0, Level.NON_NOMINAL),
+                                                      ((NAN, 35.0), 0.97, Level.MAINTENANCE),
+                                                      ((NAN, 70.0), 0.97, Level.NON_NOMINAL)])
+def test_limits_stand_where_table_2_says(size: tuple[float, float], least: float, level: Level) -> None:
+    """Nearly every unit with a fault of that size leaves its band."""
+    fault = CLOGGING if math.isfinite(size[0]) else FRICTION
+    found = levels([judged(x) for x in units(*size, count=48)], fault)
+    assert np.mean([have is not None and have >= level for have in found]) >= least
+
+
+def test_smaller_faults_stay_within() -> None:
+    """Half of MidBand is acceptable."""
+    assert set(levels([judged(x) for x in units(friction=25.0)], FRICTION)) == {Level.ACCEPTABLE}
+    assert np.mean([level == Level.ACCEPTABLE for level in levels([judged(x) for x in units(0.1)], CLOGGING)]) > 0.9
+
+
+def test_friction_is_not_taken_for_clogging() -> None:
+    """It delays a step as clogging does; the ramps tell how much of that is friction's."""
+    for friction in (20.0, 35.0, 60.0):
+        assert not any(level for level in levels([judged(x) for x in units(friction=friction)], CLOGGING))
+
+
+def test_dynamic_friction_of_its_own() -> None:
+    """FSS alone raised, FDS healthy: the level is by FSS, and it is said that the spool slips faster than that."""
+    found = [judged(x) for x in units(friction=50.0, sliding=3.333 / 50)]
+    assert set(levels(found, FRICTION)) == {Level.MAINTENANCE}
+    assert all("slips faster" in j.notes[0] for j in found)
+    assert 45.0 < float(np.median([j.friction for j in found])) < 55.0
+
+
+def test_spikes_do_not_count() -> None:
+    """One or two samples beyond are no event, wherever they are and however far; three in a row are."""
+    x = units()[0]
+    rng = np.random.default_rng(1)
+    at = np.sort(rng.choice(np.arange(500, len(x) - 30, 40), 150, replace=False))
+    for size in (1, 2):
+        spiked = x.copy()
+        for k in range(size):
+            spiked[at + k] += 5e-3 * rng.choice([-1, 1], len(at))
+        assert judged(spiked).events == ()
+    spiked = x.copy()
+    spiked[5000:5000 + LASTING] += 5e-3
+    assert {e.signal for e in judged(spiked).events} == {"position", "speed"}
+
+
+def test_the_debouncing_rule() -> None:
+    """In after three in a row, out after three within; a sample back inside does not end a stay."""
+    flags = np.array([0, 1, 1, 0, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 1, 0], bool)
+    assert stays(flags) == [(6, 13)]
+    assert stays(np.ones(2, bool)) == [] and stays(np.ones(3, bool)) == [(0, 2)]
+    assert stays(np.zeros(9, bool)) == []
+
+
+def test_entry_and_exit_times() -> None:
+    """A push of 0.16 mm for 100 ms on the ramp is one stay outside of that length."""
+    x = units()[1].copy()
+    x[5000:5100] += 1.6e-4
+    events = [e for e in judged(x).events if e.signal == "position"]
+    assert [(e.band, round(e.t_in, 3), round(e.t_out, 3)) for e in events] == [("middle", 5.0, 5.1)]
+    assert events[0].section == "ramp at 0.5 mm/s" and 4e-5 < events[0].excess < 1.2e-4
+
+
+def test_as_the_bus_has_it_and_later() -> None:
+    """Rounded to 1e-7 m, and with another rest before the first step, it is the same test."""
+    x, com = np.round(units(0.4)[2], 7), np.round(command(), 7)
+    whole = judged(x)
+    shorter = judge_columns(com[200:], x[200:], 1e-3, default(), t0=0.2)
+    assert shorter.levels == whole.levels and len(shorter.events) == len(whole.events) > 0
+    assert [e.t_in for e in shorter.events] == pytest.approx([e.t_in for e in whole.events])
+
+
+def test_missing_samples() -> None:
+    """A section that lost too much is left out and said; a fault without any section has no level."""
+    x = units(friction=50.0)[0].copy()
+    x[500:4001] = np.nan
+    lost = judged(x)
+    assert CLOGGING not in lost.levels and lost.levels[FRICTION] == Level.MAINTENANCE
+    assert sum("is missing" in note for note in lost.notes) == 4 and "filter_clogging is not judged" in lost.notes[-1]
+    with pytest.raises(InputError, match="a measured position"):
+        judged(np.full(len(x), np.nan))
+
+
+def test_bands_of_another_command_are_refused() -> None:
+    """In one line that says which they are of; so is a load they do not know."""
+    other = command().copy()
+    other[500:1500] = 4e-3
+    with pytest.raises(InputError, match=r"the command of the bands, preflight \(4 steps, 2 ramps\)"):
+        judge_columns(other, other, 1e-3, default())
+    with pytest.raises(InputError, match="has 2 sections"):
+        judge_columns(command()[:2000], command()[:2000], 1e-3, default())
+    with pytest.raises(InputError, match="unloaded ram"):
+        judge_columns(command(), units()[0], 1e-3, default(), load=np.full(len(other), 5e3))
+    assert matches(default(), command(), 1e-3) and not matches(default(), other, 1e-3)
+
+
+SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(time=0.2))
+
+
+@cache
+def short_bands(force: float = 0.0) -> Bands:
+    com = profile(SHORT).command
+    return build(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
+
+
+def test_any_command() -> None:
+    """Bands by simulation of a command that nobody has seen before judge as those of the preflight do."""
+    com = profile(SHORT).command
+    made = short_bands()
+    assert made.judges == (True, True)
+    for kind, ruling in ((Kind("", 0.4), CLOGGING), (Kind("", friction=60.0), FRICTION), (Kind(""), None)):
+        x = runs(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
+        assert {judge_columns(com, row, 1e-3, made).ruling for row in x} == {ruling}
+    check_command(made, sections(com), 1e-3, "")
+
+
+def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A healthy unit under 5 kN is not blamed: without bands of its own they are made with the load."""
+    com = profile(SHORT).command
+    force = np.full(len(com), 5e3)
+    run = simulate(load_model(), com, force, seed=3)
+    monkeypatch.setattr(judging, "suited", lambda *a, **k: short_bands(5e3))
+    j = judge(Trace.of(run._asdict(), 1e-3, {}))
+    assert (j.ruling, j.events) == (None, ())
+    assert "5000 N" in short_bands(5e3).provenance["load"]
+
+
+def test_a_command_that_shows_nothing() -> None:
+    """A hold has no band."""
+    with pytest.raises(InputError, match="steps or slow ramps"):
+        build(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
+
+
+def test_the_file(tmp_path: Path) -> None:
+    """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed."""
+    save(default(), tmp_path / "b.toml")
+    again = load(tmp_path / "b.toml")
+    assert text(again) == text(default())
+    assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
+    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= default().provenance.keys()
+    assert (tmp_path / "b.toml").stat().st_size < 40_000
+    some = short_bands()
+    assert text(parse(text(some), "")) == text(some)
+
+
+def test_a_file_of_any_command_is_read_again(tmp_path: Path) -> None:
+    """A step of no whole number of mm, too."""
+    some = short_bands()
+    odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
+    save(odd, tmp_path / "b.toml")
+    assert load(tmp_path / "b.toml").precursors.keys() == odd.precursors.keys()
+
+
+@pytest.mark.parametrize(("old", "new", "word"), [
+    ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
+    ("friction_N = [5.0, ", "friction_N = [500.0, ", "rising"),
+    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "no ramp of the command")])
+def test_a_file_edited_wrongly_is_refused(old: str, new: str, word: str) -> None:
+    content = text(default())
+    assert old in content
+    with pytest.raises(InputError, match=word):
+        parse(content.replace(old, new), "b.toml")
+
+
+@pytest.mark.parametrize(("wrong", "word"), [("[bands", "TOML"), ("x = 1\n", "bands"), (None, "of other lengths"),
+                                             ("[bands]\nperiod_ms = 1\n", "key")])
+def test_a_wrong_file_is_refused(wrong: str | None, word: str, tmp_path: Path) -> None:
+    """In one line."""
+    if wrong is None:
+        wrong = text(default()).replace("friction_N = [5.0, ", "friction_N = [")
+    (tmp_path / "b.toml").write_text(wrong)
+    with pytest.raises(InputError, match=word) as refused:
+        load(tmp_path / "b.toml")
+    assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match="can be read"):
+        load(tmp_path / "none.toml")
+
+
+@pytest.mark.slow
+def test_false_alarms() -> None:
+    """At most 0.5 % of a thousand healthy units."""
+    alarms = sum(bool(judged(x).events) for x in units(count=1008))
+    assert alarms <= 5

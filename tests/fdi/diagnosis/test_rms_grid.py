@@ -1,0 +1,172 @@
+"""The RMS grid: its maps are what they say, its minima are where the faults are, and its rules are the paper's."""
+from __future__ import annotations
+
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_command import rig
+
+from fdi import Trace
+from fdi.diagnosis.rms_grid import FSS, KINTAS, Map, Point, bisector, merge, search
+from fdi.trace.cycles import readings
+from plant import InputError, Model, simulate
+from plant.monitor import Monitor
+from plant.profile import build
+from plant.segments import Chirp, Hold, Ramp, Step
+from rig.sequences import load_sequence
+
+PREFLIGHT = load_sequence("preflight").main_profile()
+PLANTS = [name for name in Model().names() if name.startswith(("torque", "pilot", "valve.f", "jack.area", "feedback"))]
+
+
+@cache
+def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0) -> Trace:
+    """A preflight with faults; `scatter` seeds the tolerances of the plant, 0 for none."""
+    rng, model = np.random.default_rng(scatter), Model()
+    model = model.replace({name: model[name] * (1 + 0.015 * bool(scatter) * rng.normal()) for name in PLANTS})
+    faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss * ratio}
+    return of(simulate(model.replace(faults), PREFLIGHT.command, seed=scatter))
+
+
+def of(columns: object) -> Trace:
+    return Trace.of(columns._asdict(), 1e-3, {})  # type: ignore[attr-defined]
+
+
+def map_of(kintas: float, fss: float) -> Map:
+    return Map(np.zeros((1, 1)), Point(kintas, fss, 1e-5))
+
+
+def test_maps_are_rms_of_the_monitor() -> None:
+    """One cell by hand."""
+    measured = trace(0.25, 30.0)
+    grid = search(measured, sliding=(1.0,))
+    row, column = 7, 5
+    c = readings(measured, Model())[0]
+    run = Monitor(Model()).replay(np.array([[KINTAS[row], FSS[column]]]), c.cor, c.xj, 20.0)[0, 0]
+    step = np.r_[500:4001]  # the sections of the preflight
+    ramp = np.r_[4001:6001, 6501:8501]
+    assert grid.step and grid.ramp
+    variances = {}
+    for made, rows in ((grid.step, step), (grid.ramp, ramp)):
+        variances[len(rows)] = np.var((c.xj - run)[rows])
+        assert made.rms[row, column] == pytest.approx(np.sqrt(variances[len(rows)]), rel=1e-9)
+    both = sum(n * v for n, v in variances.items()) / sum(variances)
+    assert grid.joint.rms[row, column] == pytest.approx(np.sqrt(both), rel=1e-9)
+    for made in (grid.step, grid.ramp, grid.joint):
+        assert made.rms.shape == (21, 21)
+        assert made.minimum.rms == made.rms.min()
+        where = np.argwhere(made.rms == made.rms.min())[0]
+        assert made.minimum[:2] == (KINTAS[where[0]], FSS[where[1]])
+    assert grid.simulations == 441 + 21 * 13
+
+
+@pytest.mark.parametrize("scatter", [0, 1, 2])
+@pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0), (0.0, 70.0), (0.35, 5.0)])
+def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
+    """Within the width of the valley: Kintas is weak, FSS is not."""
+    grid = search(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
+    for found in (grid.joint.minimum, grid.best):
+        assert found.kintas == pytest.approx(kintas, abs=0.176 if scatter else 0.051)
+        assert found.fss == pytest.approx(fss, abs=9.0)
+    assert grid.best.rms <= grid.joint.minimum.rms
+
+
+@pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0)])
+def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
+    """From runs on the rig, bus and all."""
+    faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
+    settings = [word for name, value in faults.items() for word in ("--set", f"{name}={value!r}")]
+    rig("run", "--quiet", "--seed", "3", *settings, "--out", tmp_path)
+    for measured in (Trace.read(tmp_path), trace(kintas, fss)):  # and with another noise
+        grid = search(measured)
+        assert grid.step and grid.ramp
+        for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
+            assert point.kintas == pytest.approx(kintas, abs=0.051)
+            assert point.fss == pytest.approx(fss, abs=4.5)
+        assert grid.sliding == pytest.approx(2.0 / 3.0)
+
+
+def test_friction_that_is_static_alone() -> None:
+    """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
+    measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
+    found, paper = search(measured), search(measured, sliding=(1.0,))
+    assert found.joint.minimum.fss == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
+    assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
+
+
+def test_closed_loop_misleads() -> None:
+    """With spool friction the loop oscillates in a phase of its own; the calmest monitor wins."""
+    looped, driven = (search(trace(0.17, 45.0), drive=drive) for drive in ("command", "current"))
+    assert looped.joint.minimum.fss < 10.0
+    assert looped.joint.minimum.rms > 4.0 * driven.joint.minimum.rms
+
+
+@pytest.mark.parametrize("which", ["step", "ramp"])
+def test_a_command_with_one_kind_of_section(which: str) -> None:
+    piece = Step(to=2e-3, time=0.8) if which == "step" else Ramp(to=1e-3, time=1.5)
+    com = build([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    model = Model().replace({"spool.static_friction": 40.0, "spool.dynamic_friction": 80.0 / 3.0})
+    grid = search(of(simulate(model, com)))
+    there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
+    assert there is not None and absent is None
+    np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
+    assert grid.merged[:2] == there.minimum[:2] and grid.merged.weight == float(which == "step")
+    assert there.minimum.fss == pytest.approx(40.0, abs=18.0)
+
+
+@pytest.mark.parametrize(("kintas", "fss"), [(0.0, 5.0), (0.25, 30.0)])
+@pytest.mark.parametrize("other", ["load", "null bias", "jack friction"])
+def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: float, other: str) -> None:
+    changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
+               "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
+    faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
+    load = np.full(len(PREFLIGHT.command), 3e3 * (other == "load"))
+    found = search(of(simulate(Model().replace(faults | changed), PREFLIGHT.command, load)), sliding=(2.0 / 3.0,)).best
+    assert found.kintas == pytest.approx(kintas, abs=0.126)
+    assert found.fss == pytest.approx(fss, abs=4.5)
+
+
+def test_gaps_are_left_out() -> None:
+    whole = trace(0.25, 30.0)
+    holes = {name: whole.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    holes["xj"][700:760] = np.nan
+    holes["cor"][2000:2002] = np.nan
+    grid = search(Trace.of(holes, 1e-3, {}))
+    assert not np.isnan(grid.joint.rms).any()
+    assert grid.joint.minimum.fss == pytest.approx(30.0, abs=9.0)
+
+
+def test_refusals() -> None:
+    com = build([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    with pytest.raises(InputError, match="steps or ramps"):
+        search(of(simulate(Model(), com)))
+    with pytest.raises(InputError, match="drive"):
+        search(trace(0.25, 30.0), drive="position")
+
+
+@pytest.mark.parametrize(("kintas", "fss", "distance"), [
+    (0.25, 35.0, 0.0), (0.15, 0.0, 0.0), (0.35, 70.0, 0.0),  # on the bisector
+    (0.35, 0.0, 1.0), (0.35, 35.0, 1.0), (0.9, 69.0, 1.0),  # right edge and beyond
+    (0.15, 70.0, -1.0), (0.15, 35.0, -1.0), (0.0, 5.0, -1.0),  # left edge and beyond
+    (0.30, 35.0, 0.5), (0.20, 35.0, -0.5)])
+def test_first_bisector(kintas: float, fss: float, distance: float) -> None:
+    assert bisector(kintas, fss) == pytest.approx(distance, abs=1e-12)
+
+
+def test_centre_of_gravity() -> None:
+    merged = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
+    assert merged == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
+    assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
+    assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
+    assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
+
+
+def test_fast_enough() -> None:
+    """21x21 cells, everything included, under 2 s of both cores; processor time, as others may be at work here."""
+    search(trace(0.25, 30.0))  # compiled and loaded
+    begin = time.process_time()
+    search(trace(0.25, 30.0))
+    assert time.process_time() - begin < 4.0

@@ -1,0 +1,181 @@
+"""The statistics behind `rig explain`: noise and its whitening, the block-wise likelihood, nulls, marks, shapes."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_files import restored_catalogue
+from noisy_traces import recorded
+from scipy.signal import lfilter
+
+from fdi.discovery.fingerprints import comb, firmware, firmware_residual
+from fdi.discovery.residual_pattern import Pattern, curve, wave, write_effect
+from fdi.discovery.scan import tones
+from fdi.discovery.search import Search, common
+from fdi.discovery.significance import Sensitivity, p_value, smallest_visible
+from fdi.estimation.fit import BLOCK, FITTED, misfit, weights
+from fdi.estimation.noise import fitted, level
+from fdi.trace.record import record
+from fdi.trace.trace import Trace
+from plant import InputError, Model, simulate
+from plant.effects import CATALOGUE, load_effects
+
+SEEDS = range(20)
+
+
+def coloured(seed: int, n: int = 13_500) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return lfilter([1.2e-6], [1.0, -0.8], rng.standard_normal(n))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_coloured_noise_becomes_white(seed: int) -> None:
+    noise = fitted(coloured(seed))
+    white = noise.whiten(coloured(seed + 1000))
+    assert noise.level == pytest.approx(2e-6, rel=0.05)  # 1.2e-6 / sqrt(1 - 0.8^2)
+    assert white[50:].std() == pytest.approx(1.0, rel=0.05)
+    assert abs(np.corrcoef(white[51:], white[50:-1])[0, 1]) < 0.04
+
+
+def test_what_is_not_measured_counts_as_nothing() -> None:
+    x = coloured(0)
+    x[500:520] = np.nan
+    white = fitted(x).whiten(x)
+    assert np.isfinite(white).all()
+    assert (white[500:520] == 0.0).all()
+
+
+def test_a_stop_that_came_later_is_no_noise() -> None:
+    x = np.random.default_rng(0).normal(0.0, 1.0, 13_500)
+    x[3000:4000] += 50.0
+    assert level(x) == pytest.approx(1.0, rel=0.05)
+    assert fitted(x).level == pytest.approx(1.0, rel=0.05)
+
+
+def test_the_likelihood_is_squares_where_fitted_and_logarithms_where_not() -> None:
+    noise = np.random.default_rng(1).standard_normal((1, 2, 50 * BLOCK))
+    assert misfit(noise)[0] == pytest.approx((noise**2).sum())
+    spoilt = noise.copy()
+    spoilt[0, 0, :BLOCK] = 1e3
+    expected = FITTED * BLOCK * (1 + np.log(1e6 / FITTED)) - (noise[0, 0, :BLOCK] ** 2).sum()
+    assert misfit(spoilt)[0] - misfit(noise)[0] == pytest.approx(expected)
+
+
+def test_the_weights_are_the_slope_of_the_likelihood() -> None:
+    rng = np.random.default_rng(2)
+    white = rng.standard_normal((2, 10 * BLOCK)) * np.repeat([[1.0, 5.0] * 5], BLOCK, axis=1)
+    way, h = rng.standard_normal(white.shape), 1e-6
+    slope = (misfit((white + h * way)[None]) - misfit((white - h * way)[None]))[0] / (2 * h)
+    assert slope == pytest.approx(2 * (weights(white) * white * way).sum(), rel=1e-5)
+
+
+def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> None:
+    ratios = [common(coloured(s)[None], [coloured(s + 500)[None]], [0.0])[0] for s in SEEDS]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
+    assert max(ratios) < 1.08  # the gate
+    physics = 1e-6 * np.sin(np.arange(13_500) / 200.0)
+    found = common((coloured(1) + physics)[None], [(coloured(2) + physics)[None]], [0.0])[0]
+    assert found == pytest.approx(np.sqrt(1 + 0.5e-12 / 4e-12), abs=0.03)
+
+
+def _independent(effects: int) -> Sensitivity:
+    names = tuple(f"e{i}" for i in range(effects))
+    return Sensitivity(names, (1.0,) * effects, np.full(effects, 100.0), np.eye(effects))
+
+
+def test_the_p_value_is_that_of_the_best_of_all_candidates() -> None:
+    from scipy.stats import chi2
+
+    s = _independent(10)
+    for gain in (4.0, 6.0, 9.0):
+        exact = 1.0 - (1.0 - 0.5 * chi2.sf(gain, 1)) ** 10  # each on its own side only
+        assert p_value(s, gain) == pytest.approx(exact, rel=0.3)
+    assert p_value(s, 60.0) < 1e-3
+
+
+def test_the_smallest_visible_size_is_where_the_gain_reaches_the_threshold() -> None:
+    s = Sensitivity(("a", "a", "b"), (1.0, 10.0, 5.0), np.array([0.3, 30.0 * 100, 30.0 / 4]), np.eye(3))
+    seen = smallest_visible(s)
+    assert 1.0 < seen["a"] < 10.0
+    assert np.isinf(seen["b"])
+
+
+def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
+    t = np.arange(3000) * 1e-3
+    com = 5e-3 * np.sign(np.sin(2 * np.pi * t))
+    columns = simulate(Model().replace(changes), com, seed=seed)
+    return Trace.of(columns._asdict(), 1e-3, {})
+
+
+def test_the_firmware_leaves_its_mark_without_noise() -> None:
+    model = Model()
+    healthy, limited = record(_recorded({})), record(_recorded({"command_rate_limit.rate": 0.12}))
+    assert np.nanmax(np.abs(firmware_residual(model, healthy))) == 0.0
+    assert firmware(model, [healthy]) == (0.0, [])
+    error, found = firmware(model, [limited])
+    assert error > 100.0
+    assert [f.effect for f in found] == ["command_rate_limit"]
+    value, low, high = found[0].parameters["command_rate_limit.rate"]
+    assert low <= 0.12 <= high or value == pytest.approx(0.12, rel=1e-6)
+
+
+def test_a_converter_with_few_bits_leaves_a_comb() -> None:
+    assert comb(record(_recorded({}))) is None
+    tooth = comb(record(_recorded({"quantisation.lsb": 7.3e-6})))
+    assert tooth is not None
+    assert tooth.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4)
+
+
+def test_a_wave_over_the_position_is_found() -> None:
+    rng = np.random.default_rng(3)
+    t = np.arange(13_000) * 1e-3
+    x = 5e-3 * np.sin(2 * np.pi * 0.3 * t) + 1e-3 * np.sin(2 * np.pi * 2.1 * t)
+    y = 700.0 * np.sin(2 * np.pi * x / 1.7e-3 + 0.4) + rng.normal(0.0, 200.0, x.size)
+    (amplitude, length, phase), share = wave(y, x, 200.0)
+    assert (amplitude, length) == pytest.approx((700.0, 1.7e-3), rel=0.05)
+    assert share > 0.9
+    assert np.cos(phase - 0.4) > 0.9
+
+
+def test_a_curve_over_the_speed_is_found() -> None:
+    rng = np.random.default_rng(4)
+    v = rng.normal(0.0, 0.02, 13_000)
+    share, at, height, doubt = curve(2e6 * v * np.abs(v) + rng.normal(0.0, 100.0, v.size), v, 100.0)
+    assert share > 0.95
+    assert np.abs(height - 2e6 * at * np.abs(at)).max() < 150.0
+    assert (doubt > 0.0).all()
+
+
+@pytest.mark.parametrize("shape", ["wave", "curve"])
+def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Path) -> None:
+    at = np.linspace(-0.1, 0.1, 9)
+    found = Pattern("force", "N", 500.0, "position" if shape == "wave" else "speed", 0.9, at, 1e4 * at, at * 0 + 1.0,
+                    (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10))
+    with restored_catalogue():
+        write_effect(found, tmp_path / "found.py")
+        assert len((tmp_path / "found.py").read_text().splitlines()) < 40
+        assert load_effects(tmp_path / "found.py") == ["discovered"]
+        start = CATALOGUE["discovered"].starts[-1]
+        com = 3e-3 * np.sin(2 * np.pi * np.arange(1000) * 1e-3)
+        moved = simulate(Model().replace(start), com).p12 - simulate(Model(), com).p12
+        assert np.abs(moved).max() > 2e4  # Pa, the sensor's noise
+
+
+def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
+    short = Trace.of({k: v[:50] for k, v in _recorded({}).__dict__.items() if k in ("com", "xj", "cor")}, 1e-3, {})
+    with pytest.raises(InputError, match="at least 200 cycles"):
+        record(short)
+    with pytest.raises(InputError, match="measured signal"):
+        trace = _recorded({})
+        record(Trace.of({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
+
+
+@pytest.mark.parametrize("hertz", [11.4767, 99.6187])
+def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None:
+    """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
+    ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
+    search = Search(Model(), record(recorded(ripple)), [], ["supply_ripple"], 1)
+    starts = tones(search.problem, search.base().fit, "supply_ripple")
+    assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
+    assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10

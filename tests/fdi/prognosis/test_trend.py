@@ -1,0 +1,302 @@
+"""Trends: dates, laws, breaks, remaining life and its score, and the command."""
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rig_command import rig
+from scipy.integrate import quad
+from scipy.stats import halfnorm, multivariate_normal
+
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.prognosis import gather, regression, remaining_life
+from fdi.prognosis.dates import Row, days, in_name, iso, read_table, row_of
+from fdi.prognosis.growth_laws import basis, shapes
+from fdi.prognosis.trend import Trend, follow
+from fdi.trace.trace import Trace
+from plant import InputError, load_model, simulate
+from rig.recorder.provenance import provenance
+from rig.studies.prognosis import degrading_units
+from rig.studies.prognosis.score import Prediction, score, told_without_reason
+
+WEEKS = 7.0 * np.arange(14)
+RNG = np.random.default_rng(3)
+SIGMA = 0.4  # N
+
+
+def estimates(sizes: Sequence[float], sigma: float = SIGMA) -> list[Estimate]:
+    """Sizes of spool friction as measured, N."""
+    seen = np.asarray(sizes) + sigma * RNG.standard_normal(len(sizes))
+    return [Estimate(float(x), float(x - 1.96 * sigma), float(x + 1.96 * sigma)) for x in seen]
+
+
+def friction(sizes: Sequence[float]) -> Trend:
+    """The trend of such sizes, a week apart."""
+    return follow(FRICTION, list(WEEKS[:len(sizes)]), estimates(sizes))
+
+
+def test_dates_are_found_in_texts_and_names() -> None:
+    assert days("2026-01-02") - days("2026-01-01") == 1.0
+    assert days("2026-01-01T06:00:00+06:00") == days("2026-01-01") == days("2026-01-01T00:00:00Z")
+    assert all(math.isnan(days(text)) for text in ("", "yesterday", "2026-13-01", "12345"))
+    for name in ("u/2026-03-04_check.csv", "20260304T1200/trace.mcap"):
+        assert iso(in_name(Path(name))) == "2026-03-04"
+    assert in_name(Path("x_2026-03-04T12-00-00.csv")) == days("2026-03-04") + 0.5
+    assert math.isnan(in_name(Path("run_123456789.csv"))) and math.isnan(in_name(Path("serial_99999999.csv")))
+
+
+def test_a_table_of_dates(tmp_path: Path) -> None:
+    table = tmp_path / "dates.csv"
+    table.write_text("file,date,hours\na.csv,2026-01-01,10\nrun/,2026-02-01,\n")
+    rows = read_table(table)
+    assert row_of(rows, "sub/a.csv") == Row(days("2026-01-01"), 10.0, pytest.approx(math.nan, nan_ok=True))
+    assert row_of(rows, "b.csv") is None
+    for text, field in (("name,date\n", "header"), ("", "header"), ("file,date\na.csv,soon\n", "date"),
+                        ("file,hours\na.csv,x\n", "hours"), ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
+        table.write_text(text)
+        with pytest.raises(InputError) as refused:
+            read_table(table)
+        assert refused.value.field == field
+
+
+def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
+    data = regression.Scaled(np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.02, 0.1, 0.3, 0.5]), np.full(4, 0.03),
+                             steps=(2,))
+    every, _ = shapes()
+    found = regression.regress(data)
+    for part in (found.parts[9], found.parts[25]):
+        cov = regression.covariance(data, part.noise, part.wander)
+        for k in (1, 60, 130):
+            column = basis((every[k],), data.u)[:, 0]
+
+            def likelihood(rise: float, column: Any = column, cov: Any = cov, k: int = k) -> float:
+                chance = halfnorm.pdf(rise, scale=every[k].rise)
+                return float(chance * multivariate_normal.pdf(data.y, rise * column, cov))
+
+            exact = math.log(quad(likelihood, 0.0, 4.0, epsabs=0.0, limit=200, points=[0.2, 0.5, 1.0])[0])
+            ours = part.evidence[k] - regression.odds(part.noise, part.wander)[k] - 2.0 * math.log(2.0 * math.pi)
+            assert ours == pytest.approx(exact, abs=1e-6)
+
+
+def test_the_future_has_the_spread_of_the_wander() -> None:
+    """An integrated Wiener process, conditioned on nothing but its value and slope, spreads as its closed form says."""
+    rng = np.random.default_rng(0)
+    for kind, variance in (("wiener", 0.09 * remaining_life.AHEAD), ("integrated", 0.09 * remaining_life.AHEAD ** 3)):
+        moved = remaining_life._wander(kind, 0.3, np.zeros(4000), rng)
+        assert moved.std(axis=0)[1:] == pytest.approx(np.sqrt(variance)[1:], rel=0.08)
+
+
+def test_reaching_a_limit() -> None:
+    rising = 0.5 + 0.1 * remaining_life.AHEAD
+    paths = remaining_life.Paths(np.array([rising, np.full_like(rising, 0.5), rising + 1.0]), np.zeros(3))
+    assert remaining_life.reached(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
+
+
+@pytest.mark.parametrize("law", ["linear", "exponential", "power"])
+def test_the_law_is_recognised_and_the_time_left_found(law: str) -> None:
+    x = WEEKS / 140.0  # MaxBand at 140 days
+    grown = {"linear": x, "exponential": np.expm1(4.0 * x) / np.expm1(4.0), "power": np.sqrt(x)}[law]
+    found = friction(5.0 + 65.0 * grown)
+    left = found.remaining["non_nominal"]
+    assert found.verdict == "TREND" and not found.breaks and found.used.all()
+    alike = {law, "runaway"} if law == "exponential" else {law}  # faster and faster, both
+    assert sum(found.laws[name] for name in alike) > 0.5
+    assert left.low <= 140.0 - WEEKS[-1] <= left.high and left.high < 500.0
+    assert found.remaining["maintenance"].value <= left.value
+    assert found.now.low <= 5.0 + 65.0 * grown[-1] <= found.now.high
+    assert left.within(left.value) == pytest.approx(0.5, abs=0.01)
+
+
+def test_what_does_not_grow_has_no_trend() -> None:
+    found = friction([5.0] * 14)
+    assert found.verdict == "NO_TREND" and found.laws["none"] > 0.5
+    assert found.remaining["non_nominal"].high == math.inf
+
+
+def test_few_points() -> None:
+    for count in (1, 2):
+        found = friction([10.0, 15.0][:count])
+        assert found.verdict == "TOO_FEW" and not found.remaining and found.rate is None
+    assert follow(FRICTION, [1.0] * 4, estimates([10.0] * 4)).verdict == "TOO_FEW"
+    three = friction([10.0, 20.0, 30.0])
+    assert three.verdict == "TREND"
+    many = friction(np.linspace(10.0, 30.0, 14))
+    ratio = [t.remaining["non_nominal"].high / t.remaining["non_nominal"].low for t in (three, many)]
+    assert ratio[0] > 2.0 * ratio[1]  # three points know less
+
+
+def test_a_size_past_a_limit() -> None:
+    found = friction(np.linspace(20.0, 45.0, 10))
+    assert found.level.word == "maintenance"
+    assert found.remaining["maintenance"].high == 0.0 < found.remaining["non_nominal"].low
+
+
+LINE = 5.0 + 2.0 * np.arange(12)
+
+
+@pytest.mark.parametrize(("kind", "row", "sizes"), [
+    ("outlier", 5, LINE + 25.0 * (np.arange(12) == 5)),
+    ("outlier", 7, LINE - 12.0 * (np.arange(12) == 7)),
+    ("step", 6, LINE + 20.0 * (np.arange(12) >= 6)),
+    ("repair", 8, np.where(np.arange(12) < 8, LINE, 5.0)),
+    ("last", 11, LINE + 20.0 * (np.arange(12) == 11)),
+    ("last", 11, LINE - 20.0 * (np.arange(12) == 11)),
+])
+def test_breaks(kind: str, row: int, sizes: Sequence[float]) -> None:
+    found, plain = friction(sizes), friction(LINE)
+    assert [(b.kind, b.row) for b in found.breaks] == [(kind, row)]
+    assert found.breaks[0].size == pytest.approx(sizes[row] - LINE[row], abs=4.0)
+    left = found.remaining["non_nominal"]
+    if kind == "outlier":
+        assert not found.used[row] and left.value == pytest.approx(plain.remaining["non_nominal"].value, rel=0.2)
+    if kind == "repair":
+        assert found.used.sum() == 4 and found.verdict == "NO_TREND"
+    if kind == "step":
+        assert found.now.value == pytest.approx(47.0, abs=2.0)
+    if kind == "last" and sizes[row] > LINE[row]:  # the worse case is in the interval, too
+        assert left.low < plain.remaining["non_nominal"].low
+
+
+def test_estimates_at_their_bound_only_say_not_more_than() -> None:
+    """Ten zeros that are known to 0.03 each do not exclude that something grows below."""
+    bound = [Estimate(0.0, 0.0, 0.06)] * 10
+    free = [Estimate(0.0, -0.06, 0.06)] * 10
+    weak, strong = (follow(CLOGGING, list(WEEKS[:10]), sizes).laws["none"] for sizes in (bound, free))
+    assert weak < strong
+
+
+def test_the_metrics_on_predictors_that_are_known() -> None:
+    unit = degrading_units.unit("linear", 4)
+    end, middle = unit.reached(unit.fault.most), unit.reached(unit.fault.middle)
+
+    def by(factor: float) -> Any:
+        def predict(u: degrading_units.Unit, n: int) -> Prediction:
+            spread = np.linspace(0.95, 1.05, 101) * factor
+            return Prediction(True, spread * (middle - u.t[n - 1]), spread * (end - u.t[n - 1]))
+        return predict
+
+    right, wrong = score(unit, by(1.0)), score(unit, by(1.5))
+    assert right.alpha_lambda == (1.0,) * 4 and wrong.alpha_lambda == (0.0,) * 4
+    assert set(right.held_most) == {1.0} and set(wrong.held_most) == {0.0} and set(wrong.below) == {1.0}
+    assert right.relative == pytest.approx([1.0] * 4) and wrong.relative == pytest.approx([0.5] * 4)
+    assert right.horizon > wrong.horizon > 0.0  # the error shrinks with the time left: good at last
+    assert wrong.horizon * (end - unit.onset) <= 0.4 * end
+
+
+def test_a_fleet_reaches_maxband_at_the_end_of_its_life() -> None:
+    for i, law in enumerate(degrading_units.LAWS):
+        unit = degrading_units.unit(law, i)
+        assert np.all(np.diff(unit.course) >= -1e-12) and unit.reached(unit.fault.most) == pytest.approx(
+            unit.course_t[-1], rel=0.02)
+
+
+def test_intervals_hold_the_truth() -> None:
+    """A quick part of `rig trend --score`: at half the life, all laws, those not fitted included."""
+    held = []
+    for i, law in enumerate(degrading_units.LAWS):
+        for k in range(2):
+            u = degrading_units.unit(law, 100 * i + k)
+            end = u.reached(u.fault.most)
+            n = int(np.searchsorted(u.t, (u.onset + end) / 2))
+            left = follow(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
+            held.append(left.low <= end - u.t[n - 1] <= left.high)
+    assert sum(held) >= 0.8 * len(held)
+    assert len(told_without_reason(degrading_units.healthy(seed) for seed in range(6))) <= 1
+
+
+def points(path: Path, sizes: Sequence[float]) -> Path:
+    """An earlier answer with these sizes of spool friction."""
+    rows = [{"trace": f"{i}.csv", "t": days("2026-01-05") + 7.0 * i, "fss": e._asdict(),
+             "kintas": {"value": 0.0, "low": 0.0, "high": 0.06}} for i, e in enumerate(estimates(sizes))]
+    path.write_text(json.dumps({"axis": "date", "points": rows}))
+    return path
+
+
+def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
+    source = points(tmp_path / "a.json", LINE)
+    said = rig("trend", source, "--json", "--out", tmp_path / "b.json")
+    fss = said.json["trends"]["spool_friction"]
+    assert said.status == 0 and fss["verdict"] == "TREND" and said.json["last"] == "2026-03-23"
+    left = fss["remaining"]["maintenance"]
+    assert left["low"] <= left["value"] <= left["high"] and left["value_at"] > "2026-03-23"
+    assert rig("trend", tmp_path / "b.json", "--json").json["trends"] == said.json["trends"]
+    shown = rig("trend", source, "--out", tmp_path / "x.html").out
+    assert all(word in shown for word in ("spool friction", "TREND", "MaxBand", "●", "from", "x.html"))
+    bad = points(tmp_path / "c.json", LINE + 25.0)
+    assert rig("trend", bad, "--quiet", "--out", tmp_path / "x.png").status == 1  # past MidBand
+    page = (tmp_path / "x.html").read_text()
+    assert "<svg" in page and "MaxBand" in page and "http://" not in page.replace("http://www.w3.org", "")
+    assert (tmp_path / "x.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
+    (bad := tmp_path / "bad.json").write_text("{}")
+    (empty := tmp_path / "empty").mkdir()
+    (nan := tmp_path / "nan.json").write_text(points(nan, LINE).read_text().replace('"t": ', '"t": NaN, "x": ', 1))
+    for words in ([], [bad], [nan], ["--score", "--units", "0"], [tmp_path / "none"], [empty], [bad, "--out", "x.txt"]):
+        said = rig("trend", *words)
+        assert said.status == 2 and said.err.count("\n") == 1, words
+
+
+def diagnosed(file: Path, model: Any, again: bool = False) -> dict[str, Any]:
+    """In place of the diagnosis."""
+    if file.name == "dead.csv":
+        raise InputError(file, "xj", "a sensor that lives")
+    return {"note": "", "sizes": {"filter_clogging": [0.0, 0.0, 0.1], "spool_friction": [5.0, 4.0, 6.0]}}
+
+
+def started(file: Path, model: Any, again: bool = False) -> str:
+    """In place of a look into the log."""
+    if file.name == "broken.csv":
+        raise InputError(file, "xj", "a position")
+    return "2026-01-10T00:00:00+00:00" if file.name == "own.mcap" else ""
+
+
+def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "unit"
+    (folder / "2026-02-01").mkdir(parents=True)
+    for name in ("own.mcap", "2026-02-01/named.csv", "2026-02-01/dead.csv", "table.csv", "broken.csv"):
+        (folder / name).write_text("")
+    monkeypatch.setattr(gather, "diagnosed", diagnosed)
+    monkeypatch.setattr(gather, "started", started)
+
+    def gathered(axis: str | None = None) -> gather.Gathered:
+        return gather.gather(folder, load_model(), gather.Options(axis), lambda what, done, total: None)
+
+    with pytest.raises(InputError, match=r"table.csv: date: expected .*dates.csv"):
+        gathered()
+    (folder / "dates.csv").write_text("file,date,hours\ntable.csv,2026-01-20,30\nown.mcap,,10\n"
+                                      "named.csv,,20\ndead.csv,,25\nold.csv,,\n")
+    found = gathered()
+    assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
+    assert [iso(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
+    assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
+    assert any("old.csv stands in dates.csv" in note for note in found.notes)
+    assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
+    with pytest.raises(InputError, match="flights"):
+        gathered("flights")
+
+
+def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    t = 1e-3 * np.arange(2000)
+    command = np.where((t > 0.2) & (t < 1.0), 1e-3, 0.0) + 5e-4 * np.clip(t - 1.0, 0.0, 0.8)
+    made = simulate(load_model(), command, seed=4)
+    (tmp_path / "unit").mkdir()
+    there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.of(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
+    monkeypatch.setattr(gather, "cache_folder", lambda: tmp_path / "cache")
+    first = rig("trend", tmp_path / "unit", "--json")
+    assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"
+    assert first.json["points"][0]["date"] == "2026-01-05" and first.json["points"][0]["fss"]["low"] < 5.0
+    assert sorted(path.name for path in (tmp_path / "unit").iterdir()) == ["2026-01-05.csv"]
+    monkeypatch.setattr("fdi.diagnosis.diagnosis.diagnose", lambda *a, **k: pytest.fail("a second time"))
+    assert rig("trend", tmp_path / "unit", "--json").json == first.json
+
+
+def test_a_log_of_the_rig_tells_its_date() -> None:
+    assert days(provenance()["started"]) > days("2026-01-01")

@@ -1,0 +1,69 @@
+"""The paper's figures are drawn from whatever traces and grids there are, as SVG for a page."""
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from functools import cache
+
+import numpy as np
+import pytest
+
+from fdi import Trace
+from fdi.diagnosis.bands import excursions, suited
+from fdi.diagnosis.rms_grid import search
+from fdi.report import paper_figures as figures
+from plant import Model, simulate
+from plant.profile import build
+from plant.segments import Chirp, Hold, Step
+from rig.sequences import load_sequence
+
+PREFLIGHT = load_sequence("preflight").main_profile().command
+
+
+@cache
+def trace(kintas: float, fss: float) -> Trace:
+    model = Model().replace({"filter.clogging": kintas, "spool.static_friction": fss,
+                             "spool.dynamic_friction": fss / 1.5})
+    return Trace.of(simulate(model, PREFLIGHT)._asdict(), 1e-3, {})
+
+
+def texts(svg: str) -> set[str]:
+    """What is written in a drawing; it must be one."""
+    root = ElementTree.fromstring(svg)
+    assert root.tag.endswith("svg")
+    return {element.text or "" for element in root.iter() if element.tag.endswith("text")}
+
+
+def test_either_fault_alone() -> None:
+    runs = {"healthy": trace(0.0, 5.0), "Kintas 0.35": trace(0.35, 5.0), "FSS 70 N": trace(0.0, 70.0)}
+    for draw in (figures.steps, figures.ramps):
+        assert set(runs) <= texts(draw(runs))
+    assert "error [µm]" in texts(figures.ramps(runs, number=1))
+
+
+def test_a_trace_in_its_bands() -> None:
+    faulty = trace(0.4, 45.0)
+    bands = suited(faulty.com, faulty.load, 1e-3, None, lambda *_: None)
+    found, friction, _ = excursions(faulty.com, faulty.xj, 1e-3, bands, faulty.sections())
+    for kind, signal, first in (("step", "position", "step of +5 mm at 0.5 s"),
+                                ("ramp", "position", "ramp of +1 mm at 4.001 s"),
+                                ("ramp", "speed", "ramp of -1 mm at 6.501 s")):
+        said = texts(figures.banded(found, friction, bands, faulty, kind, signal))
+        assert {"measured", "MidBand", "MaxBand", "outside", first} <= said
+    assert figures.banded(found, friction, bands, faulty, "step", "speed") == ""
+
+
+def test_the_maps() -> None:
+    grid = search(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
+    said = texts(figures.maps(grid, truth=(0.25, 30.0)))
+    assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
+    assert any(text.startswith("step sections: ") for text in said)
+    assert "injected" not in texts(figures.maps(grid))
+
+
+@pytest.mark.parametrize("cells", [1, 2, 5])
+def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
+    com = build([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    measured = Trace.of(simulate(Model(), com)._asdict(), 1e-3, {})
+    grid = search(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
+    said = texts(figures.maps(grid))
+    assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -1,0 +1,217 @@
+"""The report: one file that needs nothing else, and says what the trace says."""
+from __future__ import annotations
+
+import html
+import math
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_run import record
+
+from fdi.report import figures
+from fdi.report.run_page import render, write_report
+from fdi.report.run_verdict import verdict
+from fdi.trace.trace import Event, Trace
+from plant.errors import InputError
+from rig.recorder import Check, Recorder, Signals, Timing
+from rig.recorder.recover import recover
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("run") / "trace.mcap")
+
+
+@pytest.fixture(scope="module")
+def page(log: Path) -> str:
+    return render(Trace.read(log, all=True))
+
+
+class _Page(HTMLParser):
+    """Open tags, every address and the text of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.tags: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "action")]
+        if tag not in ("meta", "br", "link", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_it_needs_no_network(page: str) -> None:
+    seen = _Page(page)
+    assert not seen.open and not {"script", "link", "iframe", "img"} & set(seen.tags)
+    assert all(address.startswith("#") for address in seen.addresses)
+    assert not re.search(r"@import|url\((?!#)", page)
+    assert len(page) < 2_000_000
+
+
+def test_it_says_what_the_trace_says(page: str) -> None:
+    text = " ".join(_Page(page).text.split())
+    assert text.startswith("FAIL · ") and "1 of 4 checks failed: ramp error" in text
+    assert "3 of 4" in text and "13.500 s, 13500 cycles" in text
+    for words in ("overshoot of the 5 mm step", "61", "ms", "2.500 – 3.250 s", "mean of com - xj over the slope",
+                  "sensors.position_offset: ramps in", "pre-operational", "error [µm]", "P12 [MPa]", "XS [µm]",
+                  "title = 'synthetic'", "p99.9", "0 of 14000"):
+        assert words in text, words
+
+
+def test_text_of_the_trace_is_no_html(log: Path) -> None:
+    trace = Trace.read(log, all=True)
+    nasty = "<script>alert(1)</script>"
+    page = render(replace(trace, checks=(trace.checks[0]._replace(name=nasty, detail=nasty),),
+                          provenance={"sequence": nasty, "source": nasty}, attachments={nasty: nasty.encode()}))
+    assert "<script>" not in page
+
+
+@pytest.mark.parametrize(("status", "mood"), [("PASS", "good"), ("INVALID_TIMING", "doubtful"), ("ABORTED", "bad")])
+def test_verdict_of_the_run_comes_first(log: Path, status: str, mood: str) -> None:
+    trace = Trace.read(log)
+    page = render(replace(trace, provenance={**trace.provenance, "verdict.verdict": status, "verdict.why": "because"}))
+    assert f'<div class="verdict {mood}">{status}</div>' in page and "because" in page
+
+
+def test_an_aborted_run_says_why_and_what_is_missing(aborted: Path) -> None:
+    page = render(Trace.read(aborted, all=True))
+    head, text = page[:page.index("</header>")], " ".join(_Page(page).text.split())
+    assert ">ABORTED<" in head and "guard 'ram far out' was passed by xj" in html.unescape(head)
+    assert "missing samples, marked red below the lines: 45 of xj, cor, p12; 300 of xs (of 2871)" in text
+    assert text.count("missing samples, marked") == 1
+    assert len(re.findall("not reached ?the run ended at 2.271 s", text)) == 3 and "whole run" not in text
+    assert text.count(": not measured") == 3  # the names in the drawing, without a bar
+    assert not re.search(r"\bnan\b", text)
+
+
+def test_a_real_run_has_a_report(preflight: Path) -> None:
+    text = " ".join(_Page((preflight / "report.html").read_text(encoding="utf-8")).text.split())
+    assert text.startswith("PASS · Preflight") and "17 of 17" in text and "missing" not in text.split("Signals")[0]
+    assert text.count("✓ pass") == 17 and "section main: rest" in text.replace("section", "section ").replace("  ", " ")
+
+
+def test_a_late_run_says_how_late(log: Path) -> None:
+    trace = Trace.read(log, all=True)
+    said = {**trace.provenance, "verdict.verdict": "INVALID_TIMING", "verdict.overruns": "70", "max_overruns": "0.001"}
+    assert str(verdict(replace(trace, provenance=said))) == \
+        "INVALID_TIMING: the bench itself was late: 70 overruns in 14000 cycles, more than 0.1 %"
+    said["verdict.why"] = "a guard"
+    assert verdict(replace(trace, provenance=said)).why.endswith("0.1 %; a guard")
+
+
+def test_a_failed_run_names_its_checks(log: Path) -> None:
+    trace = Trace.read(log)
+    assert verdict(trace) == ("FAIL", "1 of 4 checks failed: ramp error")
+    bad = tuple(trace.checks[0]._replace(name=f"c{i}", passed=False) for i in range(6))
+    assert verdict(replace(trace, checks=bad)).why == "6 of 6 checks failed: c0, c1, c2, c3 and 2 more"
+    assert verdict(replace(trace, checks=bad[:0])).word == "NOT JUDGED"
+    assert verdict(replace(trace, checks=trace.checks[:1])) == ("PASS", "")
+
+
+def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
+    values = np.sin(np.arange(100) / 10)
+    holes = values.copy()
+    holes[1::2] = np.nan  # every second one: a line through single samples would have no stroke at all
+    holes[60:80] = np.nan
+    line = figures._bridged(holes)
+    assert np.isnan(line).sum() == 22 and np.isnan(line[59:80]).all()  # and the last
+    np.testing.assert_allclose(line[:59], values[:59], atol=0.01)
+    assert np.isnan(figures._bridged(np.full(5, np.nan))).all()
+    columns = {"com": values, "xj": values, "cor": values}
+    sound, broken = (figures.signals(Trace.of({**columns, "xj": xj}, 1e-3, {})) for xj in (values, holes))
+    assert figures.RED in broken and figures.RED not in sound
+
+
+def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
+    record(tmp_path / "aborted.mcap", stop=100)
+    (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-50_000])
+    recover(tmp_path / "cut.mcap", tmp_path / "salvaged.mcap")
+    (tmp_path / "short.csv").write_text("t,com,xj,cor\n0,0,,0\n0.001,0,1e-6,0\n0.004,0,1e-6,0\n")
+    for name in ("aborted.mcap", "salvaged.mcap", "short.csv"):
+        write_report(tmp_path / name, tmp_path / "report.html")
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        _Page(page)
+        assert ("salvaged" in page) == (name == "salvaged.mcap")
+    assert "NOT JUDGED" in page and "2 cycles missing between 0.001 and 0.004 s" in page
+    assert "Cycle timing" not in page
+    with pytest.raises(InputError, match="can be written"):
+        write_report(tmp_path / "short.csv", tmp_path / "no" / "report.html")
+
+
+@pytest.mark.parametrize("phases", [[1], [0], [1, 1], [0, 1, 2]], ids=str)
+@pytest.mark.parametrize("timing", [(0.0, 1e-4, 1e-4), (0.0, 0.0, math.nan), (1e-4, 0.0, 0.0), (1e-8, 1e-8, 1e-9)],
+                         ids=str)
+def test_the_shortest_runs_draw_without_a_warning(tmp_path: Path, phases: list[int],
+                                                  timing: tuple[float, float, float]) -> None:
+    late, response, work = timing
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
+    for k, phase in enumerate(phases):
+        row = Signals(k, phase, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        recorder.cycle(k * 1_000_000, row, Timing(k, False, late, response, work))
+    recorder.put(0, Check(name="x", signal="xj", unit="m", value=0.0, passed=True, t0=0.0, t1=0.0))
+    recorder.close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        render(Trace.read(tmp_path, all=True))
+
+
+def test_thinned_line_keeps_its_extremes() -> None:
+    t, values = np.arange(50_000) * 1e-3, np.zeros(50_000)
+    values[[12_345, 40_001]] = 1.0, -1.0
+    values[20_000:20_100] = np.nan
+    thin_t, thin = figures.thin(t, values)
+    assert len(thin) < 5000 and np.nanmax(thin) == 1 and np.nanmin(thin) == -1 and np.isnan(thin).any()
+    assert t[12_345] in thin_t and (np.diff(thin_t) > 0).all()
+
+
+def test_command(log: Path) -> None:
+    words = [sys.executable, "-m", "rig.cli.main", "report", str(log.parent)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == f"{log.parent / 'report.html'}\n", done.stderr
+
+
+def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
+    from matplotlib.image import imread
+
+    write_report(log, tmp_path / "report.html")
+    words = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+             f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", (tmp_path / "report.html").as_uri()]
+    subprocess.run(words, capture_output=True, check=True, timeout=120)
+    shades = (imread(str(tmp_path / "page.png"))[..., :3] * 255).astype(int)
+    for name, _, _, colour in figures.PANELS[:4]:
+        wanted = np.array([int(colour[i:i + 2], 16) for i in (1, 3, 5)])
+        assert (np.abs(shades - wanted).max(axis=2) < 30).sum() > 500, name
+
+
+def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
+    trace = Trace.read(preflight)
+    events = (Event(1.0, "WARN", "fault", "lost drive begins"), Event(2.5, "INFO", "fault", "lost drive ends"),
+              Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
+    faulty = replace(trace, events=events)
+    assert figures.faults(faulty) == [("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
+    assert "lost drive" in render(faulty) and figures.signals(faulty) != figures.signals(trace)

@@ -1,0 +1,205 @@
+"""Trace: the same columns whatever the file was, and a clear line for a file that cannot be one."""
+from __future__ import annotations
+
+import ast
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT, SHARED
+from synthetic_run import ATTACHMENTS, command, record
+
+from fdi.trace.sections import sections
+from fdi.trace.trace import Check, Gap, Trace
+from plant.errors import InputError
+from rig.recorder import Event, NmtState, Recorder, Signals, Timing
+
+PRACTICE = SHARED / "practice"
+KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("run") / "trace.mcap").parent
+
+
+def test_main_phase_of_a_log(run: Path) -> None:
+    trace = Trace.read(run / "trace.mcap")
+    assert len(trace) == 13_500 and trace.period == 1e-3 and not trace.gaps
+    assert trace.t[0] == 0 and trace.t[-1] == pytest.approx(13.499)
+    assert trace.com[500] == 5e-3 and trace.com[499] == 0
+    assert trace.signals == ("com", "xj", "cor", "p12", "xs", "load")
+    assert trace.units["p12"] == "Pa" and (trace.phase == 1).all()
+    assert trace.provenance["seed"] == "1" and trace.provenance["verdict.status"] == "FAIL"
+    assert trace.attachments["sequence.toml"] == ATTACHMENTS["sequence.toml"][1]
+    assert [(e.t, e.kind) for e in trace.events] == [(-0.3, "phase"), (0, "phase"), (6, "fault"), (13.5, "phase")]
+    assert (trace.nmt[-1].node, trace.nmt[-1].name) == (3, "operational")
+    assert trace.checks[2][:5] == ("ramp error", "ramp_error", "error", 9.1e-6, "m") and not trace.checks[2].passed
+    assert isinstance(trace.checks[0], Check) and np.isnan(trace.checks[0].low)
+    assert len(trace.timing.t) == 13_500 and trace.timing.t[0] == 0
+    assert [s.kind for s in trace.sections()] == KINDS
+
+
+def test_whole_log_keeps_the_time_axis(run: Path) -> None:
+    trace, main = Trace.read(run, all=True), Trace.read(run)
+    assert len(trace) == 14_000 and trace.t[0] == pytest.approx(-0.3)
+    assert np.bincount(trace.phase).tolist() == [300, 13_500, 200]
+    np.testing.assert_array_equal(trace.xj[trace.phase == 1], main.xj)
+    np.testing.assert_allclose(trace.t[trace.phase == 1], main.t, atol=1e-12)
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_events_keep_to_the_rows_after_a_stall(tmp_path: Path, everything: bool) -> None:
+    """A real-time run that stood still for 2 s in its set-up and again in main: rows go on, log times jump."""
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
+    recorder.put(0, Event("INFO", "phase", "bring-up"))
+    for k in range(300):
+        t_ns = 500_000_000 + k * 1_000_000 + 2_000_000_000 * ((k >= 50) + (k >= 200))
+        if k == 100:
+            recorder.put(t_ns - 100_000, Event("INFO", "phase", "main"))
+        if k == 150:
+            recorder.put(t_ns, NmtState(3, 5, "operational"))
+        if k == 200:
+            recorder.put(t_ns - 1_000_000_000, Event("WARN", "stall", "half way"))
+            recorder.put(t_ns + 500_000, Event("WARN", "fault", "after it"))
+        recorder.cycle(t_ns, Signals(k, int(k >= 100), 0, 0, 0, 0, 0, 0, 0, 0, 0), Timing(k, False, 0, 0, 0))
+    recorder.put(t_ns + 3_000_000_000, Event("INFO", "phase", "end"))
+    recorder.close()
+    trace = Trace.read(tmp_path / "trace.mcap", all=everything)
+    assert [event.t for event in trace.events] == pytest.approx([-0.6, -1e-4, 0.0995, 0.1005, 3.199], abs=1e-6)
+    assert trace.nmt[0].t == 0.05
+    np.testing.assert_array_equal(trace.timing.t, trace.t)
+
+
+@pytest.mark.parametrize("name", ["x.csv", "x.csv.gz"])
+def test_csv_there_and_back(run: Path, tmp_path: Path, name: str) -> None:
+    trace = Trace.read(run)
+    trace.write_csv(tmp_path / name)
+    again = Trace.read(tmp_path / name)
+    for column in ("t", "com", "xj", "cor", "p12", "xs", "load"):
+        np.testing.assert_array_equal(again.column(column), trace.column(column))
+    assert again.period == trace.period
+
+
+def test_trace_of_columns() -> None:
+    trace = Trace.of({"com": np.zeros(3), "xj": np.ones(3), "cor": np.zeros(3)}, 1e-3, {"model": "eha"})
+    assert trace.t.tolist() == [0, 0.001, 0.002] and trace.signals == ("com", "xj", "cor")
+
+
+def _csv(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    return path
+
+
+def test_missing_samples_and_gaps(tmp_path: Path) -> None:
+    path = _csv(tmp_path, "t,com,xj,cor,note\n0.000,0,1e-6,2e-6,7\n0.001,0,,3e-6,7\n"
+                          "0.004,0,3e-6,4e-6,7\n0.005,0,1e-6,1e-6,7\n")
+    trace = Trace.read(path)
+    assert len(trace) == 6 and trace.period == 1e-3
+    np.testing.assert_array_equal(np.isnan(trace.xj), [False, True, True, True, False, False])
+    np.testing.assert_allclose(trace.t, np.arange(6) * 1e-3)
+    assert trace.gaps == (Gap(0.001, 0.004, 2),)
+    assert trace.signals == ("com", "xj", "cor") and np.isnan(trace.p12).all()
+    assert trace.notes == ("column note is not known and was left out",)
+    trace.write_csv(tmp_path / "y.csv")
+    assert Trace.read(tmp_path / "y.csv").gaps == trace.gaps
+
+
+def test_jitter_of_the_recorded_time_is_not_a_gap(tmp_path: Path) -> None:
+    t = np.arange(5000) * 1e-3 + np.random.default_rng(1).uniform(-2e-4, 2e-4, 5000)
+    path = _csv(tmp_path, "t,com,xj,cor\n" + "".join(f"{v:.6f},0,0,0\n" for v in t))
+    trace = Trace.read(path)
+    assert len(trace) == 5000 and not trace.gaps and trace.period == pytest.approx(1e-3, rel=1e-3)
+
+
+HEAD = "t,com,xj,cor\n"
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("", "line 1: t: expected a column of this name in the header t,com,xj,cor,p12,xs,load"),
+    ("com,xj,cor\n0,0,0\n", "line 1: t: expected a column"),
+    ("time;com;xj;cor\n0;0;0;0\n", "line 1: t: expected a column"),
+    (HEAD, "expected at least one row after the header"),
+    (HEAD + "0,0,0,0\n", "t: expected at least two rows"),
+    (HEAD + "0,0,0,0\n0.001,0,abc,0\n", "line 3: xj: expected a finite number or an empty field, not 'abc'"),
+    (HEAD + "0,0,0,0\n0.001,0,inf,0\n", "line 3: xj: expected a finite number"),
+    (HEAD + "0,0,0,0\n0.001,0,0,0\n0.001,0,0,0\n", "line 4: t: expected a time after 0.001 s, not '0.001'"),
+    (HEAD + "0,0,0,0\n,0,0,0\n", "line 3: t: expected a time after 0 s, not ''"),
+    (HEAD + "0,0,0,0\n0.001,0,0\n", "line 3: expected 4 fields as in the header, not 3"),
+    (HEAD + "0,0,0,0\n0.001,0,0,0\n0.0011,0,0,0\n0.002,0,0,0\n0.003,0,0,0\n", "line 4: t: expected one row per cycle"),
+    (HEAD + "0,0,0,0\n0.001,0,0,0\n0.002,0,0,0\n9e9,0,0,0\n", "t: expected gaps that leave"),
+    ("t,com,xj,cor,xj\n0,0,0,0,0\n", "line 1: header: expected each column once"),
+])
+def test_refusals(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Trace.read(_csv(tmp_path, text))
+    assert says in str(caught.value) and "x.csv" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_refusals_of_files(tmp_path: Path) -> None:
+    for name, data in {"a.csv": b"\xff\xfe\x00", "b.csv.gz": b"not gzip", "c.csv.gz": gzip.compress(HEAD.encode())[:-9],
+                       "d.mcap": b"nothing", "e.mcap": b"", "f.xlsx": b""}.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=name):
+            Trace.read(tmp_path / name)
+    with pytest.raises(InputError, match="readable file"):
+        Trace.read(tmp_path / "none.csv")
+
+
+def test_run_that_ended_in_its_set_up(tmp_path: Path) -> None:
+    path = record(tmp_path / "trace.mcap", stop=100)
+    with pytest.raises(InputError, match="ended in its set-up"):
+        Trace.read(path)
+    assert len(Trace.read(path, all=True)) == 100
+
+
+def test_sections_of_any_command() -> None:
+    t = np.arange(2000) / 1000
+    steps = np.repeat([0.0, 1e-3, -2e-3, -2.05e-3], 500)
+    assert [s.kind for s in sections(steps)] == ["hold", "step", "step", "step"]
+    ramp = np.concatenate([np.zeros(500), 0.33e-3 * t, np.full(500, 0.33e-3 * 2)])
+    on_the_bus = np.rint(ramp * 1e7) / 1e7
+    (hold, slope, rest) = sections(on_the_bus)
+    assert (hold.kind, slope.kind, rest.kind) == ("hold", "ramp", "hold")
+    assert slope.rate == pytest.approx(0.33e-3, rel=1e-3) and abs(slope.start - 500) < 3
+    for hz in (0.1, 1.0, 30.0):
+        assert {s.kind for s in sections(1e-3 * np.sin(2 * np.pi * hz * t))} == {"dynamic"}, hz
+    noise = np.random.default_rng(0).normal(0, 1e-4, 1000)
+    assert [s.kind for s in sections(np.concatenate([np.zeros(500), noise]))] == ["hold", "dynamic"]
+    with_gap = steps.copy()
+    with_gap[700:720] = np.nan
+    assert [s.kind for s in sections(with_gap)] == ["hold", "step", "step", "step"]
+    cover = sections(command())
+    assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == 13_500
+
+
+def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
+    """As an abort leaves it: main breaks off, clean-up goes back from there."""
+    for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
+        cut = command()[:last]
+        for com in (cut, np.concatenate([cut, np.linspace(cut[-1], 0, 300)]), cut[-15:]):
+            cover = sections(com)
+            assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == len(com)
+
+
+def test_practice_traces_load() -> None:
+    paths = sorted(PRACTICE.glob("*/*.csv.gz"))
+    if not paths:
+        pytest.skip(f"no practice traces beside the checkout ({PRACTICE.parent.name}/{PRACTICE.name})")
+    for path in paths:
+        trace = Trace.read(path)
+        assert len(trace) > 5000 and trace.period == 1e-3 and set(trace.signals) >= {"com", "xj", "cor"}
+        assert {s.kind for s in trace.sections()} >= {"hold"}
+        if path.name != "holdout.csv.gz":
+            np.testing.assert_allclose(trace.com, command(), atol=1e-9)
+            assert [s.kind for s in trace.sections()] == KINDS
+
+
+def test_analysis_knows_no_rig() -> None:
+    for path in (ROOT / "fdi").rglob("*.py"):
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        names = {n.module for n in nodes if isinstance(n, ast.ImportFrom) and n.module}
+        names |= {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
+        assert not {name.split(".")[0] for name in names} & {"rig", "can", "canopen", "cantools", "rerun"}, path.name

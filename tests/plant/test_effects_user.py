@@ -1,0 +1,188 @@
+"""A user's own effects: found, compiled, tried, given starts; and told in one line what is wrong with them."""
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_files import COGGING, HEAD, MEMORY, STIFF, restored_catalogue
+from physics_cases import PREFLIGHT, SILENT
+from rig_command import rig
+
+from plant import Actuator, InputError, Model, simulate
+from plant.effects import CATALOGUE, load_effects
+from plant.selftest import examine
+from plant.starts import changes, ensure_starts, levels, starts_of
+
+COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
+FEW = 20  # steps a cycle where plain Python runs too
+DEMAND = HEAD + '''
+class Rounding(NamedTuple):
+    """The firmware takes the demand in whole steps."""
+    step: Annotated[float, Quantity("m", low=0, high=1e-2)] = 0.0
+
+@effect("command", Rounding, law="Com in whole steps")
+def rounding(x, s, u, p):
+    size = p.rounding.step if p.rounding.step > 0.0 else 1.0
+    return size * float(int(x / size)) if p.rounding.step > 0.0 else x
+'''
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Iterator[Path]:
+    """A place for an effect file; what it registers is forgotten afterwards."""
+    with restored_catalogue():
+        yield tmp_path / "mine.py"
+
+
+def columns(model: Model, **options) -> np.ndarray:
+    return np.array(simulate(model, COMMAND, **options))
+
+
+def same_interpreted(model: Model, cycles: int = 40) -> bool:
+    short = COMMAND[:cycles]
+    fast, slow = (np.array(simulate(model, short, seed=3, steps=FEW, fast=fast)) for fast in (True, False))
+    return bool((fast == slow).all())
+
+
+def test_a_position_law_that_cannot_run_is_refused(file: Path) -> None:
+    file.write_text(COGGING.replace('"load"', '"position"').replace("p.cogging.force", "p.cogging.farce"))
+    load_effects(file)
+    with pytest.raises(InputError, match="cogging"):
+        Actuator(Model().having(["cogging"]))
+
+
+def test_the_users_effect_is_found_and_acts(file: Path) -> None:
+    file.write_text(STIFF.format(scale=1.0))
+    assert load_effects(file) == ["spring"]
+    model = SILENT.replace({"spring.stiffness": 5e5})
+    ours = columns(SILENT.replace({"aero_stiffness.stiffness": 5e5}))
+    assert np.abs(columns(model)[2] - ours[2]).max() < 5e-6  # the same physics, at the start of the step not its middle
+    assert same_interpreted(model)
+    assert (columns(Model().having(["spring"])) == columns(Model())).all()
+
+
+def test_the_users_effect_with_memory(file: Path) -> None:
+    file.write_text(MEMORY)
+    load_effects(file)
+    model = SILENT.replace({"wear.rate": 3e5, "constant_load.force": 100.0})
+    assert same_interpreted(model)
+    plant, way, last = Actuator(model), 0.0, 0.0
+    for current in 4e-3 * np.sin(np.arange(300) * 0.05):
+        plant.advance(current)
+        way += abs(plant.state.jack_position - last)
+        last = plant.state.jack_position
+    assert plant.state.memory.load[1].travelled == pytest.approx(way, rel=0.01)
+    assert way > 1e-3
+
+
+def test_the_users_effect_runs_at_full_speed(file: Path) -> None:
+    file.write_text(STIFF.format(scale=1.0))
+    load_effects(file)
+    long = np.tile(COMMAND, 8)
+
+    def cost(model: Model) -> float:
+        def once() -> float:
+            start = time.perf_counter()
+            simulate(model, long)
+            return time.perf_counter() - start
+        once()
+        return min(once() for _ in range(7))
+
+    assert cost(SILENT.replace({"spring.stiffness": 1e5})) < 2.0 * cost(SILENT)
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("effect(", "a file that Python can run"),
+    ("import no_such_module", "a file that Python can run"),
+    ("x = 1 / 0", "ZeroDivisionError"),
+    ("x = 1", "at least one function marked @effect"),
+    (COGGING.replace('"load"', '"laod"'), "no port 'laod'"),
+    (COGGING.replace('Quantity("N")] = 0.0', 'Quantity("N")]'), "needs a default"),
+    (COGGING.replace("def cogging", "def null_bias"), "the name is taken"),
+    (HEAD + "raise ValueError('two\\nlines')", "a file that Python can run"),
+])
+def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_effects(file)
+    assert said in str(caught.value)
+    assert str(file) in str(caught.value)
+
+
+def test_a_file_with_annotations_as_text(file: Path) -> None:
+    file.write_text("from __future__ import annotations\n" + MEMORY)
+    assert load_effects(file) == ["wear"]
+    assert CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a Python file with effects"):
+        load_effects(tmp_path / "none.py")
+
+
+@pytest.mark.parametrize("body", ["return x + p.cogging.farce", "return x + open('f')", "return [x, 'text']"])
+def test_a_law_that_cannot_run_is_refused(file: Path, body: str) -> None:
+    start = COGGING.index("    return x +")
+    file.write_text(COGGING[:start] + f"    {body}\n")
+    load_effects(file)
+    with pytest.raises(InputError, match="cogging"):
+        simulate(Model().having(["cogging"]), COMMAND)
+
+
+@pytest.mark.parametrize(("text", "name", "sized"), [
+    (COGGING, "cogging", "cogging.force"), (STIFF.format(scale=1.0), "spring", "spring.stiffness"),
+    (MEMORY, "wear", "wear.rate"), (DEMAND, "rounding", "rounding.step")])
+def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, name: str, sized: str) -> None:
+    """Nothing is said about how large it is: sizes are found that show 3, 30 and 300 times the noise."""
+    file.write_text(text)
+    load_effects(file)
+    starts = starts_of(CATALOGUE[name], PREFLIGHT)
+    assert all(tuple(start) == CATALOGUE[name].fitted for start in starts)
+    upwards = [start for start in starts if start[sized] > 0.0 and start.get("cogging.length", 1e-3) == 1e-3]
+    shown = levels(changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
+    assert shown == pytest.approx([3.0, 30.0, 300.0], rel=0.5)
+    assert {start["cogging.length"] for start in starts} == {1e-3, 4e-4, 2.5e-3} if name == "cogging" else True
+
+
+def test_a_hint_spares_the_search(file: Path) -> None:
+    file.write_text(COGGING.replace('Quantity("N")', 'Quantity("N", low=0, typical="0.2-5 kN")')
+                    .replace("above=0)", 'above=0, typical="1-4 mm")'))
+    load_effects(file)
+    entry = ensure_starts("cogging", PREFLIGHT)
+    assert entry.starts == CATALOGUE["cogging"].starts
+    assert sorted({start["cogging.force"] for start in entry.starts}) == pytest.approx([200.0, 1000.0, 5000.0])
+    assert sorted({start["cogging.length"] for start in entry.starts}) == pytest.approx([1e-3, 2e-3, 4e-3])
+
+
+def test_the_trial_of_a_sound_effect(file: Path) -> None:
+    file.write_text(COGGING)
+    said = rig("effects", "--effects", file, "cogging", "--json")
+    trial = said.json["effects"][0]["self_test"]
+    assert said.status == 0 and trial["faults"] == [] and trial["visible"]
+    assert {"start", "xj", "p12", "xs", "level"} == set(trial["shown"][0])
+    assert "sound cogging" in rig("effects", "--effects", file, "cogging").out
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ("return x +", "return x + 1.0 +", "at its off value it changes the plant"),
+    ("return x +", "return x + 0.0 *", "no size of it changes anything"),
+    ("return x +", "return x * (1.0 + p.cogging.force) ** 400 +", "has no number any more"),
+])
+def test_the_trial_of_an_unsound_one(file: Path, old: str, new: str, said: str) -> None:
+    text = COGGING.replace(old, new).replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)')
+    file.write_text(text.replace('"load"', '"position"'))
+    load_effects(file)
+    assert any(said in fault for fault in examine("cogging", COMMAND).faults)
+
+
+def test_the_catalogue_is_told_for_machines() -> None:
+    rows = {row["effect"]: row for row in json.loads(rig("effects", "--json").out)["effects"]}
+    assert set(rows) == set(CATALOGUE)
+    assert rows["coil_lag"]["confused_with"] == ["transport_delay", "sensor_lag"]
+    assert rows["spool_overlap"]["excludes"] == ["spool_underlap"] and rows["spool_overlap"]["starts"]
+    assert rows["command_rate_limit"]["in_firmware"] and "self_test" not in rows["command_rate_limit"]

@@ -1,0 +1,138 @@
+"""`rig compare` as it is typed: what it says, its JSON, exit statuses, its page, and what it refuses in one line."""
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from noisy_traces import healthy, recorded
+from rig_command import Said, rig
+
+from fdi.trace.csv_table import write_csv
+from fdi.trace.trace import Trace
+
+KEYS = {"verdict", "signals", "solver_error", "where", "blocks"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """est, repeat of a healthy plant; fault with spool friction."""
+    folder = tmp_path_factory.mktemp("traces")
+    healthy(2).write_csv(folder / "est.csv")
+    healthy(3).write_csv(folder / "repeat.csv")
+    recorded({"spool.static_friction": 30.0, "spool.dynamic_friction": 20.0}).write_csv(folder / "fault.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fault(folder: Path) -> Said:
+    return rig("compare", folder / "fault.csv", "--out", folder / "fault.html")
+
+
+def test_json_of_a_model_that_fits(folder: Path) -> None:
+    said = rig("compare", folder / "est.csv", "--repeat", folder / "repeat.csv", "--json")
+    assert said.status == 0 and said.err == ""
+    told = said.json
+    assert set(told) >= KEYS and told["verdict"] == "WITHIN_FLOOR" and told["repeats"] == 1
+    assert set(told["signals"]) == {"xj", "p12", "xs"}
+    for name, unit, floor in (("xj", "m", 2e-6), ("p12", "Pa", 2e4), ("xs", "m", 1e-6)):
+        signal = told["signals"][name]
+        assert set(signal) >= {"unit", "error", "floor", "ratio", "closed_loop_error"} and signal["unit"] == unit
+        assert signal["error"] == pytest.approx(floor, rel=0.05) and signal["floor"] == pytest.approx(floor, rel=0.05)
+        assert signal["ratio"] == pytest.approx(signal["error"] / signal["floor"])
+    assert 0 < told["solver_error"] < 0.1 * told["signals"]["xj"]["floor"]
+    assert set(told["blocks"]) == {"controller", "servovalve", "jack", "sensor"}
+    assert all({"section", "t0", "t1", "share", "condition"} <= set(place) for place in told["where"])
+    assert sum(place["share"] for place in told["where"]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_words_of_a_model_that_does_not(fault: Said, folder: Path) -> None:
+    assert fault.status == 1 and fault.err == ""
+    first, *rest = fault.out.splitlines()
+    assert re.match(r"MODEL_INCOMPLETE  The model leaves [\d.]+ um in XJ where noise explains 2.00 um; the servovalve "
+                    "disagrees; controller, jack and sensor fit.", first)
+    text = "\n".join(rest)
+    for words in ("from the command alone", "servovalve", "equal to the last digit", "halving the step",
+                  "floor     the model's sensor noise", "where     motion within 3 mm", "scatter   tolerances do not",
+                  f"page      {folder / 'fault.html'}", f"next      rig explain {folder / 'fault.csv'}"):
+        assert words in text, words
+    assert "nan" not in fault.out and not re.search(r"\d[eE][-+]\d", fault.out)
+
+
+def test_a_page_that_needs_no_network(fault: Said, folder: Path) -> None:
+    page = (folder / "fault.html").read_text()
+    assert "MODEL_INCOMPLETE" in page and page.count("<svg") == 4 and "</html>" in page
+    assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//|@import|<script""", page)
+    assert "nan" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+    for words in ("Com and XJ to Cor", "Is it noise", "What it goes with", "jack.damping", "share of the squared"):
+        assert words in page, words
+
+
+def test_the_right_parameters_bring_it_to_the_floor(folder: Path) -> None:
+    said = rig("compare", folder / "fault.csv", "--set", "spool.static_friction=30", "--set",
+               "spool.dynamic_friction=20", "--json")
+    assert said.status == 0 and said.json["verdict"] == "WITHIN_FLOOR"
+    (folder / "model.toml").write_text('name = "stiff"\n[spool]\nstatic_friction = 30.0\ndynamic_friction = 20.0\n')
+    said = rig("compare", folder / "fault.csv", "--model", folder / "model.toml")
+    assert said.status == 0 and said.out.startswith("WITHIN_FLOOR  The model explains this trace") and \
+        "next" not in said.out
+
+
+def test_results_go_where_they_should(folder: Path) -> None:
+    said = rig("compare", folder / "est.csv", "--out", folder / "told.json", "--quiet", "--signals", "xj, xs")
+    assert said.status == 0 and said.out == ""
+    assert set(json.loads((folder / "told.json").read_text())["signals"]) == {"xj", "xs"}
+    assert rig("compare", folder / "est.csv", "--report", "--quiet").status == 0
+    assert "WITHIN_FLOOR" in (folder / "compare.html").read_text()
+
+
+@pytest.mark.parametrize(("words", "refusal"), [
+    (["nowhere.csv"], "nowhere.csv: expected a readable file"),
+    (["{}/est.csv", "--signals", "xj,speed"], "--signals: speed: expected some of xj,p12,xs"),
+    (["{}/est.csv", "--signals", ""], "--signals: : expected some of|--signals: expected some of"),
+    (["{}/est.csv", "--repeat", "{}/other.csv"], "--repeat other.csv: com: expected the command of the trace"),
+    (["{}/est.csv", "--set", "spool.fiction=1"], "spool.fiction: expected a field of spool; did you mean"),
+    (["{}/est.csv", "--out", "{}/x.pdf"], "FILE.html for a page, or FILE.json"),
+    (["{}/est.csv", "--out", "{}/none/x.html"], "a place that can be written"),
+    (["{}/mm.csv"], "mm.csv: xj: expected values in m; the largest, 5.* times jack.travel"),
+    (["{}/nocor.csv"], "nocor.csv: line 1: cor: expected a column of this name"),
+    (["{}/dead.csv"], "dead.csv: xs: expected a signal that lives"),
+])
+def test_bad_input_is_one_line(folder: Path, words: list[str], refusal: str) -> None:
+    columns = {name: getattr(healthy(2), name) for name in ("t", "com", "xj", "cor", "xs")}
+    write_csv(folder / "other.csv", columns | {"com": -columns["com"]})
+    write_csv(folder / "mm.csv", columns | {"xj": 1e3 * columns["xj"]})
+    write_csv(folder / "nocor.csv", {name: x for name, x in columns.items() if name != "cor"})
+    write_csv(folder / "dead.csv", columns | {"xs": np.zeros(len(columns["xs"]))})
+    said = rig("compare", *(word.format(folder) for word in words))
+    assert said.status == 2 and said.out == "" and len(said.err.splitlines()) == 1
+    assert said.err.startswith("rig compare: ") and re.search(refusal, said.err), said.err
+
+
+def test_a_run_of_the_bench(preflight: Path) -> None:
+    """The log of a whole run over the bus, quantised as its frames are."""
+    said = rig("compare", preflight, "--json")
+    assert said.status == 0 and said.json["verdict"] == "WITHIN_FLOOR" and said.json["blocks"]["controller"] < 1.2
+
+
+def test_a_users_own_effect(folder: Path) -> None:
+    """It is in the model under test like any other; here one that changes nothing that was measured."""
+    (folder / "mine.py").write_text(
+        "from typing import Annotated, NamedTuple\nfrom plant.effects import effect\n"
+        "from plant.quantity import Quantity\n\n\nclass Weight(NamedTuple):\n"
+        '    force: Annotated[float, Quantity("N")] = 0.0\n\n\n'
+        '@effect("load", Weight, law="FR = FR + W")\ndef weight(x, s, u, p):\n    return x + p.weight.force\n')
+    from effect_files import restored_catalogue
+
+    with restored_catalogue():
+        said = rig("compare", folder / "est.csv", "--effects", folder / "mine.py", "--set=weight.force=500", "--json")
+    assert said.status == 1 and said.json["disagree"] == ["jack"]
+
+
+def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
+    short = {name: getattr(healthy(2), name)[:300] for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.of(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
+    said = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
+    assert said.status in (0, 1) and (tmp_path / "short.html").exists(), said.err

@@ -1,0 +1,120 @@
+"""`rig doctor`: every finding helps, nothing is claimed that is not so, and the lateness figures are right."""
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plant.errors import InputError
+from rig import doctor
+from rig.cli.commands import doctor as command
+from rig.run import lateness
+
+
+@pytest.fixture(scope="module")
+def findings() -> list[doctor.Finding]:
+    return doctor.survey(seconds=0.05)
+
+
+def arguments(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return argparse.Namespace(json=False, out=None, quiet=False, **vars(parser.parse_args(words)))
+
+
+def test_each_finding_says_what_it_is_for_and_how_to_get_it(findings: list[doctor.Finding]) -> None:
+    for finding in findings:
+        assert finding.area and finding.name and finding.found and finding.purpose, finding
+        assert bool(finding.remedy) == (finding.status != "ok"), finding
+
+
+def test_every_area_is_there(findings: list[doctor.Finding]) -> None:
+    names = [finding.name for finding in findings]
+    assert len(names) == len(set(names))
+    wanted = {"Python", "packages", "CAN in the kernel", "CAN interface", "CAN guest", "rerun", "Vulkan", "C compiler"}
+    wanted |= {"compiled code", "disk", "kernel", "priority", "memory lock", "clock", "timer at 1 kHz"}
+    assert wanted <= set(names)
+
+
+def test_can_finding_is_true(findings: list[doctor.Finding]) -> None:
+    status = next(finding.status for finding in findings if finding.name == "CAN in the kernel")
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+        assert status == "ok"
+    except OSError:
+        assert status == "missing"
+
+
+def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None:
+    text = next(finding.found for finding in findings if finding.name == "packages")
+    assert f"numpy {np.__version__}" in text
+    assert set(doctor.requirements()) == {"", "view", "dev", "fleet", "learn", "bench"}
+    assert doctor.versions(["no-such-distribution"]) == {"no-such-distribution": ""}
+
+
+def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(doctor, "requirements", lambda: {"": ["numpy", "no-such-distribution"]})
+    assert command.run(arguments("--seconds", "0")) == 1
+    out = capsys.readouterr().out
+    assert "missing: no-such-distribution" in out
+    assert out.splitlines()[-1] == "rig doctor: the bench cannot run without: packages"
+
+
+def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_PATH", "/nowhere")
+    found = {finding.name: finding for finding in [*doctor.tools(), *doctor.can()]}
+    assert found["C compiler"].status == "missing" and "gcc" in found["C compiler"].remedy
+    assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
+
+
+def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = arguments("--seconds", "0")
+    args.json, args.out = True, tmp_path / "doctor.json"
+    assert command.run(args) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == json.loads(args.out.read_text())
+    assert answer["verdict"] == "PASS"
+    assert {"area", "name", "status", "found", "purpose", "remedy", "needed"} == set(answer["findings"][0])
+
+
+def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    args = arguments("--seconds", "0")
+    args.quiet = True
+    assert command.run(args) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("seconds", ["-1", "4000", "nan"])
+def test_bad_seconds_are_refused(seconds: str) -> None:
+    with pytest.raises(InputError, match="--seconds: expected between 0 and 3600 s"):
+        command.run(arguments("--seconds", seconds))
+
+
+def test_percentiles_of_known_wake_ups() -> None:
+    late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
+    assert lateness.percentiles(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
+
+
+def test_timer_lateness_counts_its_periods() -> None:
+    late = lateness.timer_lateness(0.05)
+    assert late.periods == 50
+    assert 0 <= late.p50 <= late.p99 <= late.p99_9 <= late.max
+
+
+def test_fifo_ends_with_its_thread() -> None:
+    assert lateness.under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_fifo_without_the_right_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("os.sched_setscheduler", refuse)
+    assert lateness.under_fifo(lambda: True) is None

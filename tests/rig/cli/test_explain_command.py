@@ -1,0 +1,156 @@
+"""`rig explain`: what it says of runs made with a tenth of its step, as JSON (interface.md, 4), in words, as a page."""
+from __future__ import annotations
+
+import doctest
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_files import HEAD, restored_catalogue
+from rig_command import Said, rig
+from short_runs import HIDDEN, command, measured, words
+
+from fdi.estimation.model_unknowns import effects_of, free_of, unknowns_of
+from fdi.report import numbers as spoken
+from plant import Model
+from plant.effects import CATALOGUE
+
+SIGNALS = {"xj", "p12", "xs"}
+
+
+@pytest.fixture(scope="module")
+def biased(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return measured(tmp_path_factory.mktemp("biased"), HIDDEN)
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return measured(tmp_path_factory.mktemp("healthy"), {})
+
+
+@pytest.fixture(scope="module")
+def found(biased: dict[str, Path]) -> Said:
+    """One search; its page is page.html beside the run."""
+    return rig("explain", *words(biased), "--json", "--out", biased["est"].with_name("page.html"))
+
+
+def test_the_effect_is_named_with_its_evidence(found: Said) -> None:
+    said = found.json
+    assert found.status == 1, "something is missing"
+    assert said["verdict"] == "EXPLAINED" and said["effects"] == ["null_bias"]
+    best = said["candidates"][0]
+    assert best["effect"] == "null_bias" and best["word"] == "explains"
+    assert set(best["error"]) == set(best["holdout"]) == SIGNALS
+    assert best["ratio"] < 1.1 and best["evidence"] > 1000.0 and best["p_value"] < 1e-6
+    current = best["parameters"]["null_bias.current"]
+    assert current["unit"] == "A" and current["low"] < HIDDEN["null_bias.current"] < current["high"]
+    assert current["high"] - current["low"] < 0.1 * HIDDEN["null_bias.current"]
+    assert all(c["ratio"] > best["ratio"] for c in said["candidates"][1:])
+
+
+def test_baseline_and_floor(found: Said) -> None:
+    base, best = found.json["baseline"], found.json["candidates"][0]
+    assert set(base["error"]) == set(base["holdout"]) == set(base["floor"]) == SIGNALS
+    assert base["floor"]["xj"] == pytest.approx(2e-6, rel=0.1)
+    assert base["error"]["xj"] > 10.0 * base["floor"]["xj"]
+    for signal in SIGNALS:
+        assert best["error"][signal] < 1.1 * base["floor"][signal]
+        assert best["holdout"][signal] < 1.15 * base["floor"][signal]
+
+
+def test_blind_spots_have_sizes_and_units(found: Said) -> None:
+    blind = {b["effect"]: b for b in found.json["blind_to"]}
+    assert {"spool_friction", "sensor_offset", "internal_leakage"} <= set(blind)
+    assert blind["spool_friction"]["unit"] == "N" and 0.0 < blind["spool_friction"]["smallest_visible"] < 10.0
+    assert blind["sensor_offset"]["smallest_visible"] is None, "no size of it shows in a closed loop"
+    assert "command_rate_limit" in found.json["seen_without_noise"]
+
+
+def test_the_page_needs_no_network(found: Said, biased: dict[str, Path]) -> None:
+    page = biased["est"].with_name("page.html").read_text()
+    assert found.status == 1 and "null_bias explains it" in page and page.count("<svg") == 2
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+def test_nothing_missing_passes(healthy: dict[str, Path]) -> None:
+    said = rig("explain", *words(healthy))
+    assert said.status == 0 and said.out.startswith("NOTHING_MISSING")
+    assert "what is left is noise" in said.out and "blind to" in said.out and "next" not in said.out
+
+
+FEW = ("null_bias", "constant_load", "friction_asymmetry", "spool_friction")
+SPRING = HEAD + '''
+class Spring(NamedTuple):
+    stiffness: Annotated[float, Quantity("N/m", low=0)] = 0.0
+
+@effect("load", Spring, law="FR = FR + K XJ")
+def own_spring(x, s, u, p):
+    return x + p.own_spring.stiffness * s.jack_position
+'''
+
+
+@pytest.fixture
+def few_effects() -> Iterator[None]:
+    """A small catalogue: its code compiles in a few seconds."""
+    with restored_catalogue():
+        for name in set(CATALOGUE) - set(FEW):
+            del CATALOGUE[name]
+        yield
+
+
+def test_a_users_effect_is_ranked_with_the_others(tmp_path: Path, few_effects: None) -> None:
+    (tmp_path / "own.py").write_text(SPRING)
+    files = ["--effects", tmp_path / "own.py"]
+    for name, seed in (("est", 1), ("repeat", 2)):
+        said = rig("simulate", "--set=own_spring.stiffness=4e5", *files, "--seed", seed, "--steps=200", "--quiet",
+                   "--command", csv(tmp_path), "--out", tmp_path / f"{name}.csv")
+        assert said.status == 0, said.err
+    said = rig("explain", tmp_path / "est.csv", "--repeat", tmp_path / "repeat.csv", *files, "--json")
+    assert said.json["effects"] == ["own_spring"] and said.json["verdict"] == "EXPLAINED", said.out
+    stiffness = said.json["candidates"][0]["parameters"]["own_spring.stiffness"]
+    assert stiffness["low"] < 4e5 < stiffness["high"]
+
+
+def csv(folder: Path) -> Path:
+    rows = "\n".join(f"{k / 1000:.3f},{x!r}" for k, x in enumerate(command().tolist()))
+    (folder / "command.csv").write_text(f"t,com\n{rows}\n")
+    return folder / "command.csv"
+
+
+@pytest.mark.parametrize(("changed", "complaint"), [
+    (["--holdout", "est"], "a run that no fit has seen"),
+    (["--repeat", "est"], "the same command run again"),
+    (["--repeat", "holdout"], "another command is no repeat"),
+    (["--signals", "xj,q"], "--signals: q: expected some of xj,p12,xs"),
+    (["--out", "x.txt"], "FILE.html or FILE.json"),
+    (["--write-effect", "x.txt"], "FILE.py"),
+    (["--holdout", "nowhere.csv"], "a trace that can be read"),
+])
+def test_bad_input_is_told_in_one_line(changed: list[str], complaint: str, biased: dict[str, Path]) -> None:
+    said = rig("explain", biased["est"], *(biased.get(word, word) for word in changed))
+    assert said.status == 2 and complaint in said.err and said.err.count("\n") == 1 and not said.out
+
+
+def test_a_trace_without_current_is_refused(biased: dict[str, Path], tmp_path: Path) -> None:
+    table = np.genfromtxt(biased["est"], delimiter=",", names=True)
+    rows = "\n".join(f"{r['t']:.3f},{r['com']},{r['xj']}" for r in table)
+    (tmp_path / "bare.csv").write_text(f"t,com,xj\n{rows}\n")
+    said = rig("explain", tmp_path / "bare.csv")
+    assert said.status == 2 and "cor" in said.err and said.err.count("\n") == 1
+
+
+def test_effects_of_a_model_are_free_from_where_they_are() -> None:
+    model = Model().replace({"null_bias.current": 1e-4, "spool.static_friction": 45.0, "spool.dynamic_friction": 30.0,
+                             "jack.mass": 101.0, "command_rate_limit.rate": 0.1})
+    assert set(effects_of(model)) == {"spool_friction", "null_bias", "command_rate_limit"}
+    own = {f.name: f for f in unknowns_of(model)}
+    assert set(own) == {"null_bias.current", "spool.static_friction", "spool.dynamic_friction"}
+    assert own["null_bias.current"].centre == 1e-4 and np.isinf(own["null_bias.current"].prior)
+    names = [f.name for f in free_of(model)]
+    assert len(names) == len(set(names)) and {"jack.mass", "null_bias.current"} <= set(names)
+    assert not effects_of(Model()) and not unknowns_of(Model().having(["null_bias"]))
+
+
+def test_numbers_in_words() -> None:
+    assert doctest.testmod(spoken).failed == 0

@@ -1,0 +1,192 @@
+"""DBC, object dictionaries and code say the same thing, signal by signal."""
+from __future__ import annotations
+
+import random
+import struct
+import tomllib
+from collections.abc import Callable, Iterator
+from configparser import RawConfigParser
+from importlib.resources import files
+from typing import NamedTuple, cast
+
+import canopen
+import cantools
+import pytest
+from canopen.objectdictionary import ODVariable, datatypes
+from cantools.database.can import Database
+
+from dbc import DBC, EDS
+from rig.network import codec
+from rig.network.codec import SIGNALS, Signal
+
+FRAMES = (codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE)
+NODES = {1: "Rig", 2: "Controller", 3: "Plant"}
+SENDERS = {codec.COMMAND: 1, codec.FEEDBACK: 3, codec.VALVE_STATE: 3, codec.DRIVE: 2}
+RECEIVERS = {codec.COMMAND: {2}, codec.FEEDBACK: {1, 2}, codec.VALVE_STATE: {1}, codec.DRIVE: {1, 3}}
+WIDTHS = {datatypes.INTEGER32: (32, True), datatypes.UNSIGNED16: (16, False)}
+nodes = pytest.mark.parametrize("node", EDS)
+
+
+class Pdo(NamedTuple):
+    """One PDO of one dictionary."""
+
+    node: int
+    cob_id: int
+    sends: bool
+    kind: int
+    objects: list[tuple[ODVariable, int]]  # mapped object, length in bits
+
+
+def load_database() -> Database:
+    return cast(Database, cantools.database.load_file(DBC))
+
+
+def pdos(node: int) -> Iterator[Pdo]:
+    """Every PDO of a node's EDS, as canopen reads it."""
+    od = canopen.import_od(str(EDS[node]), node)
+    for base in (0x1400, 0x1800):
+        for index in (index for index in od if base <= index < base + 0x200):
+            words = [od[index + 0x200][sub].default for sub in range(1, od[index + 0x200][0].default + 1)]
+            objects = [(variable(od, word >> 16, word >> 8 & 0xFF), word & 0xFF) for word in words]
+            yield Pdo(node, od[index][1].default, base == 0x1800, od[index][2].default, objects)
+
+
+def variable(od: canopen.ObjectDictionary, index: int, sub: int) -> ODVariable:
+    item = od[index]
+    return item if isinstance(item, ODVariable) else item[sub]
+
+
+ALL_PDOS = [pdo for node in EDS for pdo in pdos(node)]
+
+
+def signals(cob_id: int) -> list[Signal]:
+    return [signal for signal in SIGNALS if signal.cob_id == cob_id]
+
+
+@pytest.mark.parametrize("cob_id", FRAMES, ids=hex)
+def test_dbc_and_code_agree(cob_id: int) -> None:
+    message = load_database().get_message_by_frame_id(cob_id)
+    assert message.length == 8
+    assert not message.is_extended_frame
+    assert message.senders == [NODES[SENDERS[cob_id]]]
+    found = [
+        Signal(cob_id, s.name, s.start, s.length, s.is_signed, s.scale, s.unit or "") for s in message.signals
+    ]
+    assert found == signals(cob_id)
+    assert all(s.byte_order == "little_endian" and s.offset == 0 for s in message.signals)
+    receivers = {NODES[node] for node in RECEIVERS[cob_id]}
+    assert all(set(s.receivers) == receivers for s in message.signals)
+
+
+def test_dbc_limits_are_those_of_the_raw_type() -> None:
+    for signal in SIGNALS:
+        found = load_database().get_message_by_frame_id(signal.cob_id).get_signal_by_name(signal.name)
+        high = 2 ** (signal.length - signal.signed) - 1
+        low = -high - 1 if signal.signed else 0
+        assert (found.minimum, found.maximum) == pytest.approx((low * signal.scale, high * signal.scale), rel=1e-12)
+
+
+@pytest.mark.parametrize("pdo", ALL_PDOS, ids=lambda pdo: f"node{pdo.node}-{'T' if pdo.sends else 'R'}{pdo.cob_id:03X}")
+def test_dictionaries_and_code_agree(pdo: Pdo) -> None:
+    """Mapping order, length, sign, scale and unit of every mapped object."""
+    start, found = 0, []
+    for signal, (mapped, bits) in zip(signals(pdo.cob_id), pdo.objects, strict=True):
+        length, signed = WIDTHS[mapped.data_type]
+        assert bits == length
+        assert mapped.pdo_mappable
+        found.append(Signal(pdo.cob_id, signal.name, start, bits, signed, mapped.factor, mapped.unit))
+        start += bits
+    assert found == signals(pdo.cob_id)
+    assert start == 64
+
+
+def test_each_frame_has_its_sender_and_receivers() -> None:
+    assert {pdo.cob_id: pdo.node for pdo in ALL_PDOS if pdo.sends} == SENDERS
+    heard = {cob_id: {pdo.node for pdo in ALL_PDOS if not pdo.sends and pdo.cob_id == cob_id} for cob_id in FRAMES}
+    assert heard == RECEIVERS
+
+
+def test_transmission_types_are_those_of_the_interface() -> None:
+    kinds = {(pdo.node, pdo.cob_id): pdo.kind for pdo in ALL_PDOS if pdo.node != 1}
+    assert kinds == {(2, 0x202): 1, (2, 0x183): 255, (2, 0x182): 255, (3, 0x182): 1, (3, 0x183): 1, (3, 0x283): 1}
+
+
+def test_cantools_and_codec_make_the_same_bytes() -> None:
+    """Random raw values through an independent encoder and back through ours."""
+    database, rng = load_database(), random.Random(1)
+    packs: dict[int, Callable[..., bytes]] = {
+        codec.COMMAND: codec.pack_command, codec.FEEDBACK: codec.pack_feedback,
+        codec.VALVE_STATE: codec.pack_valve_state, codec.DRIVE: codec.pack_drive,
+    }  # fmt: skip
+    for cob_id, pack in packs.items():
+        message = database.get_message_by_frame_id(cob_id)
+        for _ in range(200):
+            low_high = {s.name: (-(2**31), 2**31) if s.signed else (0, 2**16) for s in signals(cob_id)}
+            raw = {name: rng.randrange(*span) for name, span in low_high.items()}
+            data = message.encode(raw, scaling=False)
+            values = message.decode(data)
+            assert pack(*values.values()) == data
+            assert struct.unpack("<ii" if cob_id == codec.FEEDBACK else "<iHH", data) == tuple(raw.values())
+
+
+def test_dbc_names_the_services_of_all_nodes() -> None:
+    """COB-IDs of the predefined connection set; EMCY as in 0x1014, SDO as in 0x1200."""
+    ids = {message.frame_id: message.name for message in load_database().messages}
+    assert ids.pop(codec.SYNC) == "SYNC"
+    assert ids.pop(0x000) == "NMT"
+    for node in EDS:
+        od = canopen.import_od(str(EDS[node]), node)
+        assert ids.pop(od[0x1014].default) == f"EMCY_{node}"
+        assert ids.pop(0x700 + node) == f"heartbeat_{node}"
+        if 0x1200 in od:
+            assert ids.pop(od[0x1200][1].default) == f"SDO_request_{node}"
+            assert ids.pop(od[0x1200][2].default) == f"SDO_answer_{node}"
+    assert set(ids) == set(FRAMES)
+
+
+@nodes
+def test_dictionary_has_the_objects_of_its_role(node: int) -> None:
+    od = canopen.import_od(str(EDS[node]), node)
+    common = {0x1000, 0x1001, 0x1003, 0x1005, 0x1006, 0x1008, 0x1009, 0x100A, 0x1014, 0x1016, 0x1017, 0x1018, 0x1029}
+    own = {
+        1: {0x1280, 0x1281, 0x1F80},
+        2: {0x1200, 0x2100, 0x2101, 0x2102, 0x2103, 0x2104, 0x2105, 0x2110, 0x6040, 0x6041},
+        3: {0x1200, 0x2200, 0x2201, 0x2202, 0x2203, 0x2204, 0x2205, 0x2206, 0x2207, 0x2210, 0x2211},
+    }
+    assert common | own[node] <= set(od)
+    assert (od[0x1005].default & 0x7FF) == codec.SYNC
+    assert bool(od[0x1005].default & 1 << 30) is (node == 1)  # only the rig produces it
+
+
+@nodes
+def test_eds_is_well_formed(node: int) -> None:
+    """CiA 306: lists name exactly the objects there, counts are right, every object has its keys."""
+    eds = RawConfigParser()
+    eds.optionxform = str  # type: ignore[assignment, method-assign]
+    eds.read(EDS[node])
+    assert eds["FileInfo"]["FileName"] == EDS[node].name
+    listed: list[int] = []
+    for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+        count = int(eds[section]["SupportedObjects"])
+        assert len(eds[section]) == count + 1
+        listed += [int(eds[section][str(n)], 16) for n in range(1, count + 1)]
+    assert len(set(listed)) == len(listed)
+    objects = {int(name, 16): eds[name] for name in eds.sections() if len(name) == 4}
+    assert set(objects) == set(listed)
+    for index, section in objects.items():
+        subs = [name for name in eds.sections() if name.startswith(f"{index:04X}sub")]
+        assert len(subs) == int(section.get("SubNumber", "0"), 16)
+        if subs and index != 0x1003:  # there sub 0 counts the errors
+            highest = max(int(name[7:], 16) for name in subs)
+            assert int(eds[f"{index:04X}sub0"]["DefaultValue"], 16) == highest
+        for name in subs or [section.name]:
+            assert {"ParameterName", "ObjectType", "DataType", "AccessType", "PDOMapping"} <= set(eds[name])
+    assert int(eds["DeviceInfo"]["NrOfRXPDO"]) == sum(0x1400 <= index < 0x1600 for index in objects)
+    assert int(eds["DeviceInfo"]["NrOfTXPDO"]) == sum(0x1800 <= index < 0x1A00 for index in objects)
+
+
+def test_gains_in_the_dictionary_are_the_nominal_ones() -> None:
+    nominal = tomllib.loads((files("plant") / "nominal.toml").read_text())["controller"]
+    od = canopen.import_od(str(EDS[2]), 2)
+    names = ("proportional_gain", "integral_gain", "derivative_gain", "current_limit", "period")
+    assert [od[0x2110][sub].default for sub in range(1, 6)] == [nominal[name] for name in names]

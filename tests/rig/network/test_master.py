@@ -1,0 +1,164 @@
+"""The canopen library as master through both kinds of wire, and what it is kept from: malformed frames, strangers."""
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+import pytest
+from bus_stations import spec
+
+from plant import Model
+from rig.network.bus import open_can
+from rig.network.clock import VirtualClock, WallClock
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.network.master import CONTROLLER, PLANT, BusError, Master
+from rig.network.wire import EmbeddedWire, LinkWire, Wire, serve
+from rig.nodes.emulator import Emulator
+from rig.nodes.firmware import Firmware, gains_of
+from rig.nodes.scenario import Scenario
+from rig.sequences.faults import Plan
+
+SCENARIO = Scenario(Model(), Plan(stop=10)).to_bytes()
+
+
+@contextlib.contextmanager
+def served(where: str, *makers: type[Emulator] | type[Firmware]) -> Iterator[None]:
+    """Nodes on a bus between programs, each in a thread of its own."""
+    over = threading.Event()
+    links, threads = [], []
+    for make in makers:
+        clock = WallClock()
+        links.append(Link(open_can(where), clock.now))
+        threads.append(threading.Thread(target=serve, args=(make(links[-1].send), links[-1], clock, over.is_set)))
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+        for link in links:
+            link.close()
+
+
+@pytest.fixture
+def wire(bus_kind: str) -> Iterator[Wire]:
+    if bus_kind == "embedded":
+        yield EmbeddedWire(VirtualClock(), [Emulator, Firmware])
+        return
+    where, clock = spec(bus_kind), WallClock()
+    with served(where, Emulator, Firmware):
+        link = LinkWire(Link(open_can(where), clock.now), clock)
+        yield link
+        link.close()
+
+
+def alone() -> Master:
+    """A master with nobody opposite."""
+    return Master(EmbeddedWire(VirtualClock(), []), lambda: 0)
+
+
+def test_bring_up(wire: Wire) -> None:
+    """Boot-up, scenario, gains, heartbeats, start: what a run begins with."""
+    master = Master(wire, wire.clock.now)
+    seen: list[tuple[int, int]] = []
+    master.on_state = lambda node, state: seen.append((node, state))
+    master.reset()
+    master.configure(SCENARIO, gains_of(Model()), 1_000_000)
+    master.start()
+    wire.wait(lambda: set(master.states.values()) == {5}, 1.0)
+    master.stop()
+    wire.wait(lambda: set(master.states.values()) == {127}, 1.0)
+    for node in (CONTROLLER, PLANT):
+        states = [state for n, state in seen if n == node]
+        assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
+    assert master.errors() == [] and not master.rival(0.0)
+
+
+def test_who_answers(wire: Wire) -> None:
+    master = Master(wire, wire.clock.now)
+    assert master.present(PLANT, 2.0) and master.present(CONTROLLER, 2.0)
+
+
+def test_refusals_name_node_and_object(wire: Wire) -> None:
+    master = Master(wire, wire.clock.now)
+    master.reset()
+    with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210: .*0x06090030"):
+        master.configure(b"nonsense", None, 0)
+    with pytest.raises(BusError, match=r"node 2 \(controller\), object 0x2110 sub 1: .*0x06090030"):
+        master.configure(SCENARIO, gains_of(Model())._replace(proportional_gain=float("nan")), 0)
+
+
+def test_nobody_there() -> None:
+    master = alone()
+    with pytest.raises(BusError, match=r"no boot-up from node 2 \(controller\) and node 3 \(plant\) within 2 s"):
+        master.reset()
+    with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210"):
+        master.configure(SCENARIO, None, 0)
+    assert not master.present(PLANT, 0.1)
+
+
+@pytest.mark.parametrize("cob_id", [0x082, 0x083, 0x582, 0x583, 0x702, 0x703, 0x704, 0x084, 0x7E4, 0x7FF, 0x183])
+def test_malformed_frames_do_not_reach_the_library(cob_id: int) -> None:
+    """canopen unpacks an emergency of any length: struct.error, and the run would end."""
+    master = alone()
+    heard: list[object] = []
+    master.on_emcy = lambda node, error: heard.append(error)
+    master.on_state = lambda node, state: heard.append(state)
+    for length in range(9):
+        if (cob_id & 0x780, length) not in ((0x080, 8), (0x700, 1)):
+            master.receive(Frame(0, cob_id, b"\x85" * length))
+    assert heard == []
+
+
+def test_a_short_sdo_response_is_none() -> None:
+    master = alone()
+    for length in range(1, 8):
+        master.receive(Frame(0, 0x583, b"\x80" + bytes(length - 1)))
+    with pytest.raises(BusError, match="No SDO response"):
+        master.configure(SCENARIO, None, 0)
+
+
+def test_emergencies_come_and_go() -> None:
+    master = alone()
+    master.receive(Frame(0, 0x083, bytes.fromhex("5082110100000000")))
+    assert master.errors() == [3]
+    master.receive(Frame(0, 0x083, bytes(8)))
+    assert master.errors() == []
+
+
+@pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x202, 0x701])
+def test_another_rig_is_noticed_once(cob_id: int) -> None:
+    master = alone()
+    heard: list[int] = []
+    master.on_rival = heard.append
+    for _ in range(3):
+        master.receive(Frame(0, cob_id, b""))
+    assert heard == [cob_id] and master.rival(0.0)
+
+
+def test_heartbeats_are_watched_from_the_first_on() -> None:
+    clock = VirtualClock()
+    master = Master(EmbeddedWire(clock, [Emulator, Firmware]), clock.now)
+    lost: list[int] = []
+    master.on_lost = lost.append
+    master.reset()
+    master.configure(SCENARIO, gains_of(Model()), 0)
+    for _ in range(10):
+        master.wire.wait(lambda: False, 0.1)
+        master.tick()
+    assert lost == []
+    clock.sleep_until(clock.now() + 10**9)  # the nodes are not asked meanwhile
+    master.tick()
+    assert sorted(lost) == [CONTROLLER, PLANT]
+
+
+def test_every_frame_is_seen_once() -> None:
+    master = Master(EmbeddedWire(VirtualClock(), [Emulator, Firmware]), lambda: 7)
+    frames: list[Frame] = []
+    master.on_frame = frames.append
+    master.reset()
+    assert frames == [(7, 0x000, b"\x82\x00"), (7, 0x703, b"\0"), (7, 0x702, b"\0")]

@@ -1,0 +1,139 @@
+"""The reference firmware by scripts of frames: when current flows, how a fault is taken back, and that its law is the
+one the model has.
+"""
+from __future__ import annotations
+
+import struct
+
+import pytest
+from node_bench import FirmwareDesk
+
+from plant.controller import Loop, answer
+from rig.device import Abort, NmtState
+from rig.network import codec
+from rig.network.codec import Control, Status
+from rig.nodes.firmware import GAINS, LOST_AFTER, Gains
+
+ACTIVE, RESET = int(Control.ACTIVE), int(Control.RESET)
+GIVEN = Gains(2.0, 30.0, 1e-3, 8e-3, 1e-3)
+
+
+def lose_feedback(desk: FirmwareDesk) -> None:
+    for _ in range(LOST_AFTER + 1):
+        desk.cycle(ACTIVE, position=None)
+
+
+def set_gain(desk: FirmwareDesk, sub: int, value: float) -> int:
+    """SDO download of a REAL64; the abort code or 0."""
+    desk.send(0x602, b"\x21" + GAINS.to_bytes(2, "little") + bytes((sub, 8, 0, 0, 0)))
+    data = struct.pack("<d", value)
+    desk.send(0x602, b"\x00" + data[:7])
+    reply = desk.send(0x602, b"\x1d" + data[7:].ljust(7, b"\0"))[0]
+    return int.from_bytes(reply[4:], "little") if reply[0] == 0x80 else 0
+
+
+@pytest.mark.parametrize(("control", "status"), [
+    (0b000, 0b1000), (0b001, 0b1001), (0b011, 0b1011), (0b111, 0b1111),
+    (0b010, 0b1000), (0b100, 0b1000), (0b101, 0b1000), (0b110, 0b1000),
+])
+def test_the_levels_build_on_each_other(control: int, status: int) -> None:
+    """Current flows with all three, and none is skipped."""
+    drive = FirmwareDesk().cycle(control, demand=1e-3)
+    assert drive is not None and drive.status == status
+    assert (drive.current != 0) == (control == ACTIVE)
+
+
+def test_it_answers_each_feedback_with_the_cycle_it_belongs_to() -> None:
+    desk = FirmwareDesk()
+    assert [drive.cycle for _ in range(5) if (drive := desk.cycle(ACTIVE))] == [0, 1, 2, 3, 4]
+    desk.k = 65_535
+    assert [drive.cycle for _ in range(2) if (drive := desk.cycle(ACTIVE))] == [65_535, 0]
+
+
+def test_without_sync_and_out_of_operational_it_says_nothing() -> None:
+    desk = FirmwareDesk()
+    desk.nmt(128)
+    assert desk.cycle(ACTIVE) is None
+    desk.nmt(1)
+    assert desk.cycle(ACTIVE) is not None
+
+
+def test_the_law_is_the_models() -> None:
+    """Bit for bit, with limit and integral part, from positions as the bus has them."""
+    desk, loop = FirmwareDesk(), Loop()
+    for sub, value in enumerate(GIVEN, 1):
+        assert set_gain(desk, sub, value) == 0
+    desk.nmt(128)
+    desk.nmt(1)
+    for k in range(60):
+        demand, position = 5e-3 * (k >= 10), 1e-4 * k
+        drive = desk.cycle(ACTIVE, demand, position)
+        heard = codec.position(codec.raw_position(demand)), codec.position(codec.raw_position(position))
+        current, loop = answer(loop, *heard, GIVEN)
+        assert drive is not None and drive.current == codec.current(codec.raw_current(current))
+
+
+def test_the_integral_part_starts_anew_with_each_activation() -> None:
+    desk = FirmwareDesk()
+    set_gain(desk, 2, 1.0)
+    desk.nmt(128)
+    desk.nmt(1)
+    first = [desk.cycle(ACTIVE, 1e-3) for _ in range(5)]
+    desk.cycle(0)
+    again = [desk.cycle(ACTIVE, 1e-3) for _ in range(5)]
+    assert [d and d.current for d in again] == [d and d.current for d in first]
+
+
+def test_lost_feedback_is_an_emergency_without_current() -> None:
+    desk = FirmwareDesk()
+    desk.cycle(ACTIVE, 1e-3)
+    drives = [desk.cycle(ACTIVE, 1e-3, position=None) for _ in range(LOST_AFTER + 1)]
+    assert [d is not None for d in drives] == [False] * LOST_AFTER + [True]
+    assert drives[-1] is not None and (drives[-1].current, drives[-1].status) == (0.0, 0)
+    assert desk.emergencies() == [0x8250]
+
+
+def test_a_fault_is_latched_until_its_cause_is_gone_and_reset_rises() -> None:
+    desk = FirmwareDesk()
+    desk.cycle(ACTIVE | RESET)  # a bit that is up already acknowledges nothing
+    for _ in range(LOST_AFTER + 1):
+        desk.cycle(ACTIVE | RESET, position=None)
+    assert not desk.status(ACTIVE | RESET, 2)
+    assert desk.emergencies() == [0x8250, 0]  # feedback is back, the fault is not
+    assert not desk.status(ACTIVE, 1)
+    assert desk.status(ACTIVE | RESET, 1) == Status.ACTIVE
+    assert desk.status(ACTIVE, 1) == Status.ACTIVE
+
+
+def test_no_reset_while_the_cause_stands() -> None:
+    desk = FirmwareDesk()
+    lose_feedback(desk)
+    desk.cycle(ACTIVE | RESET, position=None)
+    assert not desk.status(ACTIVE | RESET, 1)
+
+
+def test_a_restart_takes_the_fault_but_not_the_error_that_stands() -> None:
+    """START after a pause: the emergency is taken back with the first feedback, and the next fault can be reset."""
+    desk = FirmwareDesk()
+    lose_feedback(desk)
+    desk.nmt(128)
+    desk.nmt(1)
+    assert desk.status(ACTIVE, 1) == Status.ACTIVE
+    assert desk.emergencies() == [0x8250, 0] and desk.node.device.emcy.active == []
+
+
+def test_a_silent_rig_is_a_fault() -> None:
+    """The heartbeat of node 1 stops: EMCY 0x8130, out of OPERATIONAL (0x1029), no drive any more."""
+    desk = FirmwareDesk()
+    desk.send(0x701, b"\x05")
+    desk.cycle(ACTIVE)
+    desk.wait(10**9)
+    assert desk.emergencies() == [0x8130] and desk.node.device.state is NmtState.PRE_OPERATIONAL
+    assert desk.cycle(ACTIVE) is None
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_a_gain_must_be_a_number(value: float) -> None:
+    desk = FirmwareDesk()
+    assert set_gain(desk, 1, value) == Abort.VALUE
+    assert desk.cycle(ACTIVE, 1e-3) is not None

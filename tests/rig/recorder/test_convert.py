@@ -1,0 +1,128 @@
+"""Other formats, there and back."""
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_run import record
+
+import dbc
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from rig.cli.commands import export as export_command
+from rig.cli.commands import import_ as import_command
+from rig.cli.commands import recover as recover_command
+from rig.recorder.convert import RAW, export, frames, import_csv, import_frames
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1300)
+
+
+@pytest.mark.parametrize("suffix", RAW)
+def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"x{suffix}"
+    assert export(log, out) == 6500
+    assert import_frames(out, tmp_path / "back.mcap", dbc.DBC) == 1300
+    before, after = list(frames(log)), list(frames(tmp_path / "back.mcap"))
+    assert [f[1:] for f in before] == [f[1:] for f in after]
+    worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
+    assert worst <= 100_000  # .trc counts 0.1 ms
+    want, got = Trace.read(log, all=True), Trace.read(tmp_path / "back.mcap")
+    for name, resolution in {"com": 1e-7, "xj": 1e-7, "cor": 1e-8, "p12": 10.0, "xs": 1e-9}.items():
+        np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
+    assert np.isnan(got.load).all() and not got.gaps
+    assert "eha.dbc" in got.attachments and got.provenance["imported"] == out.name
+
+
+def test_wireshark_decodes_the_export(log: Path, tmp_path: Path) -> None:
+    if not shutil.which("tshark"):
+        pytest.skip("no tshark on this machine (Debian: apt-get install tshark)")
+    export(log, tmp_path / "x.blf")
+    words = ["tshark", "-r", str(tmp_path / "x.blf"), "-d", "can.subdissector,canopen", "-T", "fields", "-e", "can.id",
+             "-e", "_ws.malformed"]
+    lines = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) == 6500 and {line.strip() for line in lines} == {"128", "386", "387", "514", "643"}
+
+
+def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
+    def at(cycle: int, drive: int | None, command: bool = True) -> list[str]:
+        t, out = 1_700_000_000 + cycle / 1000, []
+        number = (65534 + cycle).to_bytes(2, "little", signed=False).hex() if 65534 + cycle < 65536 else \
+            (cycle - 2).to_bytes(2, "little").hex()
+        if command:
+            out.append(f"({t:.6f}) can0 202#10270000" + "0700" + number)
+        out += [f"({t + 1e-4:.6f}) can0 080#", f"({t + 2e-4:.6f}) can0 183#2027000000010000"]
+        if drive is not None:
+            echo = ((65534 + drive) & 0xFFFF).to_bytes(2, "little").hex()
+            out.append(f"({t + 3e-4:.6f}) can0 182#E8030000" + "0F00" + echo)
+        return out
+
+    lines = [*at(0, 0), *at(1, 1), *at(2, None), *at(3, 2), *at(6, 6), "(1700000000.010000) can0 702#7F",
+             "(1700000000.011000) can0 083#5082010000000000", "(1700000000.012000) can0 202#1027"]
+    (tmp_path / "x.log").write_text("\n".join(lines) + "\n")
+    assert import_frames(tmp_path / "x.log", tmp_path / "x.mcap", dbc.DBC) == 5
+    trace = Trace.read(tmp_path / "x.mcap")
+    assert len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
+    np.testing.assert_allclose(trace.cor, [1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5])
+    np.testing.assert_allclose(trace.com, [1e-3, 1e-3, 1e-3, 1e-3, np.nan, np.nan, 1e-3])
+    assert [(n.node, n.name) for n in trace.nmt] == [(2, "pre-operational")]
+    assert [(e.kind, e.text[:14]) for e in trace.events] == [("emcy", "node 3: 0x8250"), ("frame", "0x202: 2 bytes")]
+
+
+def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
+    export(log, tmp_path / "x.csv.gz")
+    assert import_csv(tmp_path / "x.csv.gz", tmp_path / "y.mcap") == 1000
+    before, after = Trace.read(log), Trace.read(tmp_path / "y.mcap")
+    np.testing.assert_array_equal(before.xj, after.xj)
+    np.testing.assert_array_equal(before.t, after.t)
+
+
+def test_refusals(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"ends in \.csv"):
+        export(log, tmp_path / "x.xlsx")
+    (tmp_path / "x.csv").write_text("t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n")
+    with pytest.raises(InputError, match="raw frames"):
+        export(tmp_path / "x.csv", tmp_path / "x.blf")
+    import_csv(tmp_path / "x.csv", tmp_path / "x.mcap")
+    with pytest.raises(InputError, match="at least one raw frame"):
+        export(tmp_path / "x.mcap", tmp_path / "x.blf")
+    assert not (tmp_path / "x.blf").exists()
+    (tmp_path / "bad.log").write_text("hello\n")
+    with pytest.raises(InputError, match=r"CAN frames as \.log"):
+        import_frames(tmp_path / "bad.log", tmp_path / "y.mcap", dbc.DBC)
+    (tmp_path / "silent.log").write_text("(0.000000) can0 702#05\n")
+    with pytest.raises(InputError, match="SYNC"):
+        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", dbc.DBC)
+    (tmp_path / "bad.dbc").write_text("BO_ nonsense")
+    with pytest.raises(InputError, match="a DBC file"):
+        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", tmp_path / "bad.dbc")
+    (tmp_path / "other.dbc").write_text('VERSION ""\n')
+    with pytest.raises(InputError, match="frame 0x202"):
+        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", tmp_path / "other.dbc")
+
+
+def _run(command: object, capsys: pytest.CaptureFixture[str], *words: str,
+         out: Path | None = None) -> dict[str, object]:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)  # type: ignore[attr-defined]
+    args = parser.parse_args(words)
+    args.json, args.quiet, args.out = True, False, None if out is None else str(out)
+    assert command.run(args) == 0  # type: ignore[attr-defined]
+    answer: dict[str, object] = json.loads(capsys.readouterr().out)
+    return answer
+
+
+def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run(export_command, capsys, str(log), out=tmp_path / "x.csv")["count"] == 1000
+    assert _run(export_command, capsys, str(log), "--all", out=tmp_path / "x.csv")["count"] == 1300
+    assert _run(import_command, capsys, str(tmp_path / "x.csv")) == {"trace": str(tmp_path / "x.mcap"), "cycles": 1300}
+    (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-2000])
+    answer = _run(recover_command, capsys, str(tmp_path / "cut.mcap"))
+    assert answer["path"] == str(tmp_path / "cut.recovered.mcap") and not answer["complete"]

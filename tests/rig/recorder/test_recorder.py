@@ -1,0 +1,160 @@
+"""The log as others read it: the mcap library and Google's protobuf, not this project's own reader."""
+from __future__ import annotations
+
+import math
+import shutil
+import struct
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from synthetic_run import ATTACHMENTS, METADATA, cycles, record
+
+from rig.network.frame import Frame
+from rig.recorder import U32, CanFrame, Check, Event, NmtState, Recorder, RecorderError, Signals, Timing
+from rig.recorder.schema import TOPICS, packer, schema_bytes
+
+VALUES: dict[Any, st.SearchStrategy[Any]] = {
+    float: st.floats(), U32: st.integers(0, 2**32 - 1), bool: st.booleans(), str: st.text(max_size=300),
+    bytes: st.binary(max_size=8)}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
+
+
+@pytest.mark.parametrize("kind", TOPICS.values(), ids=lambda kind: kind.__name__)
+@given(data=st.data())
+def test_packed_record_is_what_protobuf_reads(kind: type, data: st.DataObject) -> None:
+    from mcap.records import Schema
+
+    hints = get_type_hints(kind, include_extras=True)
+    values = {f.name: data.draw(VALUES[hints[f.name]]) for f in fields(kind)}
+    t_ns = data.draw(st.integers(0, 2**63))
+    item = Frame(t_ns, values["cob_id"], values["data"]) if kind is CanFrame else kind(**values)
+    raw = packer(kind)(t_ns, item)
+    opcode, length, _, _, log_time, publish_time = struct.unpack_from("<BQHIQQ", raw)
+    assert (opcode, length, log_time, publish_time) == (5, len(raw) - 9, t_ns, t_ns)
+    decode = DecoderFactory().decoder_for("protobuf", Schema(1, schema_bytes(kind), "protobuf", f"eha.{kind.__name__}"))
+    assert decode is not None
+    message = decode(raw[31:])
+    for name, value in values.items():
+        assert getattr(message, name) == value or value != value
+
+
+def test_library_reads_a_complete_log(log: Path) -> None:
+    with log.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        rows = [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
+        names = {a.name: a.data for a in reader.iter_attachments()}
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert summary.statistics.message_count == len(rows)
+    assert {c.topic: c.metadata for c in summary.channels.values()}["/signals"]["unit.p12"] == "Pa"
+    assert names == {name: data for name, (_, data) in ATTACHMENTS.items()}
+    assert metadata == {"run": METADATA, "verdict": {"status": "ABORTED"}}
+    written = [(t, f, s) for t, f, s, _ in cycles() if s.cycle < 1000]
+    assert [(t, d.cycle, d.xj, d.p12) for topic, t, d in rows if topic == "/signals"] == \
+        [(t, s.cycle, s.xj, s.p12) for t, _, s in written]
+    assert [(t, d.cob_id, d.data) for topic, t, d in rows if topic == "/can"] == \
+        [tuple(f) for _, fs, _ in written for f in fs]
+    assert sum(topic == "/timing" for topic, _, _ in rows) == 1000
+
+
+def test_chunks_are_closed_in_time(log: Path) -> None:
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) >= 4
+    for chunk in summary.chunk_indexes:
+        assert chunk.message_end_time - chunk.message_start_time <= 250_000_000
+        assert chunk.uncompressed_size < 70_000
+
+
+def test_attachments_and_metadata_come_before_the_first_chunk(log: Path) -> None:
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    first = min(c.chunk_start_offset for c in summary.chunk_indexes)
+    assert all(a.offset < first for a in summary.attachment_indexes)
+    assert min(m.offset for m in summary.metadata_indexes) < first
+
+
+def test_cost_of_a_cycle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Processor time of both threads for 6 frames, signals and timing, told; and what they take on the disk."""
+    run = [(k * 1_000_000, [Frame(k * 1_000_000, 0x183, k.to_bytes(8, "little"))] * 6,
+            Signals(k, 1, k * 1e-7, 1.1e-3, 4e-3, 1e6, k * 1e-9, 0.0, 7, 15, 0), Timing(k, False, 1e-5, 2e-4, 3e-4))
+           for k in range(5000)]
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {})
+    start = time.process_time()
+    for t_ns, frames, signals, timing in run:
+        for frame in frames:
+            recorder.frame(frame)
+        recorder.cycle(t_ns, signals, timing)
+    recorder.close()
+    cost = (time.process_time() - start) / 5000
+    with capsys.disabled():
+        size = (tmp_path / "trace.mcap").stat().st_size
+        print(f"\nlog: {cost * 1e6:.0f} us a cycle of 8 messages, {size / 40_000:.0f} bytes a message")
+    assert size / 40_000 < 40.0
+
+
+def _until_it_fails(recorder: Recorder) -> RecorderError:
+    with pytest.raises(RecorderError) as caught:
+        for k in range(500):
+            recorder.put(k * 1_000_000, Event("INFO", "test", "x" * 1000))
+            time.sleep(0.01)
+    recorder.put(0, Event("INFO", "test", "told once: from here on the loop is left alone"))
+    recorder.close()
+    return caught.value
+
+
+def test_folder_gone_is_told_once(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run" / "trace.mcap", {}, {})
+    shutil.rmtree(tmp_path / "run")
+    assert "deleted" in str(_until_it_fails(recorder))
+
+
+def test_full_disk_is_told_once() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full on this system")
+    with pytest.raises(RecorderError, match="No space left"):
+        Recorder(full, {}, {})
+
+
+def test_full_disk_in_mid_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {})
+
+    def write(data: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(recorder._file, "_write", write)
+    error = _until_it_fails(recorder)
+    assert str(error) == f"{tmp_path / 'trace.mcap'}: the log cannot be written: No space left on device"
+
+
+def test_close_tells_what_the_loop_did_not_hear(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "trace.mcap", {}, {})
+    recorder.put(0, NmtState(2, "not a number", "x"))  # type: ignore[arg-type]
+    with pytest.raises(RecorderError, match="the log stops here"):
+        recorder.close()
+    recorder.close()
+
+
+def test_path_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecorderError, match="cannot be written"):
+        Recorder(tmp_path / "file" / "trace.mcap", {}, {})
+
+
+def test_defaults_of_a_check_are_no_limits() -> None:
+    check = Check(name="a", signal="xj", value=1.0, unit="m", passed=True)
+    assert math.isnan(check.low) and math.isnan(check.high) and math.isnan(check.t0)

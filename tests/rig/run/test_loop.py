@@ -1,0 +1,253 @@
+"""The cycle against a clock and a bus that do as the script says: due times, overruns, lateness, late frames."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isnan
+
+import pytest
+
+from rig.network import codec
+from rig.network.clock import VirtualClock, WallClock
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.network.master import Master
+from rig.network.wire import EmbeddedWire, LinkWire
+from rig.recorder import Signals, Timing
+from rig.run.loop import Loop, Step
+from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
+
+MS = 1_000_000  # ns
+
+
+class Bench:
+    """A wire that answers each SYNC as a bench does, after a delay; time is what the script makes of it."""
+
+    def __init__(self, answer_ns: int = 0) -> None:
+        self.clock = VirtualClock()
+        self.receive: Callable[[Frame], None] = lambda frame: None
+        self.sent: list[tuple[float, int, bytes]] = []  # ms
+        self.stalls: dict[int, int] = {}  # SYNC number: ns that the machine stands still after it
+        self.answers: list[Frame] = []
+        self.mute = False
+        self._syncs, self._cycle, self._answer_ns = 0, 0, answer_ns
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        now = self.clock.now()
+        self.sent.append((now / MS, cob_id, data))
+        if cob_id == codec.COMMAND:
+            self._cycle = codec.unpack_command(data).cycle
+        if cob_id == codec.SYNC:
+            if not self.mute:
+                due = now + self._answer_ns
+                self.answers += [Frame(due, codec.FEEDBACK, codec.pack_feedback(1e-3, 1e5)),
+                                 Frame(due, codec.VALVE_STATE, codec.pack_valve_state(1e-6, 0, self._syncs)),
+                                 Frame(due, codec.DRIVE, codec.pack_drive(2e-3, 15, self._syncs))]
+            self.clock.sleep_until(now + self.stalls.get(self._syncs, 0))
+            self._syncs += 1
+
+    def wait(self, done: Callable[[], bool], seconds: float) -> bool:
+        return done()
+
+    def settle(self, t_ns: int, done: Callable[[], bool]) -> None:
+        self.run_until(t_ns)
+
+    def run_until(self, t_ns: int) -> None:
+        due = [frame for frame in self.answers if frame.t_ns <= max(t_ns, self.clock.now())]
+        for frame in due:
+            self.answers.remove(frame)
+            self.clock.sleep_until(frame.t_ns)
+            self.receive(frame)
+        self.clock.sleep_until(t_ns)
+
+    def close(self) -> None: ...
+
+    def syncs(self) -> list[float]:
+        return [t for t, cob_id, _ in self.sent if cob_id == codec.SYNC]
+
+
+class Book:
+    """A log that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.rows: list[Signals] = []
+        self.timings: list[Timing] = []
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        self.times.append(t_ns)
+        self.rows.append(signals)
+        self.timings.append(timing)
+
+
+def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[Loop, Book]:
+    book = Book()
+    schedule = Schedule(Plan(faults=faults, stop=1000))
+    return Loop(Master(bench, bench.clock.now), schedule, book, MS, realtime), book
+
+
+def run(one: Loop, cycles: int) -> None:
+    for k in range(cycles):
+        one.cycle(Step(1, 1e-4 * k, 0.0, 7))
+    one.finish()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_row_holds_what_belongs_together(realtime: bool) -> None:
+    bench = Bench()
+    one, book = loop(bench, realtime=realtime)
+    run(one, 4)
+    assert [row.cycle for row in book.rows] == [0, 1, 2, 3]
+    assert [row.com for row in book.rows] == [0.0, 1e-4, 2e-4, 3e-4]
+    assert {(row.xj, row.p12, row.xs, row.cor, row.status) for row in book.rows} == {(1e-3, 1e5, 1e-6, 2e-3, 15)}
+    assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
+
+
+def test_command_before_sync_every_cycle() -> None:
+    bench = Bench()
+    run(loop(bench)[0], 3)
+    assert [cob_id for _, cob_id, _ in bench.sent] == [codec.COMMAND, codec.SYNC] * 3
+
+
+def test_due_times_are_a_fixed_grid() -> None:
+    """Being late by less than a period does not shift what follows."""
+    bench = Bench()
+    bench.stalls = {2: 1_700_000, 5: 1_200_000}
+    one, book = loop(bench)
+    run(one, 8)
+    assert bench.syncs() == pytest.approx([1, 2, 3, 4.7, 5, 6, 7.2, 8])
+    assert [round(t.lateness * 1e6) for t in book.timings] == [0, 0, 0, 700, 0, 0, 200, 0]
+    assert one.overruns == 1 and [t.overrun for t in book.timings] == [k == 3 for k in range(8)]  # above half a cycle
+
+
+def test_overruns_are_dropped_and_counted_not_piled_up() -> None:
+    bench = Bench()
+    bench.stalls = {1: 5_300_000}
+    one, book = loop(bench)
+    run(one, 5)
+    assert bench.syncs() == pytest.approx([1, 2, 7.3, 8, 9])  # back on the grid, no burst
+    assert one.overruns == 4 and [t.overrun for t in book.timings] == [False, False, True, False, False]
+    assert [row.cycle for row in book.rows] == [0, 1, 2, 3, 4]
+
+
+def test_in_lockstep_nothing_is_late() -> None:
+    bench = Bench()
+    bench.stalls = {1: 5_300_000}
+    one, book = loop(bench, realtime=False)
+    run(one, 4)
+    assert one.overruns == 0 and {t.lateness for t in book.timings} == {0.0}
+    assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
+
+
+def test_what_does_not_come_is_missing() -> None:
+    bench = Bench()
+    one, book = loop(bench)
+    bench.mute = True
+    run(one, 2)
+    for row, timing in zip(book.rows, book.timings, strict=True):
+        assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
+
+
+def test_an_answer_after_the_next_sync_is_not_that_cycles() -> None:
+    """Valve state and drive carry the cycle they belong to. (Feedback does not: the bus page says what follows.)"""
+    bench = Bench(answer_ns=1_500_000)
+    one, book = loop(bench)
+    run(one, 4)
+    assert all(isnan(row.cor) and isnan(row.xs) for row in book.rows)
+
+
+def test_of_two_drives_the_last_counts_as_in_the_plant() -> None:
+    bench = Bench()
+    one, book = loop(bench)
+    one.cycle(Step(1, 0.0, 0.0, 7))
+    bench.answers.append(Frame(bench.clock.now(), codec.DRIVE, codec.pack_drive(4e-3, 15, 0)))
+    one.finish()
+    assert book.rows[0].cor == 4e-3
+
+
+@pytest.mark.parametrize("cob_id", [codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE])
+def test_frames_of_another_length_are_nothing(cob_id: int) -> None:
+    bench = Bench()
+    one, book = loop(bench)
+    bench.mute = True
+    one.cycle(Step(1, 0.0, 0.0, 7))
+    for length in (0, 1, 4, 7):
+        bench.receive(Frame(0, cob_id, bytes(length)))
+    one.finish()
+    assert isnan(book.rows[0].xj) and isnan(book.rows[0].cor) and isnan(book.rows[0].xs)
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_commands_lost_and_late(realtime: bool) -> None:
+    """One of a cycle's commands comes after its SYNC; the rest of the bench does not notice."""
+    bench = Bench()
+    one, _ = loop(bench, Lost(frame="command", start=0.001, end=0.002),
+                  Late(frame="command", start=0.003, end=0.004, delay=0.4e-3), realtime=realtime)
+    run(one, 6)
+    commands = [(t, codec.unpack_command(data).cycle) for t, cob_id, data in bench.sent if cob_id == codec.COMMAND]
+    assert [cycle for _, cycle in commands] == [0, 2, 3, 4, 5]
+    order = [cob_id for _, cob_id, _ in bench.sent]
+    late = next(i for i, (_, cob, data) in enumerate(bench.sent) if cob == codec.COMMAND and data[6] == 3)
+    assert order[late - 1:late + 2] == [codec.SYNC, codec.COMMAND, codec.COMMAND]
+    if realtime:
+        assert commands[2][0] == pytest.approx(4.4)
+        assert bench.syncs() == pytest.approx([1, 2, 3, 4, 5, 6])
+
+
+def test_the_rigs_heartbeat_can_be_dropped() -> None:
+    bench = Bench()
+    one, _ = loop(bench, Silent(node="rig", start=0.0, end=0.5))
+    one._master._beat.configure(100, 0)
+    run(one, 800)
+    beats = [round(t) for t, cob_id, _ in bench.sent if cob_id == 0x701]
+    assert beats == [600, 700, 800]
+
+
+class Slow(Link):
+    """A link on which nothing comes; each poll costs the time-out it was given."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.asked: list[float] = []
+        self._time = clock
+
+    def send(self, cob_id: int, data: bytes) -> None: ...
+
+    def poll(self, timeout: float = 0.0) -> list[Frame]:
+        self.asked.append(timeout)
+        self._time.sleep_until(self._time.now() + round(timeout * 1e9) + 1)
+        return []
+
+
+def test_a_node_that_is_gone_does_not_hold_up_lockstep_for_long() -> None:
+    clock = VirtualClock()
+    wire = LinkWire(Slow(clock), clock)  # type: ignore[arg-type]  # any clock will do
+    for _ in range(500):
+        wire.settle(0, lambda: False)
+    assert clock.now() < 15e9
+    wire.settle(0, lambda: True)  # it is back: patience too
+    before = clock.now()
+    wire.settle(0, lambda: False)
+    assert clock.now() - before == pytest.approx(0.2e9, rel=0.01)
+
+
+def test_clocks() -> None:
+    virtual, wall = VirtualClock(), WallClock()
+    virtual.sleep_until(5)
+    virtual.sleep_until(3)
+    assert virtual.now() == 5
+    wall.sleep_until(-5)
+    wall.sleep_until(2 * MS)
+    assert wall.now() >= 2 * MS
+
+
+def test_the_embedded_wire_waits_in_its_own_time() -> None:
+    wire = EmbeddedWire(VirtualClock(), [])
+    assert not wire.wait(lambda: False, 0.25) and wire.clock.now() == 250 * MS
+    assert wire.wait(lambda: wire.clock.now() >= 300 * MS, 1.0) and wire.clock.now() == 300 * MS
+
+
+def test_response_and_work_are_measured_from_sync_to_reception() -> None:
+    bench = Bench(answer_ns=300_000)
+    one, book = loop(bench)
+    run(one, 4)
+    assert [t.response for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
+    assert [t.work for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)

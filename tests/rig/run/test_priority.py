@@ -1,0 +1,58 @@
+"""Real-time rights: taken where they are granted, given back, and taken for all threads of the process."""
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import threading
+
+import pytest
+
+from rig.run.priority import PRIORITY, SWITCH, elevated, scheduler, undisturbed
+
+
+def allowed() -> bool:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+@pytest.mark.skipif(not allowed(), reason="SCHED_FIFO is not allowed here; as root, or with an rtprio limit, it is")
+def test_all_threads_are_raised_and_lowered() -> None:
+    done = threading.Event()
+    helper = threading.Thread(target=done.wait)
+    helper.start()
+    other = helper.native_id or 0
+    try:
+        with elevated():
+            assert scheduler() == "SCHED_FIFO" and os.sched_getparam(0).sched_priority == PRIORITY
+            assert os.sched_getscheduler(other) == os.SCHED_FIFO and os.sched_getparam(other).sched_priority == 1
+        assert scheduler() == "SCHED_OTHER" and os.sched_getscheduler(other) == os.SCHED_OTHER
+    finally:
+        done.set()
+        helper.join()
+
+
+def test_without_the_right_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with elevated():
+        assert scheduler() == "SCHED_OTHER"
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_collection_comes_back_as_it_was(collecting: bool) -> None:
+    if not collecting:
+        gc.disable()
+    try:
+        before = sys.getswitchinterval()
+        with undisturbed():
+            assert not gc.isenabled() and sys.getswitchinterval() == pytest.approx(SWITCH)
+        assert gc.isenabled() == collecting and sys.getswitchinterval() == before
+    finally:
+        gc.enable()

@@ -1,0 +1,237 @@
+"""The sequencer: phases in order, clean-up always, no current in the safe state, and what is told on the way."""
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from short_sequences import SHORT, job, kinds, play, silent, stop_after
+
+from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
+from plant import Actuator, InputError, RigError
+from rig.network.clock import VirtualClock
+from rig.network.frame import Frame
+from rig.network.wire import EmbeddedWire
+from rig.nodes.emulator import Emulator
+from rig.nodes.firmware import Firmware
+from rig.recorder import RecorderError
+from rig.run import runner
+from rig.run.session import Session
+from rig.sequences.sequence import parse_sequence
+
+SAFE = SHORT + 'ends = "safe_state"\n'
+
+
+def with_faults(text: str, *faults: str) -> str:
+    return f"faults = [{', '.join('{ ' + fault + ' }' for fault in faults)}]\n" + text
+
+
+THREE_LOST = 'name = "cut", kind = "lost", frame = "drive", start = 0.2, count = 3'
+
+
+def phases(folder: Path) -> list[int]:
+    """Number of cycles of set-up, main and clean-up in the log."""
+    trace = Trace.read(folder, all=True)
+    return [int((trace.phase == phase).sum()) for phase in (SETUP, MAIN, CLEANUP)]
+
+
+def test_three_phases_in_order(tmp_path: Path) -> None:
+    outcome = play(job(), tmp_path)
+    assert outcome.verdict == "PASS" and not outcome.safe and phases(tmp_path) == [50, 350, 50]
+    assert [text for kind, text in kinds(outcome) if kind in ("phase", "section")] == [
+        "bring-up", "setup", "setup: hold_1", "main", "main: rest", "main: step", "main: back", "cleanup",
+        "cleanup: ramp_1", "end"]
+    times = {text: event.t for event in outcome.events for text in [event.text]}
+    assert (times["main"], times["main: step"], times["cleanup"]) == pytest.approx((0.0, 0.05, 0.35))
+    assert outcome.counters == dict.fromkeys(outcome.counters, 0)
+
+
+def test_the_drive_is_enabled_step_by_step(tmp_path: Path) -> None:
+    outcome = play(job(), tmp_path)
+    session_rows = outcome.timing["cycles"]
+    assert session_rows == 450
+    words = control_words(tmp_path)
+    assert words[:4] == [1, 3, 7, 7] and set(words[2:]) == {7}
+
+
+def control_words(folder: Path) -> list[int]:
+    from fdi.trace.mcap_log import open_log
+
+    return [message.control for _, _, message in open_log(folder / "trace.mcap").messages("/signals")]
+
+
+def test_without_set_up_and_clean_up_and_a_main_of_one_cycle(tmp_path: Path) -> None:
+    one = job('title = "shortest"\nmain = [{ kind = "hold", time = 0.001 }]')
+    assert play(one, tmp_path).verdict == "PASS"
+    assert phases(tmp_path) == [0, 1, 0]
+
+
+def test_a_guard_ends_main_and_clean_up_runs(tmp_path: Path) -> None:
+    text = SHORT + 'guards = [{ name = "too far", signal = "xj", high = 0.5, unit = "mm" }]'
+    outcome = play(job(text), tmp_path)
+    assert (outcome.verdict, outcome.status) == ("ABORTED", 1) and outcome.aborted == "guard 'too far' was passed by xj"
+    setup, main, cleanup = phases(tmp_path)
+    assert (setup, cleanup) == (50, 50) and 50 < main < 100
+    trace = Trace.read(tmp_path, all=True)
+    assert trace.com[trace.phase == CLEANUP][0] == trace.com[trace.phase == MAIN][-1]  # from where it was
+
+
+@pytest.mark.parametrize("cycle", [0, 20, 100, 399])
+def test_the_operator_ends_it(tmp_path: Path, cycle: int) -> None:
+    outcome = play(job(), tmp_path, stop_after(cycle))
+    assert (outcome.verdict, outcome.status, outcome.interrupted) == ("ABORTED", 130, True)
+    setup, main, cleanup = phases(tmp_path)
+    assert setup + main == cycle + 1 and cleanup == 50
+    assert ("operator", "stopped by the operator") in kinds(outcome)
+
+
+def test_trouble_is_the_safe_state_and_ends_main(tmp_path: Path) -> None:
+    """Three drive frames lost: EMCY of the plant, no current, clean-up with current again once all is well."""
+    outcome = play(job(with_faults(SHORT, THREE_LOST)), tmp_path)
+    assert outcome.verdict == "ABORTED" and outcome.safe and "node 3 plant 0x8250" in outcome.aborted
+    setup, main, cleanup = phases(tmp_path)
+    assert (setup, cleanup) == (50, 50) and 200 < main < 210
+    assert not {check.name: check.passed for check in outcome.checks}["no emergency"]
+    assert outcome.counters["plant_drive_missing"] == 3
+
+
+def test_a_sequence_may_be_about_trouble(tmp_path: Path) -> None:
+    outcome = play(job(with_faults(SAFE.replace('{ name = "no emergency", kind = "event_never", event = "EMCY" }',
+                                                '{ name = "told", kind = "response_within", after = "cut", '
+                                                'event = "EMCY 0x8250", high = 5.0, unit = "ms" }'), THREE_LOST)),
+                   tmp_path)
+    assert outcome.verdict == "PASS" and outcome.safe and phases(tmp_path) == [50, 350, 50]
+    words = control_words(tmp_path)
+    zero = words.index(0)
+    assert set(words[zero:400]) == {0} and words[400] == 8 and set(words[401:]) == {7}  # reset, then current again
+    trace = Trace.read(tmp_path)
+    assert np.all(trace.cor[zero - 50 + 1:] == 0)
+
+
+def test_a_meant_end_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
+    outcome = play(job(SAFE), tmp_path)
+    assert (outcome.verdict, outcome.status) == ("FAIL", 1)
+    assert outcome.failures == ["the run was to end in the safe state"]
+
+
+@pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", "node 3 plant is silent")])
+def test_a_heartbeat_that_stops(tmp_path: Path, node: str, says: str) -> None:
+    text = SHORT.replace("time = 0.2 }", "time = 1.2 }")
+    outcome = play(job(with_faults(text, f'kind = "heartbeat", node = "{node}", start = 0.1')), tmp_path)
+    assert outcome.verdict == "ABORTED" and says in outcome.aborted and phases(tmp_path)[2] == 50
+    assert ("fault", f"heartbeat {node} begins") in kinds(outcome)
+
+
+def test_a_plant_without_numbers_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The model diverges: no exception, no made-up number; EMCY, clean-up without current."""
+    sample = Actuator.sample
+
+    def diverge(self: Actuator) -> tuple[float, float, float]:
+        xj, p12, xs = sample(self)
+        return (float("nan") if self.cycle > 200 else xj), p12, xs
+
+    monkeypatch.setattr(Actuator, "sample", diverge)
+    outcome = play(job(), tmp_path)
+    assert outcome.verdict == "ABORTED" and "node 3 plant 0x6000" in outcome.aborted
+    assert phases(tmp_path)[2] == 50 and set(control_words(tmp_path)[-50:]) == {0}
+
+
+class Intruder:
+    """A stranger on the bus who at some time sends something."""
+
+    def __init__(self, at_ms: int, *frames: tuple[int, bytes]) -> None:
+        self.at_ns, self.frames = at_ms * 1_000_000, list(frames)
+
+    def receive(self, frame: Frame) -> None: ...
+
+    def tick(self, t_ns: int) -> None:
+        if t_ns >= self.at_ns:
+            for cob_id, data in self.frames:
+                self.send(cob_id, data)
+            self.frames = []
+
+
+def play_with(intruder: Intruder, tmp_path: Path) -> Session:
+    def join(send: object) -> Intruder:
+        intruder.send = send  # type: ignore[attr-defined]
+        return intruder
+
+    wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, join])  # type: ignore[list-item]
+    with runner.log(job(), tmp_path) as recorder:
+        session = Session(job(), wire, recorder, silent, lambda: False)
+        session.bring_up()
+        session.play()
+    return session
+
+
+@pytest.mark.parametrize(("frames", "why"), [
+    ([(0x080, b"")], "somebody else sends 0x080"),
+    ([(0x202, bytes(8))], "somebody else sends 0x202"),
+    ([(0x000, b"\x80\x02")], "somebody else sends 0x000"),
+    ([(0x702, b"\0")], "node 2 controller left OPERATIONAL: boot-up"),
+    ([(0x703, b"\x7f")], "node 3 plant left OPERATIONAL: pre-operational"),
+    ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330"),
+])
+def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
+    session = play_with(Intruder(250, *frames), tmp_path)
+    assert session.aborted.startswith(why) and phases(tmp_path)[2] == 50
+
+
+def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
+    """Foreign nodes, short frames, unknown identifiers: logged as frames, else ignored."""
+    noise = [(cob_id, bytes(length)) for cob_id in (0x084, 0x184, 0x284, 0x584, 0x604, 0x704, 0x7E5, 0x082, 0x083,
+                                                    0x583, 0x603) for length in (0, 3)]
+    session = play_with(Intruder(250, *noise), tmp_path)
+    assert session.aborted == "" and phases(tmp_path) == [50, 350, 50]
+
+
+@pytest.mark.parametrize("error", [RigError("the bus is gone"), RuntimeError("a bug"), KeyboardInterrupt()])
+def test_whatever_is_raised_clean_up_runs_and_the_log_is_whole(tmp_path: Path, error: BaseException) -> None:
+    calls = iter(range(10**6))
+
+    def stop() -> bool:
+        if next(calls) == 200:
+            raise error
+        return False
+
+    threads = threading.active_count()
+    with pytest.raises(type(error)):
+        play(job(), tmp_path, stop)
+    assert phases(tmp_path) == [50, 151, 50]
+    assert Trace.read(tmp_path, all=True).events[-1].text == "end"
+    assert threading.active_count() == threads and not (tmp_path / "verdict.json").exists()
+
+
+def test_a_log_that_cannot_be_written_is_told_after_clean_up(tmp_path: Path) -> None:
+    """The disk goes away in mid run."""
+    calls = iter(range(10**6))
+
+    def stop() -> bool:
+        if next(calls) == 150:
+            (tmp_path / "trace.mcap").unlink()
+        return False
+
+    with pytest.raises(RecorderError, match="deleted"):
+        play(job(SHORT.replace("time = 0.2 }", "time = 2.0 }")), tmp_path, stop)
+
+
+def test_a_law_that_cannot_be_compiled_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def warm(self: Actuator) -> None:
+        raise InputError("effects", "mine", "laws that can be compiled and run (KeyError)")
+
+    monkeypatch.setattr(Actuator, "warm", warm)
+    with pytest.raises(InputError, match="mine: expected laws"):
+        play(job(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
+    """White noise does not compress: said before a word is sent, and not as "out of memory"."""
+    rows = "\n".join(f"{k / 1000:.3f},{value:.3f}" for k, value in enumerate(np.random.default_rng(0).uniform(
+        -1e6, 1e6, 250_000)))
+    text = 'title = "x"\nmain = [{ kind = "hold", time = 250 }]\nload = [{ kind = "csv", file = "x.csv" }]'
+    sequence = parse_sequence(text, "x.toml", lambda name: f"t,value\n{rows}\n".encode())
+    with pytest.raises(InputError, match="KiB compressed"):
+        play(replace(job(), sequence=sequence), tmp_path)

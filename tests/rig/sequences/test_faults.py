@@ -1,0 +1,170 @@
+"""The fault schedule: what is wrong in which cycle, the same for the same seed, and cheap to ask."""
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from plant import load_model
+from plant.errors import InputError
+from rig.nodes.scenario import Scenario
+from rig.sequences import faults
+from rig.sequences.faults import Delay, Drop, Fault, Late, Lost, Noise, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.sequence import Sequence, parse_sequence
+
+MAIN = 'title = "T"\nmain = [{ kind = "hold", time = 1.0 }]\n'
+BASE = {"filter.clogging": 0.0, "spool.static_friction": 5.0}
+
+
+def schedule(*faults: Fault, start: int = 0, stop: int = 10_000, seed: int = 0) -> Schedule:
+    return Schedule(Plan(faults=faults, start=start, stop=stop, seed=seed), BASE)
+
+
+def parse(text: str) -> Sequence:
+    return parse_sequence(text, "mine.toml", lambda name: b"")
+
+
+def test_without_faults_everything_is_as_it_was() -> None:
+    s = schedule()
+    assert s.parameters_at(5) == {} and s.signal("xj", 1.5, 5) == 1.5 and s.frame("drive", 5) is None
+    assert s.heartbeat_alive("plant", 5) and s.edges == ()
+
+
+def test_a_parameter_ramps_from_its_base_and_returns() -> None:
+    s = schedule(Parameter(parameter="spool.static_friction", value=45.0, start=1.0, end=2.0, ramp=0.1), start=500)
+    seen = {k: s.parameters_at(k) for k in range(4000)}
+    changes = {k: v["spool.static_friction"] for k, v in seen.items() if v}
+    assert list(changes) == [*range(1501, 1601), 2500]  # said only when it changes
+    assert changes[1501] == pytest.approx(5.4) and changes[1600] == 45.0 and changes[2500] == 5.0
+
+
+def test_skipped_cycles_lose_no_change() -> None:
+    s = schedule(Parameter(parameter="filter.clogging", value=0.5, start=1.0))
+    assert s.parameters_at(1003) == {}
+    assert s.parameters_at(1003, since=998) == {"filter.clogging": 0.5}
+    assert schedule(Parameter(parameter="filter.clogging", value=0.5, start=0.0)).parameters_at(0) == {
+        "filter.clogging": 0.5}
+
+
+def test_faults_end_when_main_ends() -> None:
+    clogged = Parameter(parameter="filter.clogging", value=0.5, start=1.0)
+    s = schedule(clogged, Lost(frame="drive", start=1.0), stop=2000)
+    assert s.parameters_at(2000) == {"filter.clogging": 0.0}
+    assert s.frame("drive", 1999) == Drop() and s.frame("drive", 2000) is None
+    assert s.edges[:2] == ((1000, "parameter filter.clogging", True), (2000, "parameter filter.clogging", False))
+
+
+def test_sensor_faults() -> None:
+    stuck = schedule(Stuck(signal="xj", start=0.003, end=0.006))
+    assert [stuck.signal("xj", float(k), k) for k in range(8)] == [0, 1, 2, 2, 2, 2, 6, 7]
+    at_value = schedule(Stuck(signal="p12", value=7.0, start=0.0, end=0.001))
+    assert [at_value.signal("p12", 1.0, k) for k in range(2)] == [7.0, 1.0]
+    offset = schedule(Offset(signal="xs", value=4.0, start=0.0, end=0.006, ramp=0.004))
+    assert [offset.signal("xs", 1.0, k) for k in range(7)] == [1, 2, 3, 4, 5, 5, 1]
+    assert offset.signal("xj", 1.0, 5) == 1.0
+    both = schedule(Offset(signal="xj", value=1.0, start=0.0), Stuck(signal="xj", value=9.0, start=0.0))
+    assert both.signal("xj", 0.0, 5) == 9.0  # in the order of the plan
+
+
+def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
+    fault = Noise(signal="xj", value=3e-6, start=0.0)
+    one, same, other = schedule(fault, seed=1), schedule(fault, seed=1), schedule(fault, seed=2)
+    values = [one.signal("xj", 0.0, k) for k in range(10_000)]
+    assert np.std(values) == pytest.approx(3e-6, rel=0.03) and abs(np.mean(values)) < 1e-7
+    assert values[77] == same.signal("xj", 0.0, 77) != other.signal("xj", 0.0, 77)
+
+
+def test_frames_are_lost_by_count_period_and_chance() -> None:
+    three = schedule(Lost(frame="drive", start=0.01, count=3))
+    assert [k for k in range(30) if three.frame("drive", k) is not None] == [10, 11, 12]
+    assert three.edges == ((10, "lost drive", True), (13, "lost drive", False))
+    periodic = schedule(Lost(frame="feedback", start=0.0, end=0.1, every=20, count=4))
+    assert [k for k in range(200) if periodic.frame("feedback", k) == Drop()] == [0, 20, 40, 60]
+    chance = schedule(Lost(frame="command", start=0.0, probability=0.2), seed=3)
+    hits = [k for k in range(10_000) if chance.frame("command", k) is not None]
+    assert len(hits) == pytest.approx(2000, abs=150)
+    again = schedule(Lost(frame="command", start=0.0, probability=0.2), seed=3)
+    assert hits == [k for k in range(10_000) if again.frame("command", k) is not None]
+    assert three.frame("feedback", 10) is None
+
+
+def test_late_frames_say_how_late() -> None:
+    assert schedule(Late(frame="valve_state", start=0.0, delay=400e-6)).frame("valve_state", 0) == Delay(400_000)
+
+
+def test_a_silent_node_comes_back() -> None:
+    s = schedule(Silent(node="plant", start=0.5, end=1.0))
+    assert [s.heartbeat_alive("plant", k) for k in (499, 500, 999, 1000)] == [True, False, False, True]
+    assert s.heartbeat_alive("rig", 700)
+
+
+ONE_OF_EACH: tuple[Fault, ...] = (
+    Parameter(parameter="filter.clogging", value=0.3, start=1.0, ramp=0.5), Offset(signal="p12", value=1e5, start=0.1),
+    Noise(signal="xs", value=1e-6, start=0.2, end=0.4), Stuck(signal="xj", start=0.3),
+    Lost(frame="drive", start=1.0, count=3), Late(frame="feedback", start=1.0, delay=1e-3),
+    Silent(node="rig", start=2.0, name="rig dies"),
+)
+
+
+def test_a_plan_survives_json() -> None:
+    assert {fault.kind for fault in ONE_OF_EACH} == set(faults.KINDS)
+    plan = Plan(faults=ONE_OF_EACH, start=500, stop=9000, seed=7)
+    assert Plan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
+
+
+@pytest.mark.parametrize(("data", "message"), [
+    ([], "scenario: expected a table"),
+    ({"stop": 1, "faults": [{"kind": "lots", "frame": "drive", "start": 0}]}, "did you mean 'lost'"),
+    ({"stop": 1, "faults": [{"kind": "lost", "frame": "drvie", "start": 0}]}, "did you mean 'drive'"),
+    ({"stop": 1.5}, r"scenario: stop: expected a whole number, not 1.5"),
+])
+def test_a_bad_scenario_is_refused(data: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Plan.from_json(data)
+
+
+def test_a_parameter_the_model_lacks_is_refused() -> None:
+    with pytest.raises(InputError, match=r"did you mean 'filter.clogging'"):
+        schedule(Parameter(parameter="filter.cloging", value=0.3, start=1.0))
+
+
+def test_words_stand_for_their_numbers_and_what_fits_together_is_taken() -> None:
+    s = parse(MAIN + """faults = [
+      { kind = "parameter", parameter = "filter.law", value = "linear", start = 0.1 },
+      { kind = "parameter", parameter = "spool.static_friction", value = 70, start = 0.2, ramp = 0.3 },
+      { kind = "parameter", parameter = "spool.dynamic_friction", value = 30, start = 0.2, ramp = 0.3 },
+      { kind = "parameter", parameter = "null_bias.current", value = 1e-4, start = 0.2 },
+    ]
+    [model]
+    overrides = { filter.law = "pressure" }
+    """)
+    assert s.model.overrides == {"filter.law": "pressure"}
+    model = load_model("eha").replace(s.model.overrides)
+    asked = Schedule(s.plan(0), {**model.values, "null_bias.current": 0.0})
+    at = [asked.parameters(k) for k in (0, 100, 999, 1000)]
+    assert [values["filter.law"] for values in at] == [0.0, 1.0, 1.0, 0.0]
+    assert [values["spool.static_friction"] for values in at] == [5.0, 5.0, 70.0, 5.0]
+
+
+def test_a_fault_that_contradicts_the_model_of_the_run_is_refused_before_it() -> None:
+    """The sequence is sound on the actuator it names; --set has made another of it."""
+    s = parse(MAIN + 'faults = [{ kind = "parameter", parameter = "jack.static_friction", value = 600, start = 0 }]')
+    other = load_model("eha").replace({"jack.dynamic_friction": 700.0})
+    Scenario.of(load_model("eha"), s.plan(0), s.load_profile(), 0)
+    with pytest.raises(InputError, match=r"parameter jack.static_friction: expected jack.dynamic_friction at most "):
+        Scenario.of(other, s.plan(0), s.load_profile(), 0)
+
+
+def test_it_is_cheap_enough_to_ask_in_every_cycle() -> None:
+    s = schedule(*ONE_OF_EACH)
+    begin = time.perf_counter()
+    for k in range(2000):
+        s.parameters_at(k)
+        for signal in ("xj", "p12", "xs"):
+            s.signal(signal, 0.0, k)
+        for frame in ("feedback", "valve_state", "drive", "command"):
+            s.frame(frame, k)
+        s.heartbeat_alive("plant", k)
+    assert (time.perf_counter() - begin) / 2000 < 100e-6  # some 5 us on an idle machine; a cycle is 1000 us

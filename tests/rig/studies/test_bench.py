@@ -1,0 +1,96 @@
+"""The benchmarks run, say what they measured, and say what they could not."""
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from physics_cases import PREFLIGHT
+
+from rig.cli import main
+from rig.studies.benchmarks import many_runs, peers, peers_grid, plant_step
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {peers.GET_GCC}")
+
+
+@needs_gcc
+def test_c_and_python_take_the_same_step() -> None:
+    cost = plant_step.step_vs_c(PREFLIGHT, rounds=3)
+    assert cost is not None
+    assert cost.identical
+    assert cost.difference < 1e-9  # m, with another rounding: no more than stick-slip makes of it
+    assert cost.ratio < 2.0  # 1.15 on a quiet machine; here only that nothing is grossly wrong
+
+
+def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(peers.shutil, "which", lambda name: None)
+    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(plant_step, "cycle_cost", lambda: 4e-6)
+    monkeypatch.setattr(plant_step, "lockstep", lambda: 10.0)
+    assert main.main(["bench"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in words
+    assert "C, one run after the other: skipped, there is no gcc" in words
+    assert "C, OpenMP: skipped, there is no gcc" in words
+    assert "jax, vmap: skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
+    assert "ProgPy, vectorised: skipped, progpy is not installed" in words
+
+
+def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    monkeypatch.setattr(plant_step, "step_vs_c", lambda command: None)
+    monkeypatch.setattr(plant_step, "lockstep", lambda: 10.0)
+    for part in ("many", "grid"):
+        monkeypatch.setattr(plant_step, part, lambda command, tell: [many_runs.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")])
+    assert main.main(["bench", "--json", "--out", str(tmp_path / "b.json")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == json.loads((tmp_path / "b.json").read_text())
+    assert answer["times_real_time"] > 20
+    assert 0 < answer["cycle"] < 1e-3
+    assert answer["many"] == [{"name": "jax, vmap", "speed": 5e7, "ratio": 7.0, "difference": 1e-12, "note": ""}]
+    assert answer["grid"] == answer["many"]
+
+
+def test_a_path_that_cannot_be_written_is_told_in_one_line(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(plant_step, "report", lambda command, tell: {"step": None})
+    assert main.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
+
+
+def test_a_cycle_from_python_costs_far_less_than_a_cycle() -> None:
+    assert plant_step.cycle_cost(2000, 3) < 200e-6
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_runs() -> None:
+    """Those of the `bench` extra where it is installed; without fused multiply-add C even to the last bit."""
+    told: list[str] = []
+    found = {rival.name: rival for rival in many_runs.many(PREFLIGHT, told.append, rounds=2, cycles=300)}
+    assert len(found) == 8 and told
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        else:
+            assert rival.speed > 0.0 and rival.ratio is not None and rival.difference is not None
+            assert rival.difference < 1e-12
+    for name in (many_runs.OURS, "ours, a thread a core", "C, 16 runs, -ffp-contract=off"):
+        assert found[name].difference == 0.0
+    slowest = found["C, one run after the other"].ratio
+    assert slowest is not None and slowest > 1.2  # 5 on a quiet machine with AVX-512
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_map() -> None:
+    told: list[str] = []
+    found = {rival.name: rival for rival in peers_grid.grid(PREFLIGHT[:1500], told.append, rounds=2)}
+    assert len(found) == 8 and told
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        elif name != peers_grid.REFERENCE:
+            assert rival.difference is not None and rival.difference < 1e-12
+    reference = found[peers_grid.REFERENCE]
+    assert reference.ratio is not None and reference.ratio > 2.0  # 13 on a quiet machine
+    assert reference.difference is not None and 1e-6 < reference.difference < 3e-3

@@ -1,0 +1,191 @@
+"""The picture of a real run: no view with an error, every line, lane and text to be seen.
+
+EHA_RIG_REQUIRE_VIEWER=1 forbids skips.
+"""
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_run import record
+
+from fdi.trace.trace import Trace
+from rig.view import rerun_log, viewer
+
+REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
+
+
+def _missing() -> str:
+    if importlib.util.find_spec("rerun") is None:
+        return "no rerun: pip install 'eha-rig[view]'"
+    folders = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
+    if not any(folder.glob("*.json") for folder in folders if folder.is_dir()):
+        return "no Vulkan driver (Debian: apt-get install mesa-vulkan-drivers libvulkan1)"
+    return ""
+
+
+@pytest.fixture(scope="module")
+def trace(preflight: Path) -> Trace:
+    return Trace.read(preflight, all=True)
+
+
+def _rows(trace: Trace, path: Path) -> dict[str, list[tuple[float, object]]]:
+    """What a recording of the trace holds: entity -> time, s (NaN: always), and value of each of its rows."""
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("no rerun: pip install 'eha-rig[view]'")
+    from rerun.chunk import RrdReader
+
+    rerun_log.write_rrd(trace, path)
+    found: dict[str, list[tuple[float, object]]] = {}
+    for chunk in RrdReader(path).stream():
+        table = chunk.to_record_batch()
+        for column in {"StateChange:state", "TextLog:text", "Scalars:scalars", "TextDocument:text"} & {
+                *table.schema.names}:
+            values = [value[0] for value in table.column(column).to_pylist()]
+            times = [math.nan] * len(values)
+            if rerun_log.TIMELINE in table.schema.names:
+                times = (table.column(rerun_log.TIMELINE).cast("int64").to_numpy() / 1e9).tolist()
+            found.setdefault(chunk.entity_path, []).extend(zip(times, values, strict=True))
+    return {entity: sorted(rows, key=lambda row: row[0]) for entity, rows in found.items()}
+
+
+@pytest.fixture(scope="module")
+def rows(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[float, object]]]:
+    return _rows(trace, tmp_path_factory.mktemp("rrd") / "x.rrd")
+
+
+def test_recording_holds_every_line(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
+    drawn = {"/position/command": trace.com * 1e3, "/position/ram": trace.xj * 1e3, "/current/current": trace.cor * 1e3,
+             "/error/error": (trace.com - trace.xj) * 1e6, "/pressure/pressure": trace.p12 / 1e6,
+             "/spool/spool": trace.xs * 1e6, "/timing/response": trace.timing.response * 1e6,
+             "/timing/work": trace.timing.work * 1e6}
+    for entity, values in drawn.items():
+        np.testing.assert_allclose([value for _, value in rows[entity]], values, rtol=1e-9)
+        np.testing.assert_allclose([t for t, _ in rows[entity]], trace.t, atol=1e-8)
+
+
+def test_recording_holds_every_limit(rows: dict[str, list[tuple[float, object]]]) -> None:
+    """Of preflight: error at rest (14th check), position and pressure; low and high, over the window."""
+    limits = {entity: values for entity, values in rows.items() if "limit" in entity}
+    assert {entity: [(round(t, 6), round(float(str(value)), 6)) for t, value in values]
+            for entity, values in limits.items()} == {
+        "/error/limit_13_high": [(13.2, 29.0), (13.5, 29.0)], "/error/limit_13_low": [(13.2, -29.0), (13.5, -29.0)],
+        "/position/limit_14_high": [(0.0, 6.0), (13.5, 6.0)], "/position/limit_14_low": [(0.0, -6.0), (13.5, -6.0)],
+        "/pressure/limit_15_high": [(0.0, 4.0), (13.5, 4.0)], "/pressure/limit_15_low": [(0.0, -4.0), (13.5, -4.0)]}
+
+
+def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
+    lanes = {entity.removeprefix("/states/"): values for entity, values in rows.items() if "/states/" in entity}
+    assert lanes.pop("0_verdict") == [(-0.5, "PASS")]
+    assert lanes.pop("1_phase") == [(-0.5, "set-up"), (0.0, "main"), (13.5, "clean-up")]
+    assert [str(word).split()[0] for _, word in lanes.pop("2_command")] == [s.kind for s in trace.sections()]
+    for node in (2, 3):
+        states = lanes.pop(f"3_node_{node}_NMT")
+        assert [word for _, word in states] == ["boot-up", "operational"] and states[-1][0] < 0
+    assert len(lanes) == len(trace.checks) == 17
+    for (lane, ((t0, word), (t1, end))), check in zip(sorted(lanes.items()), trace.checks, strict=True):
+        assert lane[:5] == f"5.{trace.checks.index(check) + 1:02}_" and end == ""
+        assert (t0, t1) == pytest.approx((check.t0, check.t1)) and str(word).startswith(f"PASS {check.value:.4g}")
+
+
+def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
+    events = rows["/log/events"]
+    assert len(events) == len(trace.events) > 15
+    assert [t for t, _ in events] == pytest.approx([event.t for event in trace.events])
+    for event, (_, text) in zip(trace.events, events, strict=True):
+        assert f"{event.kind}: {event.text}" in str(text)
+    texts = [str(text) for _, text in rows["/log/checks"]]
+    assert len(texts) == 17 and all(any(f"PASS {c.name}: {c.value:.4g}" in text for text in texts)
+                                    for c in trace.checks)
+    assert "- sequence: Preflight" in str(rows["/log/provenance"][0][1])
+
+
+def test_recording_of_an_aborted_run(aborted: Path, tmp_path: Path) -> None:
+    rows = _rows(Trace.read(aborted, all=True), tmp_path / "x.rrd")
+    lanes = {entity.removeprefix("/states/"): values for entity, values in rows.items() if "/states/" in entity}
+    assert lanes["0_verdict"] == [(-0.3, "ABORTED: guard 'ram far out' was passed by xj")]
+    failed = {lane: [(round(t, 3), word) for t, word in values] for lane, values in lanes.items() if lane[0] == "4"}
+    assert failed == {
+        "4.02_ramp_error": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 3.5 s"), (2.271, "")],
+        "4.03_gain_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
+        "4.04_lag_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
+        "4.05_spool": [(0, "FAIL not measured: 300 of 2271 samples of xs are missing"), (2.271, "")]}
+    assert np.isnan([float(str(value)) for _, value in rows["/spool/spool"]]).sum() == 300
+    assert not any("nan" in str(text) for _, text in rows["/log/checks"])
+
+
+def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
+                                              capsys: pytest.CaptureFixture[str]) -> None:
+    missing = _missing()
+    if missing and not REQUIRED:
+        pytest.skip(missing)
+    assert not missing
+    rerun_log.write_rrd(trace, tmp_path / "view.rrd")
+    pixels = viewer.screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
+    assert {*pixels} == {*(plot.title for plot in rerun_log.PLOTS), rerun_log.LANES, rerun_log.TEXTS, viewer.LIMITS}
+    assert (tmp_path / "view.png").stat().st_size > 50_000
+    assert pixels[rerun_log.LANES] > 20_000 and pixels[rerun_log.TEXTS] > 200 and pixels[viewer.LIMITS] > 1000
+    with capsys.disabled():
+        print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
+
+
+@pytest.mark.parametrize(("part", "title"), [("_states", rerun_log.LANES), ("_texts", rerun_log.TEXTS)])
+def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str,
+                                             title: str) -> None:
+    missing = _missing()
+    if missing and not REQUIRED:
+        pytest.skip(missing)
+    monkeypatch.setattr(rerun_log, part, lambda *_: None)
+    rerun_log.write_rrd(trace, tmp_path / "view.rrd")
+    with pytest.raises(rerun_log.ViewerError, match=f"nothing is to be seen: {title}$"):
+        viewer.screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
+
+
+def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("no rerun")
+    (tmp_path / "x.rrd").write_bytes(b"")
+    trace = Trace.read(folder)
+    with pytest.raises(rerun_log.ViewerError, match="does not draw"):
+        viewer.screenshot(trace, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+
+
+def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(rerun_log.ViewerError, match=r"pip install 'eha-rig\[view\]'"):
+        rerun_log.write_rrd(Trace.read(folder), folder / "none.rrd")
+
+
+def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    if importlib.util.find_spec("rerun") is None or sys.platform != "linux":
+        pytest.skip("no rerun, or no Linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(rerun_log.ViewerError, match="no display"):
+        viewer.open_viewer(Path("x.rrd"))
+
+
+def test_it_listens_on_this_machine_only() -> None:
+    words = viewer._command(Path("x.rrd"), "9999")
+    assert words[words.index("--bind") + 1] == "127.0.0.1"
+
+
+def test_command(folder: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("no rerun")
+    words = [sys.executable, "-m", "rig.cli.main", "view", str(folder), "--save", str(tmp_path / "x.rrd")]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == f"{tmp_path / 'x.rrd'}\n", done.stderr
+    done = subprocess.run([*words, "--headless"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr == "rig view: --headless: expected --screenshot FILE.png with it\n"

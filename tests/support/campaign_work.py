@@ -1,0 +1,26 @@
+"""Judgements for the tests of rig campaign: quick, or as slow as the environment says."""
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdi.trace.trace import Trace
+from plant import Model
+
+
+def quick(trace: Trace, model: Model) -> dict[str, Any]:
+    """Some numbers that depend on every bit of the trace; each call leaves its mark in $CAMPAIGN_CALLS."""
+    source = f"{trace.provenance['source']} {trace.provenance.get('seed')}"
+    if "CAMPAIGN_CALLS" in os.environ:
+        with (Path(os.environ["CAMPAIGN_CALLS"])).open("a") as out:
+            out.write(f"{os.getpid()} {source}\n")
+    time.sleep(float(os.environ.get("CAMPAIGN_SLOW", 0)))
+    if source == "filter_clogging=0.9 1":
+        raise ZeroDivisionError("nothing\nleft to divide")
+    error = trace.com - trace.xj
+    return {"rms": float(np.sqrt((error**2).mean())), "sum": float(trace.p12.sum()), "last": float(trace.xs[-1]),
+            "events": [{"t": float(t)} for t in np.flatnonzero(error > 2e-3)[:3]]}

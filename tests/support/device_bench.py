@@ -1,0 +1,55 @@
+"""One device on an embedded bus, opposite a hand-made master: a test is a script of frames."""
+from __future__ import annotations
+
+from pathlib import Path
+
+from dbc import EDS
+from rig.device import Device, NmtCommand
+from rig.network.bus import Embedded
+from rig.network.frame import Frame
+
+MS = 1_000_000  # ns
+
+
+class Rack:
+    """Node 2 or 3, booted. What it sends is collected as (COB-ID, data) until `take`n."""
+
+    def __init__(self, node: int = 3, boot: bool = True, eds: Path | None = None) -> None:
+        self.node, self.t_ns = node, 0
+        self.heard: list[tuple[int, bytes]] = []
+        self.bus = Embedded()
+        self._send = self.bus.attach(self._hear)
+        self.device = self.bus.add(lambda send: Device(node, eds or EDS[node], send))
+        if boot:
+            self.wait(0)
+            self.take()
+
+    def _hear(self, frame: Frame) -> None:
+        self.heard.append((frame.cob_id, frame.data))
+
+    def take(self) -> list[tuple[int, bytes]]:
+        """What the device sent since the last call."""
+        heard, self.heard = self.heard, []
+        return heard
+
+    def send(self, cob_id: int, data: bytes = b"") -> list[tuple[int, bytes]]:
+        """Send one frame to the device; what it answers at once."""
+        self._send(cob_id, data)
+        self.bus.deliver(self.t_ns)
+        return self.take()
+
+    def nmt(self, command: NmtCommand, node: int | None = None) -> list[tuple[int, bytes]]:
+        return self.send(0x000, bytes((command, self.node if node is None else node)))
+
+    def sync(self) -> list[tuple[int, bytes]]:
+        return self.send(0x080)
+
+    def wait(self, ms: float) -> list[tuple[int, bytes]]:
+        """Let time pass in ticks of 1 ms; what the device sent meanwhile."""
+        end = self.t_ns + round(ms * MS)
+        while True:
+            self.device.tick(self.t_ns)
+            self.bus.deliver(self.t_ns)
+            if self.t_ns >= end:
+                return self.take()
+            self.t_ns = min(self.t_ns + MS, end)

@@ -1,0 +1,13 @@
+"""What the physics tests share: the preflight command, and plants without noise or friction."""
+from __future__ import annotations
+
+from plant import Model
+from plant.profile import build
+from rig.sequences.sequence import load_sequence
+from rig.studies.benchmarks.plant_step import FRICTIONLESS, QUIET
+
+PREFLIGHT = load_sequence("preflight").main_profile().command
+SILENT = Model().replace(QUIET)
+SMOOTH = SILENT.replace(FRICTIONLESS)  # no dry friction
+
+__all__ = ["FRICTIONLESS", "PREFLIGHT", "QUIET", "SILENT", "SMOOTH", "build"]

@@ -1,0 +1,86 @@
+"""The `rig` command in a test: in this process (fast), or as a user's process that can be interrupted and killed."""
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rig.cli.main import main
+
+
+class Said(NamedTuple):
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """Standard output as exactly one JSON object, without NaN or Infinity."""
+        def refuse(word: str) -> None:
+            raise AssertionError(f"{word} is not JSON")
+
+        value = json.loads(self.out, parse_constant=refuse)
+        assert isinstance(value, dict)
+        return value
+
+
+def rig(*words: object) -> Said:
+    """The command in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:
+            status = int(end.code or 0)
+    return Said(status, out.getvalue(), err.getvalue())
+
+
+def started(*words: object, **options: Any) -> subprocess.Popen[str]:
+    """The command as a process of its own."""
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    return subprocess.Popen([sys.executable, "-m", "rig.cli.main", *map(str, words)], **streams)
+
+
+def finished(process: subprocess.Popen[str], timeout: float = 60.0) -> Said:
+    """Wait for it."""
+    out, err = process.communicate(timeout=timeout)
+    return Said(process.returncode, out or "", err or "")
+
+
+def grown(path: Path, size: int, timeout: float = 30.0) -> None:
+    """Wait until a file has that many bytes: a run that is well under way."""
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):
+            if path.stat().st_size >= size:
+                return
+        time.sleep(0.02)
+    raise AssertionError(f"{path} has not grown to {size} bytes")
+
+
+def nodes_on(where: str) -> list[int]:
+    """Processes that run a node on that bus."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+                if b"node" in words and where.encode() in words and entry.name != str(os.getpid()):
+                    found.append(int(entry.name))
+    return found
+
+
+def gone(where: str, timeout: float = 5.0) -> bool:
+    """Whether no node is left on that bus, within `timeout` s."""
+    end = time.monotonic() + timeout
+    while nodes_on(where) and time.monotonic() < end:
+        time.sleep(0.05)
+    return not nodes_on(where)

@@ -1,0 +1,58 @@
+"""Short sequences as text, and what it takes to play one in a test."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from plant import load_model
+from rig.run.job import Job
+from rig.run.outcome import Outcome
+from rig.run.runner import run
+from rig.sequences.sequence import parse_sequence
+
+SHORT = """
+title = "A short one"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [
+  { name = "rest", kind = "hold", time = 0.05 },
+  { name = "step", kind = "step", to = 1e-3, time = 0.2 },
+  { name = "back", kind = "ramp", to = 0.0, time = 0.1 },
+]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.05 }]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "step", high = 30.0 },
+  { name = "no emergency", kind = "event_never", event = "EMCY" },
+]
+"""
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """No progress is shown."""
+
+
+def never() -> bool:
+    """Nobody stops the run."""
+    return False
+
+
+def job(text: str = SHORT, seed: int = 0, set_: dict[str, float] | None = None, **settings: object) -> Job:
+    """A job of a sequence's text."""
+    sequence = parse_sequence(text, "short.toml", lambda name: b"")
+    model = load_model(sequence.model.name).replace(dict(sequence.model.overrides)).replace(set_ or {})
+    return Job(sequence=sequence, model=model, seed=seed, **settings)  # type: ignore[arg-type]
+
+
+def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
+    """Run a job; its results lie in `folder`."""
+    return run(one, folder, silent, stop)
+
+
+def stop_after(cycles: int) -> Callable[[], bool]:
+    """An operator who presses Ctrl-C in that cycle of the run."""
+    asked = iter(range(10**9))
+    return lambda: next(asked) >= cycles
+
+
+def kinds(outcome: Outcome) -> list[tuple[str, str]]:
+    """Kind and text of the events, in order."""
+    return [(event.kind, event.text) for event in outcome.events]

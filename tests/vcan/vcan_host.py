@@ -1,0 +1,42 @@
+"""Where a real CAN interface is to be had: this kernel's own vcan0, or a User-Mode-Linux guest with one."""
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+from rig.network.bus import socketcan_problem
+
+FOLDER = Path(__file__).parent
+ROOT = FOLDER.parent.parent
+GUEST = FOLDER / "guest.sh"
+APT_LINE = "apt-get install user-mode-linux kmod iproute2 can-utils tshark"
+REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1"  # then nothing about vcan may be skipped
+
+
+@functools.cache
+def kernel_has_vcan0() -> bool:
+    """True if vcan0 is there and up in this very kernel. Nothing is sent: somebody may be using it."""
+    return not socketcan_problem("vcan0")
+
+
+@functools.cache
+def guest_missing() -> str:
+    """What keeps the guest from booting, in one line; empty if it can."""
+    if shutil.which("bash") is None:
+        return "guest.sh: bash is missing"
+    return subprocess.run(["bash", str(GUEST), "--check"], capture_output=True, text=True).stderr.strip()
+
+
+def in_guest(*command: str | Path, timeout_s: int = 800) -> subprocess.CompletedProcess[str]:
+    """Run a command with vcan0 in the project's folder: directly where the kernel can, else in the guest."""
+    words = [str(word) for word in command]
+    if not kernel_has_vcan0():
+        words = ["bash", str(GUEST), *words]
+    environment = {**os.environ, "GUEST_TIMEOUT": str(timeout_s)}
+    return subprocess.run(
+        words, cwd=ROOT, env=environment, timeout=timeout_s + 30, text=True,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )
