@@ -10,7 +10,7 @@ import re
 from collections import Counter
 
 import pytest
-from vcan.support import APT_LINE, guest_missing, kernel_has_vcan0
+from vcan_host import APT_LINE, guest_missing, kernel_has_vcan0
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
 GUEST_TESTS = pytest.StashKey[int]()  # socketcan tests that passed in the guest
