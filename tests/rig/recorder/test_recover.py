@@ -21,7 +21,7 @@ from rig.recorder.recover import recover
 WRITER = """
 import sys, time
 from pathlib import Path
-from synthetic import ATTACHMENTS, METADATA, cycles
+from synthetic_run import ATTACHMENTS, METADATA, cycles
 from rig.recorder import Recorder
 run = list(cycles())
 recorder = Recorder(Path(sys.argv[1]), ATTACHMENTS, METADATA)
