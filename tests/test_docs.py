@@ -17,6 +17,7 @@ from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, effect, load_effects
 from plant.state import Input, Ports, State
 from rig.cli import main
+from rig.cli.command_list import HELP_OF_COMMAND
 from rig.sequences import checks, faults
 from rig.sequences.guards import Guard
 from rig.sequences.sequence import Sequence, parse_sequence
@@ -92,7 +93,7 @@ def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
 
 def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
     said = set(re.findall(r"\brig ([a-z]+)\b", "\n".join(blocks(README)))) | set(re.findall(r"`rig ([a-z]+)", README))
-    assert said == set(main.command_modules())
+    assert said == set(HELP_OF_COMMAND)
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))
@@ -117,14 +118,14 @@ def values(args: argparse.Namespace, *names: str) -> list[str]:
 
 @pytest.mark.parametrize("line", TYPED)
 def test_the_commands_of_the_tutorial_are_accepted(line: str) -> None:
-    main.parser().parse_args(shlex.split(line)[1:])
+    main.build_parser().parse_args(shlex.split(line)[1:])
 
 
 def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
     there = {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
     effects = {"null_bias", "jack_friction", "discovered"}
     for line in TYPED:
-        args = main.parser().parse_args(shlex.split(line)[1:])
+        args = main.build_parser().parse_args(shlex.split(line)[1:])
         used = values(args, "trace", "words", "repeat", "holdout", "effects", "model", "command_file")
         assert set(used) - effects - {"eha"} <= there, line
         there |= set(values(args, "out", "write_effect"))

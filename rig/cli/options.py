@@ -3,8 +3,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from plant import InputError, Model, load_model
+from plant.errors import InputError
+
+if TYPE_CHECKING:
+    from plant.model import Model
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +67,8 @@ def model_of(args: argparse.Namespace) -> Model:
     Raises:
         InputError: a file, name or value that cannot be used.
     """
+    from plant.model import load_model
+
     load_user_effects([*args.effects, *named_in(args.model, args.effects)])
     return load_model(args.model or "eha").replace(changes(args.set))
 

@@ -1,1 +1,1 @@
-"""One module a subcommand: HELP, add_arguments(parser), run(args) -> exit status. Heavy imports wait in `run`."""
+"""One module per subcommand: add_arguments(parser) and run_command(args) -> exit status, which holds heavy imports."""

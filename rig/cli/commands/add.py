@@ -10,8 +10,6 @@ from rig.cli import discovery_options, options
 if TYPE_CHECKING:
     from rig.cli.model_update import Done
 
-HELP = "add an effect to a model file, fit it, show the error before and after"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -23,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_model(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: the file of --model, else model.toml); exit status 0 if the effect helps, 1 if not."""
     from fdi.discovery import model_file as ledgers
     from fdi.discovery.refit import addable

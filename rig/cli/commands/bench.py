@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from rig.studies.benchmarks.plant_step import Accuracy
 
-HELP = "the project's own benchmarks"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -27,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--folder", metavar="DIR", help="keeps cases and answers; a trial that was stopped goes on there")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Measure the plant: a step, a run, a cycle from Python, and many runs at once, beside C and other libraries."""
     if args.what == "explain":
         from rig.studies.trial.trial_command import trial

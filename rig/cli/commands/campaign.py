@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rig.studies.campaign.matrix import Matrix
     from rig.studies.campaign.run_campaign import Progress
 
-HELP = "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster"
 EVERY = 30.0  # s between words on how far it is, where there is no terminal
 
 
@@ -46,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--work", default="fdi", metavar="MODULE:FUNCTION", help="another judgement than that of rig fdi")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Judge every case; results.parquet, summary.json and detection.svg in --out (default: campaigns/NAME)."""
     from rig.studies.campaign.folder import read_rows
     from rig.studies.campaign.run_campaign import Hands

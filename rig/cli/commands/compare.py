@@ -11,8 +11,6 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.comparison.compare import Comparison
 
-HELP = "hold a model against a measured trace: how large is the error, where, when, in which block"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -26,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                                               "or where --out FILE.html says")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Replay a trace with a model; exit status 0 if only noise is left, 1 otherwise."""
     from fdi.comparison.compare import compare
     from fdi.report.compare_text import to_json

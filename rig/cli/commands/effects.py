@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from plant.effects import Effect
     from plant.selftest import Report
 
-HELP = "list the catalogue of physical effects, or tell about one"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -32,7 +30,7 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """List the catalogue of effects, or tell about one of them."""
     from plant.model import entry, load_model, offered
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from fdi.discovery.residual_pattern import Pattern
     from fdi.discovery.runs import Runs
 
-HELP = "find the physical effect that a model lacks: a ranked, honest answer"
 LEFT_OVER = ("UNEXPLAINED", "PARTLY")  # verdicts after which the shape of what is left is told
 
 
@@ -29,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                                               "--out FILE.html says")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Name what is missing; exit status 0 if nothing is, 1 otherwise."""
     from fdi.discovery import explain
     from fdi.discovery.candidates import to_json

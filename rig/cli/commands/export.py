@@ -5,8 +5,6 @@ import argparse
 import json
 from pathlib import Path
 
-HELP = "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -14,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--all", action="store_true", help="signals of set-up and clean-up too")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out; the format is that of its suffix."""
     from plant.errors import InputError
     from rig.recorder.convert import export

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from fdi.diagnosis.envelope import Bands
     from rig.studies.fault_size_methods import Row
 
-HELP = "judge filter clogging and spool friction from a trace: levels, sizes with intervals, what else is wrong"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -34,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what --learn-bands simulates: CSV with t,com (default: the main phase of preflight)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Diagnose a trace; exit status 0 if both faults are acceptable, 1 otherwise. Or learn bands."""
     if args.learn_bands is not None:
         return learned(args)

@@ -5,8 +5,6 @@ import argparse
 import json
 from pathlib import Path
 
-HELP = "make a trace.mcap from a CSV (signals) or from a CAN log (.log of candump, .blf, .asc, .trc)"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -14,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dbc", metavar="FILE", help="decodes the raw frames (default: the rig's own eha.dbc)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: FILE with .mcap in place of its suffix)."""
     import dbc
     from plant.errors import InputError

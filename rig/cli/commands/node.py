@@ -11,8 +11,6 @@ from rig.cli import options
 if TYPE_CHECKING:
     from rig.network.frame import Node, Send
 
-HELP = "run one node (plant or controller) on a bus, to face real hardware"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -23,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_model(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Be the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it.
 
     --model, --set and --seed are what it is until a rig loads something else, for a bus with another master.

@@ -6,15 +6,13 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-HELP = "salvage a log whose writer died: everything up to the last sound chunk, indexed anew"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     parser.add_argument("file", metavar="FILE", help="the broken trace.mcap")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: FILE with .recovered before its suffix) and say what was lost."""
     from rig.recorder.recover import recover
 

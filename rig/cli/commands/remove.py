@@ -10,8 +10,6 @@ from rig.cli import discovery_options, options
 if TYPE_CHECKING:
     from rig.cli.model_update import Done
 
-HELP = "take an effect out of a model file; with a TRACE, refit and show the error going up"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -22,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_model(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: the file of --model, in place)."""
     from pathlib import Path
 

@@ -5,15 +5,13 @@ import argparse
 import json
 from pathlib import Path
 
-HELP = "write one HTML file about a trace that needs no network"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     parser.add_argument("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: report.html beside the trace)."""
     from fdi.report.run_page import write_report
 

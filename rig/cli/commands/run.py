@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from rig.run.job import Job
     from rig.run.outcome import Outcome
 
-HELP = "run a test sequence: log, checks, verdict"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -37,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run of this log")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Run a sequence; results go to --out (default: a new folder in runs/)."""
     from fdi.report.run_page import write_report
     from rig.cli import show_run

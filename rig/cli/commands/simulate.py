@@ -7,8 +7,6 @@ from typing import Any
 
 from rig.cli import options
 
-HELP = "run a model on a command, write a trace"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -20,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="plant steps a cycle (default 100)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Run a model closed loop over a command and write t,com,xj,cor,p12,xs,load (default: simulation.csv)."""
     from pathlib import Path
 

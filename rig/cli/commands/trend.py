@@ -11,7 +11,6 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.prognosis.unit_trend import Answer
 
-HELP = "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits"
 KINDS = (".html", ".png", ".svg", ".json")
 
 
@@ -29,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--units", type=options.whole, default=20, metavar="N", help="with --score: units of each law (default 20)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Follow both faults; exit status 0 if both are within MidBand at the last trace, 1 otherwise."""
     from plant import InputError
 

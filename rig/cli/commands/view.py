@@ -5,8 +5,6 @@ import argparse
 import json
 from pathlib import Path
 
-HELP = "open the rerun viewer on a trace (or save its recording, or a picture of it)"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
@@ -17,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="draw without a display, check that every view holds its lines, save the picture")
 
 
-def run(args: argparse.Namespace) -> int:
+def run_command(args: argparse.Namespace) -> int:
     """Open the viewer on 127.0.0.1, or do what --save and --screenshot say."""
     from plant.errors import InputError
 

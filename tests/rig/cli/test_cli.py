@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import pkgutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,8 @@ from short_sequences import SHORT
 
 from fdi.trace.trace import CLEANUP, Trace
 from plant.effects import CATALOGUE
-from rig.cli.main import command_modules
+from rig.cli import commands
+from rig.cli.command_list import HELP_OF_COMMAND, import_command
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
 RUN_KEYS = {"verdict", "trace", "checks", "timing", "fdi"}
@@ -31,11 +33,30 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["", *command_modules()])
+@pytest.mark.parametrize("command", ["", *HELP_OF_COMMAND])
 def test_help(command: str) -> None:
     said = rig(*[command] if command else [], "--help")
     assert said.status == 0 and said.err == "" and len(said.out.splitlines()) > 4
     assert not command or {"--json", "--out", "--quiet"} <= set(said.out.replace(",", " ").split())
+
+
+def test_the_command_list_agrees_with_the_modules() -> None:
+    modules = {module.name for module in pkgutil.iter_modules(commands.__path__)}
+    assert {import_command(name).__name__.rpartition(".")[2] for name in HELP_OF_COMMAND} == modules
+    assert list(HELP_OF_COMMAND) == sorted(HELP_OF_COMMAND)
+
+
+@pytest.mark.parametrize("command", ["", *HELP_OF_COMMAND])
+def test_help_imports_no_heavy_package(command: str) -> None:
+    """Help is quick because neither the plant nor any library is imported for it."""
+    source = ("import sys; from rig.cli.main import build_parser\n"
+              "try: build_parser().parse_args(sys.argv[1:])\n"
+              "finally: print(*{name.partition('.')[0] for name in sys.modules})")
+    done = subprocess.run([sys.executable, "-c", source, *([command] if command else []), "--help"],
+                          capture_output=True, text=True)
+    packages = set(done.stdout.splitlines()[-1].split())
+    assert "rig" in packages and done.returncode == 0
+    assert packages.isdisjoint({"numpy", "numba", "scipy", "matplotlib", "can", "canopen", "mcap", "rich", "google"})
 
 
 def test_version() -> None:

@@ -60,7 +60,7 @@ def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None
 def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(doctor, "requirements", lambda: {"": ["numpy", "no-such-distribution"]})
-    assert command.run(arguments("--seconds", "0")) == 1
+    assert command.run_command(arguments("--seconds", "0")) == 1
     out = capsys.readouterr().out
     assert "missing: no-such-distribution" in out
     assert out.splitlines()[-1] == "rig doctor: the bench cannot run without: packages"
@@ -76,7 +76,7 @@ def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -
 def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = arguments("--seconds", "0")
     args.json, args.out = True, tmp_path / "doctor.json"
-    assert command.run(args) == 0
+    assert command.run_command(args) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads(args.out.read_text())
     assert answer["verdict"] == "PASS"
@@ -86,14 +86,14 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.Capt
 def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     args = arguments("--seconds", "0")
     args.quiet = True
-    assert command.run(args) == 0
+    assert command.run_command(args) == 0
     assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("seconds", ["-1", "4000", "nan"])
 def test_bad_seconds_are_refused(seconds: str) -> None:
     with pytest.raises(InputError, match="--seconds: expected between 0 and 3600 s"):
-        command.run(arguments("--seconds", seconds))
+        command.run_command(arguments("--seconds", seconds))
 
 
 def test_percentiles_of_known_wake_ups() -> None:

@@ -114,7 +114,7 @@ def _run(command: object, capsys: pytest.CaptureFixture[str], *words: str,
     command.add_arguments(parser)  # type: ignore[attr-defined]
     args = parser.parse_args(words)
     args.json, args.quiet, args.out = True, False, None if out is None else str(out)
-    assert command.run(args) == 0  # type: ignore[attr-defined]
+    assert command.run_command(args) == 0  # type: ignore[attr-defined]
     answer: dict[str, object] = json.loads(capsys.readouterr().out)
     return answer
 

@@ -1,0 +1,32 @@
+"""The commands of `rig` and their one-line helps: `rig --help` shows them without importing a command."""
+from __future__ import annotations
+
+import importlib
+import keyword
+from types import ModuleType
+
+HELP_OF_COMMAND = {
+    "add": "add an effect to a model file, fit it, show the error before and after",
+    "bench": "run the project's own benchmarks",
+    "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
+    "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
+    "doctor": "report what this machine can do: CAN, vcan, real-time rights, viewer",
+    "effects": "list the catalogue of physical effects, or show one in detail",
+    "explain": "find the physical effect that a model lacks: a ranked, honest answer",
+    "export": "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
+    "fdi": "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
+    "import": "make a trace.mcap from a CSV (signals) or from a CAN log (.log of candump, .blf, .asc, .trc)",
+    "node": "run one node (plant or controller) on a bus, to face real hardware",
+    "recover": "salvage a log whose writer died: keep everything up to the last intact chunk and index it again",
+    "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",
+    "report": "write one HTML file about a trace; it needs no network",
+    "run": "run a test sequence: log, checks, verdict",
+    "simulate": "run a model on a command and write a trace",
+    "trend": "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
+    "view": "open the rerun viewer on a trace, or save its recording or a picture of it",
+}
+
+
+def import_command(name: str) -> ModuleType:
+    """Import the module of a command: `add_arguments(parser)` and `run(args)`, which returns the exit status."""
+    return importlib.import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")
