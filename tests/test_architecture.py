@@ -4,6 +4,7 @@ from __future__ import annotations
 import ast
 import fnmatch
 import importlib
+import itertools
 import re
 import shutil
 import subprocess
@@ -193,6 +194,43 @@ def test_no_leftovers_and_no_machine_paths() -> None:
             if bad.search(line):
                 found.append(f"{name(path)}:{number}: {line.strip()[:100]}")
     assert found == []
+
+
+def constants(path: Path) -> Iterator[tuple[str, ast.expr]]:
+    """Names in capitals that a module gives a value, and the value."""
+    for node in tree(path).body:
+        if isinstance(node, ast.Assign):
+            targets, value = node.targets, node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            targets, value = [node.target], node.value
+        else:
+            continue
+        for target in targets:
+            words = target.elts if isinstance(target, ast.Tuple) else [target]
+            yield from ((word.id, value) for word in words if isinstance(word, ast.Name) and word.id.isupper())
+
+
+def test_each_threshold_has_its_reason() -> None:
+    """In fdi/thresholds.py a docstring follows each value and says what it decides and why it is that large."""
+    path = ROOT / "fdi" / "thresholds.py"
+    lines = tree(path).body
+    names = [word for word, _ in constants(path)]
+    explained = []
+    for line, following in itertools.pairwise(lines):
+        if isinstance(line, ast.Assign | ast.AnnAssign) and isinstance(following, ast.Expr):
+            text = ast.literal_eval(following.value)
+            assert len(text) > 40, ast.unparse(line)
+            explained.append(ast.unparse(line).partition(" = ")[0].partition(":")[0])
+    assert explained == names
+    assert len(names) > 40
+
+
+def test_each_threshold_is_used() -> None:
+    """A threshold that decides nothing any more is removed."""
+    texts = [path.read_text() for path in MODULES if path.name != "thresholds.py"]
+    unused = [word for word, _ in constants(ROOT / "fdi" / "thresholds.py")
+              if not any(re.search(rf"\b{word}\b", text) for text in texts)]
+    assert unused == []
 
 
 def requirements() -> list[str]:

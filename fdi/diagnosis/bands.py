@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from fdi.comparison.localisation import name
 from fdi.diagnosis.envelope import (
-    KNOWN,
     Bands,
     StepBand,
     Width,
@@ -24,6 +23,12 @@ from fdi.diagnosis.envelope import (
 )
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Event, Level
 from fdi.diagnosis.simulated_units import DYNAMIC, Tell, silent
+from fdi.thresholds import (
+    BAND_UNITS_QUICK,
+    FAST_SLIP_RATIO,
+    FRICTION_HIDES_CLOGGING_RATIO,
+    SECTION_MEASURED_SHARE,
+)
 from fdi.trace.cycles import Cycles, held
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
@@ -32,9 +37,6 @@ from plant.model import Model, load_model
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-
-FASTER = 1.5  # times the slip that goes with the friction, which is worth a word
 
 
 class Judged(NamedTuple):
@@ -66,12 +68,12 @@ def judge(source: Trace | Cycles, bands: Bands | None = None, model: Model | Non
 def suited(com: Floats, load: Floats, period: float, model: Model | None = None, tell: Tell = silent) -> Bands:
     """The preflight's own bands if they are of this command, load and model; else bands made for them."""
     from fdi.diagnosis.bands_file import default
-    from fdi.diagnosis.learn_bands import QUICK, build
+    from fdi.diagnosis.learn_bands import build
 
     plain = model is None or same_plant(model)
     if plain and not loaded(load) and matches(own := default(), com, period):
         return own
-    return build(model or load_model(), com, np.nan_to_num(load), period, *QUICK, tell=tell)
+    return build(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, tell=tell)
 
 
 def same_plant(model: Model) -> bool:
@@ -126,7 +128,7 @@ def judge_columns(com: Floats, xj: Floats, period: float, bands: Bands, load: Fl
         left = {event.band for e in own for event in _events(e, t0, period)}
         levels[fault.name] = (Level.NON_NOMINAL if "most" in left else Level.MAINTENANCE if "middle" in left else
                               Level.ACCEPTABLE)
-    if FRICTION.name in levels and max(slips(found)) > FASTER * max(1.0, severity[FRICTION.name]):
+    if FRICTION.name in levels and max(slips(found)) > FAST_SLIP_RATIO * max(1.0, severity[FRICTION.name]):
         notes.append("the spool slips faster than its static friction accounts for: less dynamic friction than a third "
                      "below it")
     gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
@@ -137,7 +139,7 @@ def judge_columns(com: Floats, xj: Floats, period: float, bands: Bands, load: Fl
 def _why(fault: str, found: list[Excursion], friction: float, bands: Bands) -> str:
     if not any(e.fault == fault and e.signal == "position" for e in found):
         return "no section of the trace shows it"
-    if fault == CLOGGING.name and friction > 2.0 * float(bands.friction[0]):
+    if fault == CLOGGING.name and friction > FRICTION_HIDES_CLOGGING_RATIO * float(bands.friction[0]):
         return f"{friction:.0f} N of friction hide it"
     return "Table 2's fault is within what healthy units scatter"
 
@@ -183,9 +185,9 @@ def excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts: list
 
 def _lost(x: Floats, s: Section, notes: list[str]) -> bool:
     lost = float(np.isnan(x).mean()) if len(x) else 1.0
-    if lost > 1.0 - KNOWN:
+    if lost > 1.0 - SECTION_MEASURED_SHARE:
         notes.append(f"{name(s)} is not judged: {100 * lost:.0f} % of its position is missing")
-    return lost > 1.0 - KNOWN
+    return lost > 1.0 - SECTION_MEASURED_SHARE
 
 
 def _ramp(signal: str, s: Section, start: int, departure: Floats, width: Width) -> Excursion:

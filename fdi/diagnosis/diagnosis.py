@@ -18,6 +18,14 @@ from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Event, Le
 from fdi.diagnosis.precursors import Precursor, measure
 from fdi.diagnosis.refine import COARSE, Refined, refine
 from fdi.discovery.runs import usable
+from fdi.thresholds import (
+    MOVING_RAM,
+    RESIDUAL_JUDGES_NOTHING,
+    SUSPECT_HEALTHY_TOLERANCES,
+    SUSPECT_INTERVAL_FACTOR,
+    SUSPECT_SMALLEST,
+    UNIT_TOLERANCE,
+)
 from fdi.trace.cycles import Cycles
 from fdi.trace.record import Record
 from fdi.trace.sections import sections
@@ -28,12 +36,6 @@ from plant.model import Model, load_model
 Progress = Callable[[str, int, int], None]
 
 STAGES = 4
-STILL = 2e-4  # m
-TOLERANCE = 0.015  # of a healthy unit's parameters, relative, standard deviation
-HEALTHY = 4.0  # such tolerances, within which a suspect is as it left the works
-SURE = 2.0  # times the 95 % interval
-SMALL = {"null_bias.current": 1.6e-5, "constant_load.force": 50.0}  # A, N: less is not worth a word
-FAR = 1.5  # times the noise; a fit that leaves more says nothing of any size
 WORDS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
 
 
@@ -91,8 +93,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     progress("reading", 0, STAGES)
     model, record, c = usable(trace, model, None, source)
     assert c is not None
-    if float(np.ptp(c.com)) < STILL and float(np.ptp(record.position[~np.isnan(record.position)])) < STILL:
-        raise InputError(source, "com", f"a ram that moves {1e3 * STILL:g} mm or more: at rest it shows neither fault")
+    measured = record.position[~np.isnan(record.position)]
+    if float(np.ptp(c.com)) < MOVING_RAM and float(np.ptp(measured)) < MOVING_RAM:
+        raise InputError(source, "com",
+                         f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
     notes = list(c.notes)
     progress("bands", 1, STAGES)
     bands, judged, seen = _banded(c, model, bands, notes)
@@ -157,7 +161,7 @@ def _concluded(d: Diagnosis) -> Diagnosis:
     """Levels, verdict, and what else is off."""
     sizes = _sizes(d.refined)
     levels = {f.name: rules.level(f, sizes[f.name]) for f in FAULTS}
-    far = max(d.refined.ratio.values()) > FAR
+    far = max(d.refined.ratio.values()) > RESIDUAL_JUDGES_NOTHING
     if not d.refined.reached:
         levels = {name: found if found == Level.ACCEPTABLE and not far else None for name, found in levels.items()}
     others = {name: e for name, e in d.refined.others.items() if not far and _unhealthy(name, e, d.model)}
@@ -188,8 +192,9 @@ def _verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
 
 def _unhealthy(name: str, e: Estimate, model: Model) -> bool:
     """Whether a suspect is surely off what a healthy unit has: there are many of them, so by more than 95 %."""
-    e = Estimate(e.value, e.value - SURE * (e.value - e.low), e.value + SURE * (e.high - e.value))
-    if name in SMALL:
-        return (e.low > 0.0 or e.high < 0.0) and abs(e.value) > SMALL[name]
-    usual, way = positive(model, name), math.exp(HEALTHY * TOLERANCE)
-    return e.low > usual * way or e.high < usual / way
+    low = e.value - SUSPECT_INTERVAL_FACTOR * (e.value - e.low)
+    high = e.value + SUSPECT_INTERVAL_FACTOR * (e.high - e.value)
+    if name in SUSPECT_SMALLEST:
+        return (low > 0.0 or high < 0.0) and abs(e.value) > SUSPECT_SMALLEST[name]
+    usual, way = positive(model, name), math.exp(SUSPECT_HEALTHY_TOLERANCES * UNIT_TOLERANCE)
+    return low > usual * way or high < usual / way

@@ -13,23 +13,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.thresholds import (
+    BAND_EVENT_SAMPLES,
+    BAND_FAULT_CLEARANCE_SD,
+    BAND_LARGEST_LOAD,
+    BAND_NEAREST_LIMIT_SD,
+    SAME_COMMAND_POSITION,
+    SAME_COMMAND_RATE,
+    SAME_COMMAND_TIME,
+)
 from fdi.trace.sections import Section, sections
 from plant.errors import InputError
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LASTING = 3  # samples in a row beyond a limit that make an event; as many within end it
-CLEAR = 4.5  # healthy standard deviations by which a fault must move a step's response where it is to be judged
-NEAREST = 4.0  # healthy standard deviations; nearer to the healthy response no limit stands
 HORIZON = 0.1  # s after a step; later there is only stick-slip, which the ramps show better
 FIRST = 0.004  # s; the command has to come through the pilot stage and a cycle of the bus
 SETTLED = 0.2  # s from a ramp's start until it is judged
 SPAN = 0.02  # s between the two samples of a speed: 2 um of noise become 0.14 mm/s
-SAME_PLACE, SAME_TIME, SAME_RATE = 2e-6, 0.004, 0.002  # m, s, a fraction: one command recorded twice
-LARGEST_LOAD = 100.0  # N, a load that moves nothing: 0.6 um of droop
 SCALED = 0.9, 1.3  # a range of friction's error that low or high dynamic friction can account for
-KNOWN = 0.8  # of a section's samples that must have been measured
 
 
 class StepBand(NamedTuple):
@@ -101,8 +104,8 @@ class Bands:
 
     def margins(self, step: StepBand, spread: Floats) -> tuple[Floats, Floats, Flags]:
         """Distance of the limits MidBand and MaxBand from the centre, m, and where there are any; (K,) each."""
-        least = NEAREST * spread
-        judged = np.abs(step.middle) > CLEAR * spread
+        least = BAND_NEAREST_LIMIT_SD * spread
+        judged = np.abs(step.middle) > BAND_FAULT_CLEARANCE_SD * spread
         middle = np.maximum(self.middle_share * np.abs(step.middle), least)
         return middle, np.maximum(self.most_share * np.abs(step.most), middle), judged
 
@@ -114,7 +117,7 @@ class Stay(NamedTuple):
     last: int
 
 
-def stays(beyond: Flags, lasting: int = LASTING) -> list[Stay]:
+def stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[Stay]:
     """Where a flag (n,) is up for `lasting` rows in a row, until it is down for as many.
 
     A single spike, or two, is no event; a single sample back inside does not end one.
@@ -135,7 +138,7 @@ def stays(beyond: Flags, lasting: int = LASTING) -> list[Stay]:
     return found
 
 
-def lasting_most(x: Floats, lasting: int = LASTING) -> Floats:
+def lasting_most(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
     """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all."""
     known = np.where(np.isnan(x), -np.inf, x)
     windows = np.lib.stride_tricks.sliding_window_view(known, lasting, axis=-1)
@@ -182,8 +185,9 @@ def check_command(bands: Bands, found: Sequence[Section], period: float, where: 
         raise InputError(where, "com", f"the command of the bands, {_told(bands)}; this one has {len(theirs)} "
                                        f"sections (rig fdi --learn-bands makes bands of it)")
     for a, b in zip(mine, theirs, strict=True):
-        near = (abs(a.start - b.start) < SAME_TIME and abs(a.first - b.first) < SAME_PLACE
-                and abs(a.last - b.last) < SAME_PLACE and abs(a.rate - b.rate) <= SAME_RATE * abs(a.rate) + 1e-6)
+        near = (abs(a.start - b.start) < SAME_COMMAND_TIME and abs(a.first - b.first) < SAME_COMMAND_POSITION
+                and abs(a.last - b.last) < SAME_COMMAND_POSITION
+                and abs(a.rate - b.rate) <= SAME_COMMAND_RATE * abs(a.rate) + 1e-6)
         if a.kind != b.kind or not near:
             raise InputError(where, "com", f"the command of the bands, {_told(bands)}; at {b.start:.3g} s it differs "
                                            f"(rig fdi --learn-bands makes bands of it)")
@@ -191,7 +195,7 @@ def check_command(bands: Bands, found: Sequence[Section], period: float, where: 
 
 def loaded(load: Floats) -> bool:
     """Whether a known load, (n,) N, moves the ram by more than can be seen."""
-    return bool((np.abs(np.nan_to_num(load)) > LARGEST_LOAD).any())
+    return bool((np.abs(np.nan_to_num(load)) > BAND_LARGEST_LOAD).any())
 
 
 def matches(bands: Bands, com: Floats, period: float) -> bool:

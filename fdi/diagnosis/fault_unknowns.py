@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.model_unknowns import free_of
 from fdi.estimation.problem import Free, unknowns
+from fdi.thresholds import UNIT_TOLERANCE
 from plant.effects import CATALOGUE
 from plant.model import Model
 
@@ -89,9 +90,9 @@ def positive(model: Model, name: str) -> float:
 
 def free_parameters(model: Model) -> tuple[Free, ...]:
     """What a fit may change: the faults first, then the suspects, then the tolerances."""
-    clogging = Open(CLOGGING.parameter, 0.0, 0.015, UNKNOWN, math.log(1.0 - MOST), 0.0, 1.0)
-    friction = [Ratio(f"spool.{kind}_friction", math.log(positive(model, f"spool.{kind}_friction")), 0.015, UNKNOWN,
-                      math.log(LEAST), math.log(LARGEST), 1.0) for kind in ("static", "dynamic")]
+    clogging = Open(CLOGGING.parameter, 0.0, UNIT_TOLERANCE, UNKNOWN, math.log(1.0 - MOST), 0.0, 1.0)
+    friction = [Ratio(f"spool.{kind}_friction", math.log(positive(model, f"spool.{kind}_friction")), UNIT_TOLERANCE,
+                      UNKNOWN, math.log(LEAST), math.log(LARGEST), 1.0) for kind in ("static", "dynamic")]
     suspects = [_suspected(s, model) for s in SUSPECTS]
     usual = math.log(positive(model, "jack.static_friction") / positive(model, "jack.dynamic_friction"))
     over = Over("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)

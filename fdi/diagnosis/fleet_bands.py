@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import columns, judge_columns, suited
 from fdi.diagnosis.envelope import (
-    CLEAR,
-    NEAREST,
     Bands,
     RampBand,
     StepBand,
@@ -25,6 +23,13 @@ from fdi.diagnosis.envelope import (
 from fdi.diagnosis.faults import Level
 from fdi.diagnosis.features import features
 from fdi.diagnosis.simulated_units import Tell, silent
+from fdi.thresholds import (
+    BAND_FAULT_CLEARANCE_SD,
+    BAND_NEAREST_LIMIT_SD,
+    FLEET_FEWEST_TRACES,
+    FLEET_PRIOR_TRACES,
+    POSITION_MISSING_SHARE,
+)
 from fdi.trace.sections import sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -32,20 +37,16 @@ from plant.model import Model
 
 Floats = NDArray[np.float64]
 
-FEWEST = 5  # traces
-PRIOR = 8.0  # traces that the simulated scatter counts for beside the measured
-MISSING = 0.02  # of a trace's positions
-
-
 def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[str] = (), tell: Tell = silent
           ) -> Bands:
     """Bands from healthy traces of one command.
 
-    The mean is the fleet's own. The scatter is the fleet's, too, with the simulated one as if of PRIOR traces more, and
-    wider by what so few traces leave unsure (Student's t). What the faults add is simulated with `model`.
+    The mean is the fleet's own. The scatter is the fleet's, too, joined with the simulated one as if that were of
+    FLEET_PRIOR_TRACES traces more, and widened for the small number of traces (Student's t). What the faults add is
+    simulated with `model`.
 
     Args:
-        traces: at least FEWEST, without load.
+        traces: at least FLEET_FEWEST_TRACES, without load.
         model: default the nominal one.
         names: of the traces, for refusals.
         tell: told how far it is.
@@ -54,8 +55,9 @@ def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[s
         InputError: too few traces, another command or period in one, a load, or a position with holes.
     """
     names = names or [f"trace {i + 1}" for i in range(len(traces))]
-    if len(traces) < FEWEST:
-        raise InputError("--learn-bands", f"{len(traces)} traces", f"at least {FEWEST} healthy traces of one command")
+    if len(traces) < FLEET_FEWEST_TRACES:
+        raise InputError("--learn-bands", f"{len(traces)} traces",
+                         f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
     com, _, _, period, _ = columns(traces[0])
     base = suited(com, np.zeros_like(com), period, model, tell)
     rows = [_aligned(base, trace, name) for trace, name in zip(traces, names, strict=True)]
@@ -78,7 +80,7 @@ def _aligned(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     if loaded(load):
         raise InputError(name, "load", "none: bands are learned from an unloaded ram")
     missing = np.isnan(xj)
-    if missing.mean() > MISSING:
+    if missing.mean() > POSITION_MISSING_SHARE:
         raise InputError(name, "xj", f"a whole position, not one with {100 * missing.mean():.0f} % missing")
     if abs(period / base.period - 1) > 0.01:
         raise InputError(name, "t", f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
@@ -98,15 +100,15 @@ class _Fleet:
         self.x, self.com, self.base, self.count = x, com, base, len(x)
         from scipy.stats import norm, t
 
-        freedom = self.count - 1 + PRIOR
-        unsure = float(t.isf(norm.sf(NEAREST), freedom)) / NEAREST
+        freedom = self.count - 1 + FLEET_PRIOR_TRACES
+        unsure = float(t.isf(norm.sf(BAND_NEAREST_LIMIT_SD), freedom)) / BAND_NEAREST_LIMIT_SD
         self.wider = unsure * float(np.sqrt(1 + 1 / self.count))
 
     def scatter(self, values: Floats, simulated: Floats) -> Floats:
         """Standard deviation over the fleet, of (m, ..), shrunk to the simulated one and widened."""
         freedom = self.count - 1
-        variance = (PRIOR * simulated**2 + freedom * values.var(axis=0, ddof=1)) / (PRIOR + freedom)
-        out: Floats = self.wider * np.sqrt(variance)
+        squares = FLEET_PRIOR_TRACES * simulated**2 + freedom * values.var(axis=0, ddof=1)
+        out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + freedom))
         return out
 
     def step(self, s: StepBand) -> StepBand:
@@ -131,7 +133,7 @@ class _Fleet:
         centre = float(np.nanmean(values))
         usual = lasting_most(np.abs(values - centre))
         spread = self.scatter(usual, np.array((simulated.healthy - float(usual.mean())) / 3).clip(0.0))
-        clear = float(usual.mean() + CLEAR * spread)
+        clear = float(usual.mean() + BAND_FAULT_CLEARANCE_SD * spread)
         middle = simulated.middle if simulated.middle > clear else np.inf
         return Width(centre, float(usual.mean() + 3 * spread), middle, max(middle, simulated.most))
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import excursions
 from fdi.diagnosis.envelope import (
-    CLEAR,
     FIRST,
     HORIZON,
     Bands,
@@ -29,6 +28,13 @@ from fdi.diagnosis.features import features, slow
 from fdi.diagnosis.simulated_units import STEPS, Kind, Tell, runs, silent
 from fdi.output import writable
 from fdi.sources import software
+from fdi.thresholds import (
+    BAND_FAULT_CLEARANCE_SD,
+    BAND_UNITS,
+    RAMP_FAULT_MISSED_SHARE,
+    RAMP_HEALTHY_SHARE,
+    STEP_FAULT_LEAVES_SD,
+)
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -36,18 +42,13 @@ from plant.model import Model, load_model
 
 Floats = NDArray[np.float64]
 
-RUNS, FAULTY = 416, 416  # units, healthy and of each fault
-QUICK = (208, 96)  # the same where bands are made on the way
 SEED = 0
-OUT_RAMP = 0.005  # of units with friction of Table 2's sizes may stay within MidBand, MaxBand
-FAR_STEP = 2.33, 1.96  # standard deviations of a normal one: of units with clogging 1 % may, and 2.5 %
-ORDINARY = 0.995  # of healthy units stay within the width that is called healthy
 BETWEEN = (20.0, 50.0, 100.0, 140.0)  # N of friction, beside Table 2's, at which its effect on steps is known
 EASY = 0.2  # FDS over FSS of units that slip easily
 COARSE = 2  # cycles between the times at which shifts and spreads are known
 
 
-def build(model: Model, com: Floats, load: Floats, period: float, count: int = RUNS, faulty: int = FAULTY,
+def build(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS, faulty: int = BAND_UNITS,
           seed: int = SEED, steps: int = STEPS, tell: Tell = silent, name: str = "") -> Bands:
     """Bands of a command (n,) m with a known load (n,) N, one row per `period` s, by simulating units of a model.
 
@@ -148,13 +149,16 @@ def _ramp(number: int, s: Section, com: Floats, period: float, frictions: Sequen
 
 
 def _width(healthy: Floats, middle: Floats, most: Floats) -> Width:
-    """Limits that all but OUT_RAMP of the faulty units leave, where clear of the healthy ones; (runs, rows) each."""
+    """Limits that all but RAMP_FAULT_MISSED_SHARE of the faulty units leave, from runs (units, rows).
+
+    A limit that is not clear of the healthy units is infinite.
+    """
     centre = float(np.nanmean(healthy))
     usual, lesser, greater = (lasting_most(np.abs(x - centre)) for x in (healthy, middle, most))
-    clear = float(usual.mean() + CLEAR * usual.std(ddof=1))
-    limits = [float(np.quantile(x, OUT_RAMP)) for x in (lesser, greater)]
+    clear = float(usual.mean() + BAND_FAULT_CLEARANCE_SD * usual.std(ddof=1))
+    limits = [float(np.quantile(x, RAMP_FAULT_MISSED_SHARE)) for x in (lesser, greater)]
     wide = [limit if limit > clear else np.inf for limit in limits]
-    return Width(centre, float(np.quantile(usual, ORDINARY)), wide[0], max(wide))
+    return Width(centre, float(np.quantile(usual, RAMP_HEALTHY_SHARE)), wide[0], max(wide))
 
 
 def _share(bands: Bands, com: Floats, units: Floats, most: bool) -> float:
@@ -169,7 +173,7 @@ def _share(bands: Bands, com: Floats, units: Floats, most: bool) -> float:
         furthest = [float(lasting_most(e.departure / (e.most if most else e.middle))) for e in own]
         reached.append(max(furthest, default=1.0))
     logs = np.log(reached)
-    return float(np.exp(logs.mean() - FAR_STEP[most] * logs.std(ddof=1)))
+    return float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[most] * logs.std(ddof=1)))
 
 
 def _sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, period: float, parts: Sequence[Section]

@@ -1,18 +1,17 @@
 """From the size of a fault, with its interval, to one of the paper's three levels; and which of two faults rules.
 
 A limit of Table 2 counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the
-healthy size, for MidBand) is excluded. MidBand has to be a little further off (`MARGIN`) before a fault is acceptable:
-one that is missed costs more than one that is looked at early. So a fault exactly at MidBand is found in 98 % of all
-tests, as long as the interval excludes a healthy unit. One that holds the healthy size and MidBand both cannot be
-judged.
+healthy size, for MidBand) is excluded. MidBand has to be a little further off (`ACCEPTABLE_INTERVAL_FACTOR`) before a
+fault is acceptable: one that is missed costs more than one that is looked at early. So a fault exactly at MidBand is
+found in 98 % of all tests, as long as the interval excludes a healthy unit. One that holds the healthy size and MidBand
+both cannot be judged.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from fdi.diagnosis.faults import FAULTS, Estimate, Fault, Level
-
-MARGIN = 1.1  # times the upper half of the interval: 98.4 % on this side
+from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
 
 
 def level(fault: Fault, size: Estimate) -> Level | None:
@@ -22,7 +21,7 @@ def level(fault: Fault, size: Estimate) -> Level | None:
     >>> level(CLOGGING, Estimate(0.02, 0.0, 0.07)).word, level(CLOGGING, Estimate(0.23, 0.18, 0.28)).word
     ('acceptable', 'maintenance')
     """
-    if size.value + MARGIN * (size.high - size.value) < fault.middle:
+    if size.value + ACCEPTABLE_INTERVAL_FACTOR * (size.high - size.value) < fault.middle:
         return Level.ACCEPTABLE
     if size.low <= fault.healthy:
         return None

@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from fdi.diagnosis.envelope import Bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.diagnosis.features import MEANINGS, OF_STEPS, features, kind_of
+from fdi.thresholds import POSITION_MISSING_SHARE
 from fdi.trace.cycles import Cycles
 from fdi.trace.sections import sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
-
-BRIDGED = 0.02  # of a trace's positions may be missing; they are put on straight lines
-
 
 class Precursor(NamedTuple):
     """One number, SI or %, NaN where the trace does not show it; the rest is NaN without bands."""
@@ -58,7 +56,7 @@ def measure(source: Trace | Cycles, bands: Bands | None = None) -> dict[str, Pre
 
     com, xj, _, period, _ = columns(source)
     missing = np.isnan(xj)
-    if missing.mean() > BRIDGED:
+    if missing.mean() > POSITION_MISSING_SHARE:
         return {}
     rows = np.arange(len(xj))
     whole = np.interp(rows, rows[~missing], xj[~missing])

@@ -21,6 +21,14 @@ from fdi.estimation import noise as noises
 from fdi.estimation.fit import Fit, misfit, typical
 from fdi.estimation.problem import Free, Problem, quiet
 from fdi.estimation.valley import descended, first_widths, flats
+from fdi.thresholds import (
+    FAULT_BLAMED_SHARE,
+    FSS_INTERVAL_FACTOR,
+    INTERVAL_95_SD,
+    RESIDUAL_HOPELESS,
+    RESIDUAL_IS_NOISE,
+    RESIDUAL_WORST,
+)
 from fdi.trace.record import NOISE, Record
 from plant.effects import CATALOGUE
 from plant.model import Model
@@ -28,8 +36,6 @@ from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 
-WIDTH = 1.96  # standard deviations of a 95 % interval
-ROUGH = 1.1  # times the interval of FSS: what stick-slip and the solver add (320 cases: 1.14 standard deviations)
 FINE = 20  # steps a cycle of the last fit
 EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
 AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
@@ -37,10 +43,7 @@ SETTLING = 4  # rounds of the last fit
 LONG = 8  # further ones, where these were not enough
 # where a fit begins again that has not come down to noise: parts of the way back to a unit without deviations, by turns
 BACK = ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25))
-HOPELESS = {"xj": 7.0, "p12": 7.0, "xs": 2.0}  # times the noise: something else is wrong, no other start mends it
 FAULTY = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
-FURTHEST = 5.0  # times the floor, that a few missed stops may leave in all
-REACHED = 1.08  # times the floor: what is left above is physics that neither fault nor tolerance explains
 COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
 CLOSER = ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03))  # steps of Kintas and factors of FSS around the best start
 
@@ -68,8 +71,8 @@ class Refined:
     def reached(self) -> bool:
         """True when nothing but noise is left, but for a few stops of the ram that were made or missed by a hair."""
         usual = typical(self.fit.residuals)
-        near = all(float(t) <= REACHED * floor for t, floor in zip(usual, self.floor.values(), strict=True))
-        return near and max(self.ratio.values()) <= FURTHEST
+        near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
+        return near and max(self.ratio.values()) <= RESIDUAL_WORST
 
 
 @dataclass
@@ -137,7 +140,8 @@ def _last(problem: Counted, first: Fit) -> Fit:
             return last
     signals = problem.record.signals
     for parts in BACK:
-        if _reached(problem, last) or any(x > HOPELESS[s] for s, x in zip(signals, _over(problem, last), strict=True)):
+        ratios = dict(zip(signals, _over(problem, last), strict=True))
+        if _reached(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
             break
         last = _restarted(problem, last, parts)
     return last
@@ -178,11 +182,11 @@ def _blamed(free: Sequence[Free], x: Floats) -> bool:
     """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
     known = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
     kintas, fss = known[CLOGGING.parameter], known[FRICTION.parameter]
-    return kintas > 0.5 * CLOGGING.middle or fss > 0.5 * FRICTION.middle
+    return kintas > FAULT_BLAMED_SHARE * CLOGGING.middle or fss > FAULT_BLAMED_SHARE * FRICTION.middle
 
 
 def _reached(problem: Problem, found: Fit) -> bool:
-    return max(_over(problem, found)) <= REACHED
+    return max(_over(problem, found)) <= RESIDUAL_IS_NOISE
 
 
 def _over(problem: Problem, found: Fit) -> list[float]:
@@ -243,7 +247,7 @@ def _with_noise(problem: Counted, found: Fit) -> Counted:
     """The problem with the noise of what a fit leaves, signal by signal, where that is noise."""
     learnt = []
     for old, r in zip(problem.noise, found.residuals, strict=True):
-        calm = float(np.sqrt(np.nanmean(r**2))) <= REACHED * old.level
+        calm = float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level
         learnt.append(noises.fitted(r) if calm else old)
     return replace(problem, noise=tuple(learnt), _lanes={})
 
@@ -256,14 +260,14 @@ def _refined(last: Fit, problem: Counted) -> Refined:
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
-    return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter, ROUGH), correlation,
-                   {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+    return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter, FSS_INTERVAL_FACTOR),
+                   correlation, {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
                    sum(problem.counts))
 
 
 def estimate(found: Fit, name: str, wider: float = 1.0) -> Estimate:
     """A parameter with its 95 % interval, within what is possible; `wider` times what the fit's covariance says."""
     i = [f.name for f in found.free].index(name)
-    half = wider * WIDTH * float(np.sqrt(found.covariance[i, i]))
+    half = wider * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i]))
     low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
     return Estimate(found.free[i].value(float(found.x[i])), low, high)

@@ -13,14 +13,10 @@ from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
 from fdi.prognosis.growth_laws import basis, shapes
-from fdi.prognosis.regression import NOISES, STEP, WANDERS, Scaled, covariance, odds
+from fdi.prognosis.regression import NOISES, WANDERS, Scaled, covariance, odds
+from fdi.thresholds import BREAK_FEWEST_IN_LINE, BREAK_MOST, BREAK_PRIOR, LAST_OUTLIER_PRIOR, STEP_PRIOR_SD
 
 Floats = NDArray[np.float64]
-
-ODDS = 0.01  # prior probability that a series holds any one kind of break
-AT_LAST = 0.2  # that the last size is not in line: not much is lost by asking for another trace
-MOST = 5  # breaks looked for
-FEWEST = 3  # sizes in line among which another can be out of it
 
 
 class Break(NamedTuple):
@@ -42,8 +38,8 @@ class Cleaned(NamedTuple):
 def clean(data: Scaled) -> Cleaned:
     """Mark breaks one by one: an outlier's row becomes loose, a step gets a column, before a repair all goes."""
     first, found = 0, []
-    for _ in range(MOST):
-        strongest = _strongest(data) if len(data.u) - len(data.loose) >= FEWEST else None
+    for _ in range(BREAK_MOST):
+        strongest = _strongest(data) if len(data.u) - len(data.loose) >= BREAK_FEWEST_IN_LINE else None
         if strongest is None:
             break
         kind, at, size = strongest
@@ -71,11 +67,11 @@ def _strongest(data: Scaled) -> tuple[str, int, float] | None:
     jumps = np.tril(np.ones((n, n)))[:, 1:-1]  # from row j on; the first is no jump, at the last one cannot tell
     v = np.column_stack([spikes, jumps])
     gain, size = _gains(data, v)
-    gain = gain + np.log(ODDS / np.repeat([n, max(n - 2, 1)], [n, n - 2]))
-    gain[n - 1] += np.log(AT_LAST / ODDS * n)
+    gain = gain + np.log(BREAK_PRIOR / np.repeat([n, max(n - 2, 1)], [n, n - 2]))
+    gain[n - 1] += np.log(LAST_OUTLIER_PRIOR / BREAK_PRIOR * n)
     gain[[*data.loose, *(n + row - 1 for row in data.steps if row < n - 1)]] = -np.inf  # known already
     if n == 3:  # each of three is out of line with the other two
-        gain[:] = np.where(np.abs(size) > STEP, gain, -np.inf)
+        gain[:] = np.where(np.abs(size) > STEP_PRIOR_SD, gain, -np.inf)
     best = int(np.argmax(gain))
     if not gain[best] > 0.0:
         return None
@@ -107,12 +103,12 @@ def _gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
 
 def _two(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[Floats, Floats, Floats]:
     """What the rise, and rise and a column's factor, add to the evidence, (k,) and (k, m); and that factor, (k, m)."""
-    gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP ** -2, g.T @ v
+    gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP_PRIOR_SD ** -2, g.T @ v
     gy, vy = g.T @ y, v.T @ y
     alone = 0.5 * gy ** 2 / gg - 0.5 * np.log(gg * usual ** 2) + log_ndtr(gy / np.sqrt(gg))
     left = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
     rest = gy[:, None] - gv * (vy / vv)
-    both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP ** 2) + 0.5 * rest ** 2 / left
+    both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP_PRIOR_SD ** 2) + 0.5 * rest ** 2 / left
             - 0.5 * np.log(left * usual[:, None] ** 2) + log_ndtr(rest / np.sqrt(left)))
     rise = np.maximum(rest / left, 0.0)
     return alone, both, (vy - gv * rise) / vv

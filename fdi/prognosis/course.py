@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.prognosis.growth_laws import basis
-from fdi.prognosis.regression import OFFSET, STEP, Posterior, Scaled, covariance, wandering
+from fdi.prognosis.regression import Posterior, Scaled, covariance, wandering
+from fdi.thresholds import INTERVAL_95_SD, OFFSET_PRIOR_SD, STEP_PRIOR_SD
 
 Floats = NDArray[np.float64]
 
@@ -23,13 +24,13 @@ def fitted(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
     mean = rise * there + cross @ cho_solve(solver, data.y - rise * here)
     pull = there - cross @ cho_solve(solver, here)
     left = _between(data, part.wander, u, u).diagonal() - (cross * cho_solve(solver, cross.T).T).sum(axis=1)
-    half = 1.96 * np.sqrt(np.maximum(left + (pull * part.deviation[shape]) ** 2, 0.0))
+    half = INTERVAL_95_SD * np.sqrt(np.maximum(left + (pull * part.deviation[shape]) ** 2, 0.0))
     return np.array([mean - half, mean, mean + half])
 
 
 def _between(data: Scaled, wander: int, a: Floats, b: Floats) -> Floats:
     """Covariance of the level without the rise at times a with that at times b, (len(a), len(b))."""
-    out = OFFSET ** 2 + wandering(wander, a, b)
+    out = OFFSET_PRIOR_SD ** 2 + wandering(wander, a, b)
     for row in data.steps:
-        out = out + STEP ** 2 * np.outer(a >= data.u[row], b >= data.u[row])
+        out = out + STEP_PRIOR_SD ** 2 * np.outer(a >= data.u[row], b >= data.u[row])
     return out

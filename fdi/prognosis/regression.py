@@ -18,10 +18,10 @@ from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
 from fdi.prognosis.growth_laws import Shape, basis, shapes
+from fdi.thresholds import OFFSET_PRIOR_SD, STEP_PRIOR_SD
 
 Floats = NDArray[np.float64]
 
-OFFSET, STEP = 0.5, 0.5  # prior deviations, in units of (MaxBand - healthy)
 # (common part of the variance, factor on the deviation)
 NOISES = ((0.0, 1.0), (0.5, 1.0), (0.9, 1.0), (0.98, 1.0), (0.996, 1.0), (0.0, 2.0))
 NOISE_PRIOR = (0.18, 0.18, 0.18, 0.18, 0.18, 0.1)
@@ -96,8 +96,8 @@ def covariance(data: Scaled, noise: int, wander: int) -> Floats:
     sigma = factor * np.maximum(data.sigma, GRAIN)
     jumps = _jumps(data)
     own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
-    out: Floats = (np.diag(own * sigma ** 2) + OFFSET ** 2
-                   + STEP ** 2 * jumps.T @ jumps + wandering(wander, data.u, data.u))
+    out: Floats = (np.diag(own * sigma ** 2) + OFFSET_PRIOR_SD ** 2
+                   + STEP_PRIOR_SD ** 2 * jumps.T @ jumps + wandering(wander, data.u, data.u))
     out[data.loose, data.loose] += LOOSE ** 2
     return out
 
@@ -139,7 +139,7 @@ def _part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     precision = (g * g).sum(axis=0) + usual ** -2
     rise, deviation = (g.T @ y) / precision, precision ** -0.5
     evidence = odds(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y + truncated(rise, deviation, usual)
-    own = np.array([[OFFSET ** 2 + len(data.steps) * STEP ** 2, 0.0], [0.0, 0.0]])
+    own = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
     return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, own + _end(kind, strength) - s.T @ s)
 
 
@@ -153,7 +153,7 @@ def end_with(data: Scaled, u: Floats, wander: int) -> Floats:
     """Covariance of the level and of the wander's slope at u = 1 with the levels at times u, (2, m)."""
     kind, strength = WANDERS[wander]
     counted = np.sum([u >= data.u[row] for row in data.steps], axis=0) if data.steps else 0.0
-    level = OFFSET ** 2 + STEP ** 2 * counted + np.zeros_like(u)
+    level = OFFSET_PRIOR_SD ** 2 + STEP_PRIOR_SD ** 2 * counted + np.zeros_like(u)
     if kind == "integrated":
         return np.array([level + 3 * strength ** 2 * (u ** 2 / 2 - u ** 3 / 6), 3 * strength ** 2 * u ** 2 / 2])
     return np.array([level + strength ** 2 * u, np.zeros_like(u)])

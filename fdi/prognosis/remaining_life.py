@@ -9,15 +9,11 @@ from scipy.special import ndtr, ndtri
 
 from fdi.prognosis.growth_laws import basis
 from fdi.prognosis.regression import NOISES, WANDERS, Posterior
+from fdi.thresholds import NEVER_FACTOR, PACE_FREEDOM, PACE_SCALE, TREND_PATHS
 
 Floats = NDArray[np.float64]
 
-PATHS = 2000
-FAR = 50.0  # times the time seen so far; what comes later is called never
-AHEAD = np.concatenate([[0.0], np.logspace(-2.5, np.log10(FAR), 80)])  # from the last trace, in u
-
-
-PACE, FREEDOM = 0.12, 3.0  # Student's scale and freedom of the logarithm of how fast the course found goes on from here
+AHEAD = np.concatenate([[0.0], np.logspace(-2.5, np.log10(NEVER_FACTOR), 80)])  # from the last trace, in u
 
 
 class Paths(NamedTuple):
@@ -34,7 +30,7 @@ class Own(NamedTuple):
     share: float = 0.0
 
 
-def draw(posterior: Posterior, own: Own, seed: int = 0, paths: int = PATHS) -> Paths:
+def draw(posterior: Posterior, own: Own, seed: int = 0, paths: int = TREND_PATHS) -> Paths:
     """Paths of equal probability."""
     rng = np.random.default_rng(seed)
     weights = posterior.weights
@@ -55,7 +51,7 @@ def draw(posterior: Posterior, own: Own, seed: int = 0, paths: int = PATHS) -> P
         rate[rows] = rise * slopes[k] + (level[1] if kind == "integrated" else 0.0)
     common = np.sqrt([NOISES[p.noise][0] for p in posterior.parts])[part] * rng.standard_normal(paths)
     sizes -= common[:, None] * (own.base + own.share * sizes)
-    pace = np.exp(np.clip(PACE * rng.standard_t(FREEDOM, paths), -2.0, 2.0))
+    pace = np.exp(np.clip(PACE_SCALE * rng.standard_t(PACE_FREEDOM, paths), -2.0, 2.0))
     sizes = np.array([np.interp(AHEAD, AHEAD * slower, row) for slower, row in zip(pace, sizes, strict=True)])
     return Paths(sizes, rate / pace)
 

@@ -14,14 +14,17 @@ from fdi.prognosis import remaining_life
 from fdi.prognosis.breaks import Break, Cleaned, clean
 from fdi.prognosis.course import fitted
 from fdi.prognosis.regression import Posterior, Scaled, regress
+from fdi.thresholds import (
+    INTERVAL_95_SD,
+    INTERVAL_SLOPE_RANGE,
+    NO_GROWTH_PROBABILITY,
+    TREND_FEWEST_TRACES,
+    TREND_MOST_TRACES,
+    TREND_PATHS,
+)
 
 Floats = NDArray[np.float64]
 
-FEWEST = 3  # traces that make a trend: two points lie on every line
-DOUBT = 0.05  # largest probability that nothing grows at which a trend is told
-LATEST = 200  # traces; older ones are left out, they no longer tell where the size goes
-LEVER = 0.15  # of (MaxBand - healthy); over less, intervals do not show how they go with the size
-WIDTH = 1.96  # standard deviations of a 95 % interval
 LIMITS = {"maintenance": "middle", "non_nominal": "most"}  # level that begins there: field of Fault
 
 
@@ -74,14 +77,14 @@ class Trend:
 
 def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:
     """The trend of a fault from its sizes at `times` (in order, any unit), at least one."""
-    t = np.array(times[-LATEST:], dtype=float)
-    sizes = tuple(estimates[-LATEST:])
+    t = np.array(times[-TREND_MOST_TRACES:], dtype=float)
+    sizes = tuple(estimates[-TREND_MOST_TRACES:])
     data, unit = _scaled(fault, t, sizes)
     found = clean(data) if t[-1] > t[0] else Cleaned(data, 0, ())
     breaks = tuple(b._replace(size=b.size * unit) for b in found.breaks)
     used = np.arange(len(t)) >= found.first
     used[[found.first + row for row in found.data.loose]] = False
-    if used.sum() < FEWEST or np.ptp(t[used]) == 0.0:
+    if used.sum() < TREND_FEWEST_TRACES or np.ptp(t[used]) == 0.0:
         return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
     span = float(t[-1] - t[found.first])
     posterior = regress(found.data)
@@ -91,7 +94,7 @@ def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) 
     middle = np.linspace(0.0, 1.0, 60)
     past = Curve(t[found.first] + span * middle, *(fault.healthy + unit * fitted(found.data, posterior, middle)))
     now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], 0.0)  # neither fault can be less
-    return Trend(fault, "TREND" if laws["none"] < DOUBT else "NO_TREND", t, sizes, used, breaks, laws,
+    return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, used, breaks, laws,
                  _quantiles(now), _quantiles(paths.rate * unit / span), remaining, past,
                  _fan(fault, unit, paths, float(t[-1]), span))
 
@@ -100,7 +103,7 @@ def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled,
     """The series in the regression's units, and the size that is 1 there."""
     unit = fault.most - fault.healthy
     value, low, high = np.array(sizes).T
-    sigma = np.maximum(high - value, value - low) / WIDTH / unit  # one side may end at what is possible at all
+    sigma = np.maximum(high - value, value - low) / INTERVAL_95_SD / unit  # one side may end at what is possible at all
     span = float(t[-1] - t[0]) or 1.0
     bounded = tuple(int(row) for row in np.flatnonzero(value <= low))
     return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
@@ -109,7 +112,7 @@ def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled,
 def _own(data: Scaled, used: NDArray[np.bool_]) -> remaining_life.Own:
     """A line through the intervals' deviations over the sizes; their mean where these hardly differ."""
     y, sigma = data.y[used], data.sigma[used]
-    if np.ptp(y) < LEVER:
+    if np.ptp(y) < INTERVAL_SLOPE_RANGE:
         return remaining_life.Own(float(sigma[-1]))
     share, base = np.polyfit(y, sigma, 1)
     return remaining_life.Own(float(base), float(share))
@@ -125,7 +128,7 @@ def _drawn(found: Cleaned, posterior: Posterior, own: remaining_life.Own) -> rem
         return remaining_life.draw(posterior, own)
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
-    third = remaining_life.PATHS // 3
+    third = TREND_PATHS // 3
     jumped = regress(tight._replace(steps=(*tight.steps, at)))
     three = [remaining_life.draw(p, own, i, third) for i, p in enumerate((posterior, jumped, regress(tight)))]
     return remaining_life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))

@@ -10,7 +10,8 @@ from typing import Any
 from fdi.diagnosis.faults import FAULTS, Estimate, Level
 from fdi.prognosis.dates import AXES, iso
 from fdi.prognosis.gather import Gathered, Point
-from fdi.prognosis.trend import FEWEST, LATEST, Remaining, Trend, follow
+from fdi.prognosis.trend import Remaining, Trend, follow
+from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
 from plant.errors import InputError
 
 NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}
@@ -109,8 +110,8 @@ def sentences(trend: Trend, found: Answer) -> list[str]:
     points = found.gathered.points[-len(trend.t):]
     for b in trend.breaks:
         lines.append(_broken(b.kind, points[b.row], _number(abs(b.size), trend.fault.unit), b.size > 0, found))
-    if len(found.gathered.points) > LATEST:
-        lines.append(f"only the latest {LATEST} traces are looked at")
+    if len(found.gathered.points) > TREND_MOST_TRACES:
+        lines.append(f"only the latest {TREND_MOST_TRACES} traces are looked at")
     if trend.verdict == "TREND" and trend.laws:
         lines.append("law: " + ", ".join(f"{law} {100 * p:.0f} %" for law, p in
                                          sorted(trend.laws.items(), key=lambda item: -item[1]) if p >= 0.005))
@@ -122,9 +123,9 @@ def _main(trend: Trend, found: Answer) -> str:
     state = f"{trend.fault.symbol} {now} now"
     if trend.verdict == "TOO_FEW":
         count = int(trend.used.sum())
-        why = ("all traces are of one time" if count >= FEWEST else
+        why = ("all traces are of one time" if count >= TREND_FEWEST_TRACES else
                "one trace shows a size, no growth" if count == 1 else "two points lie on every line")
-        return f"{state}; no trend yet: {why}; at least {FEWEST} traces of different times are needed"
+        return f"{state}; no trend yet: {why}; at least {TREND_FEWEST_TRACES} traces of different times are needed"
     if trend.verdict == "NO_TREND":
         return f"{state}; no trend yet: that nothing grows has a probability of {100 * trend.laws['none']:.0f} %"
     assert trend.rate is not None

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import Judged, columns
-from fdi.diagnosis.envelope import NEAREST, Bands, RampBand, StepBand, Width, judged_rows, lasting_most, speed, waver
+from fdi.diagnosis.envelope import Bands, RampBand, StepBand, Width, judged_rows, lasting_most, speed, waver
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Event, Fault
 from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
 from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
+from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.cycles import Cycles
 from fdi.trace.sections import Section, sections
 
@@ -65,7 +66,8 @@ def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged:
     middle, most, there = bands.margins(step, spread)
     rows = s.start + np.rint(step.t / c.period).astype(int)
     rows = np.minimum(rows, s.stop - 1)
-    ax.fill_between(t, -NEAREST * spread * UM, NEAREST * spread * UM, color=GREEN, alpha=0.15, lw=0, label="healthy")
+    healthy = BAND_NEAREST_LIMIT_SD * spread * UM
+    ax.fill_between(t, -healthy, healthy, color=GREEN, alpha=0.15, lw=0, label="healthy")
     side = np.sign(step.middle)
     for limit, colour, label in ((middle, AMBER, "MidBand"), (most, RED, "MaxBand")):
         ax.plot(t, np.where(there, side * limit, np.nan) * UM, color=colour, lw=1.6, label=label)

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.prognosis.trend import FEWEST, Trend, follow
+from fdi.prognosis.trend import Trend, follow
+from fdi.thresholds import TREND_FEWEST_TRACES
 from rig.studies.prognosis.degrading_units import Unit
 
 Floats = NDArray[np.float64]
@@ -57,7 +58,7 @@ def predict(u: Unit, traces: int) -> Prediction:
 def score(u: Unit, by: Predict = predict) -> Score:
     """A unit followed from trace to trace, as it would be in service."""
     end, middle = u.reached(u.fault.most), u.reached(u.fault.middle)
-    counts = [n for n in range(FEWEST, len(u.t) + 1, EVERY) if u.t[n - 1] < end]
+    counts = [n for n in range(TREND_FEWEST_TRACES, len(u.t) + 1, EVERY) if u.t[n - 1] < end]
     every = {n: by(u, n) for n in counts}
     told = [n for n in counts if every[n].told]
     life = end - u.onset

@@ -12,10 +12,11 @@ import pytest
 from fdi.diagnosis import bands as judging
 from fdi.diagnosis.bands import Judged, judge, judge_columns
 from fdi.diagnosis.bands_file import default, load, parse, save, text
-from fdi.diagnosis.envelope import LASTING, Bands, check_command, matches, stays
+from fdi.diagnosis.envelope import Bands, check_command, matches, stays
 from fdi.diagnosis.faults import Level
 from fdi.diagnosis.learn_bands import build
 from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
@@ -67,7 +68,7 @@ def test_a_fault_is_named(size: tuple[float, float], expected: str) -> None:
     assert {j.ruling for j in found} == {expected}
     assert all(level >= Level.MAINTENANCE for level in levels(found, expected))
     assert set(levels(found, other)) == {Level.ACCEPTABLE}
-    assert all(e.t_out - e.t_in >= 0.9 * LASTING * 1e-3 and e.excess > 0 for j in found for e in j.events)
+    assert all(e.t_out - e.t_in >= 0.9 * BAND_EVENT_SAMPLES * 1e-3 and e.excess > 0 for j in found for e in j.events)
 
 
 @pytest.mark.parametrize(("size", "least", "level"), [((0.25, NAN), 0.9, Level.MAINTENANCE),
@@ -112,7 +113,7 @@ def test_spikes_do_not_count() -> None:
             spiked[at + k] += 5e-3 * rng.choice([-1, 1], len(at))
         assert judged(spiked).events == ()
     spiked = x.copy()
-    spiked[5000:5000 + LASTING] += 5e-3
+    spiked[5000:5000 + BAND_EVENT_SAMPLES] += 5e-3
     assert {e.signal for e in judged(spiked).events} == {"position", "speed"}
 
 
