@@ -159,7 +159,7 @@ TREND_MOST_TRACES = 200
 """Traces that are used, the latest ones; older ones no longer say where the size goes, and 200 take 1.3 s."""
 
 NO_GROWTH_PROBABILITY = 0.05
-"""Probability that nothing grows below which a trend is reported; of 100 healthy units with 25 traces none had one."""
+"""Probability that nothing grows, below which a trend is reported; of 100 healthy units with 25 traces none had one."""
 
 BREAK_PRIOR = 0.01
 """Prior probability that a series holds any one kind of break: an outlier, a step, a repair."""
@@ -168,7 +168,7 @@ LAST_OUTLIER_PRIOR = 0.2
 """Prior probability that the last size is out of line: asking for another trace costs little, a false trend much."""
 
 BREAK_MOST = 5
-"""Breaks looked for in a series."""
+"""Breaks looked for in a series, the strongest first; a series with more of them follows no law."""
 
 BREAK_FEWEST_IN_LINE = 3
 """Sizes that must be in line before another one can be called out of line."""
