@@ -31,7 +31,7 @@ ONLY_IN = {
     "canopen": ("rig/",),
     "cantools": ("rig/",),
     "rerun": ("rig/",),
-    "rich": ("rig/",),
+    "rich": ("rig/", "fdi/report/"),
     "mcap": ("rig/", "fdi/"),
     "matplotlib": ("fdi/", "rig/"),
     "jax": ("rig/studies/benchmarks/",),

@@ -14,7 +14,7 @@ from fdi.discovery.search import REACHED, Hypothesis
 from fdi.discovery.significance import p_value, smallest_visible
 from fdi.estimation.fit import Fit
 from fdi.estimation.model_unknowns import UNREPLAYED
-from fdi.report.numbers import SHOWN
+from fdi.report.numbers import SIGNAL_NAMES
 from plant.effects import CATALOGUE
 from plant.model import Model, meaning, offered
 
@@ -245,7 +245,7 @@ def to_json(a: Answer) -> dict[str, Any]:
                       "usual": b.usual} for b in a.blind],
         "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
         "separate": dict(a.separate), "pattern": a.pattern,
-        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SHOWN[s] for s in e.floor}}
+        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor}}
     if several:
         found["ledger"] = [{"effect": effect, "error": error, "holdout": held} for effect, error, held in a.ledger]
     return dict(plain(found))

@@ -14,7 +14,7 @@ from fdi.discovery.model_file import Row
 from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.search import Hypothesis
 from fdi.report.figures import COMMAND, INK, STYLE, svg, thin
-from fdi.report.numbers import SHOWN
+from fdi.report.numbers import SIGNAL_NAMES
 from fdi.trace.record import Record
 from fdi.trace.sections import sections
 
@@ -46,7 +46,7 @@ def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floo
             for side in (-1, 1):
                 ax.axhline(side * TWICE * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
                            label="twice the floor" if side > 0 else None)
-            ax.set_ylabel(f"{SHOWN[name]} [{unit}]")
+            ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
         axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
         for ax in axes:
             _shaded(ax, record)
@@ -100,7 +100,7 @@ def ledger(rows: Sequence[Row], floor: Mapping[str, float]) -> str:
             ax.axhline(1.0, color=FLOOR, lw=1.2)
             ax.set_yscale("log")
             ax.set_xticks(x, names, rotation=20, ha="right")
-            ax.set_title(SHOWN[s], fontsize=9, color=INK)
+            ax.set_title(SIGNAL_NAMES[s], fontsize=9, color=INK)
         axes[0].set_ylabel("error, in floors")
         axes[0].legend(loc="upper right", frameon=False)
         return svg(figure, "ledger")

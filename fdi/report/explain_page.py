@@ -11,7 +11,15 @@ from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.runs import Source
 from fdi.output import rendered
 from fdi.report import explain_figures, explain_text
-from fdi.report.numbers import SHOWN, UNITS, amount, chance, interval, ratio, spoken
+from fdi.report.numbers import (
+    SIGNAL_NAMES,
+    SIGNAL_UNITS,
+    format_amount,
+    format_interval,
+    format_p_value,
+    format_ratio,
+    name_parameter,
+)
 
 MOODS = {"NOTHING_MISSING": "good", "EXPLAINED": "good", "PARTLY": "doubtful", "AMBIGUOUS": "doubtful",
          "NOT_RESOLVABLE": "doubtful", "UNEXPLAINED": "bad"}
@@ -39,7 +47,7 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
         title=title, verdict=a.verdict, mood=MOODS[a.verdict], why=explain_text.sentence(a),
         lines=explain_text.lines(a), then=then,
         notes=notes, facts=[("model", model), *_runs(sources, bool(a.baseline["holdout"]))], command=[command],
-        candidates=[_candidate(c, list(e.floor)) for c in a.explanations], signals=[SHOWN[s] for s in e.floor],
+        candidates=[_candidate(c, list(e.floor)) for c in a.explanations], signals=[SIGNAL_NAMES[s] for s in e.floor],
         parameters=_parameters([c for c in a.candidates if c.effect in e.effects]),
         left=explain_figures.left_over(record, e.base, after, e.floor,
                                 "with what was found" if e.effects else "with the best candidate"),
@@ -47,7 +55,8 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
         ledger=explain_figures.ledger([Row(*row) for row in a.ledger], a.baseline["floor"])
         if len(a.ledger) > 2 else "",
         shape=explain_figures.shape(shape, record.trace.t) if shape and shape.place else "",
-        blind=[(b.effect, spoken(b.parameter), amount(b.smallest, b.unit), amount(b.usual, b.unit),
+        blind=[(b.effect, name_parameter(b.parameter), format_amount(b.smallest, b.unit),
+                format_amount(b.usual, b.unit),
                 not b.smallest <= b.usual) for b in a.blind], suspicious=_suspicious(a.suspicious))
 
 
@@ -59,8 +68,8 @@ def ledger(r: Refit, p: Provenance, intervals: Mapping[str, Value], title: str, 
     first, last = r.steps[0].hypothesis, r.last.hypothesis
     return _page(
         title=title, verdict="FITTED", mood=mood, why=why, lines=[], then="", notes=notes, command=p.history,
-        facts=_runs(sources, bool(p.holdout)), candidates=[], signals=[SHOWN[s] for s in floor],
-        parameters=[(name, interval(v.value, v.low, v.high, v.unit)) for name, v in intervals.items()],
+        facts=_runs(sources, bool(p.holdout)), candidates=[], signals=[SIGNAL_NAMES[s] for s in floor],
+        parameters=[(name, format_interval(v.value, v.low, v.high, v.unit)) for name, v in intervals.items()],
         left=explain_figures.left_over(record, first, last if last is not first else None, floor), ranking="", shape="",
         ledger=explain_figures.ledger(rows, floor), blind=[], suspicious=_suspicious(doubts),
         rows=[_row(row, floor) for row in rows])
@@ -79,20 +88,22 @@ def _runs(sources: Sequence[Source], held: bool) -> list[tuple[str, str]]:
 def _candidate(c: Candidate, signals: Sequence[str]) -> dict[str, Any]:
     return {"name": " + ".join([*c.beside, c.effect]), "word": c.word, "sizes": [explain_text.value(n, v) for n, v in
                                                                             c.parameters.items()],
-            "ratios": [ratio(c.ratios[s]) if s in c.ratios else "–" for s in signals],
-            "holdout": [amount(c.holdout[s], UNITS[s]) if s in c.holdout else "–" for s in signals],
-            "evidence": f"{c.evidence:.0f}", "p": chance(c.p_value), "named": c.word in ("explains", "equal")}
+            "ratios": [format_ratio(c.ratios[s]) if s in c.ratios else "–" for s in signals],
+            "holdout": [format_amount(c.holdout[s], SIGNAL_UNITS[s]) if s in c.holdout else "–" for s in signals],
+            "evidence": f"{c.evidence:.0f}", "p": format_p_value(c.p_value),
+            "named": c.word in ("explains", "equal")}
 
 
 def _parameters(named: Sequence[Candidate]) -> list[tuple[str, str]]:
-    return [(name, interval(v.value, v.low, v.high, v.unit)) for c in named for name, v in c.parameters.items()]
+    return [(name, format_interval(v.value, v.low, v.high, v.unit)) for c in named for name, v in c.parameters.items()]
 
 
 def _suspicious(found: Sequence[Suspicious]) -> list[tuple[str, str, str]]:
-    return [(s.parameter, amount(s.value, s.unit), f"{s.tolerances:+.1f}") for s in found]
+    return [(s.parameter, format_amount(s.value, s.unit), f"{s.tolerances:+.1f}") for s in found]
 
 
 def _row(row: Row, floor: Mapping[str, float]) -> dict[str, Any]:
     return {"name": "the model as it was" if row.effect is None else f"{'–' if row.removed else '+'} {row.effect}",
-            "cells": [(amount(by.get(s, float("nan")), UNITS[s]), ratio(by.get(s, float("nan")) / floor[s]))
+            "cells": [(format_amount(by.get(s, float("nan")), SIGNAL_UNITS[s]),
+                       format_ratio(by.get(s, float("nan")) / floor[s]))
                       for by in (row.error, row.holdout) for s in floor]}

@@ -5,7 +5,15 @@ import math
 from collections.abc import Mapping, Sequence
 
 from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious, Value
-from fdi.report.numbers import SHOWN, UNITS, amount, errors, interval, listed, spoken
+from fdi.report.numbers import (
+    SIGNAL_NAMES,
+    SIGNAL_UNITS,
+    format_amount,
+    format_interval,
+    format_signals,
+    join_words,
+    name_parameter,
+)
 
 SPOKEN = 2  # parameters of an effect in a sentence
 FEWEST = 4  # blind spots, or suspicious parameters, that are listed by name
@@ -18,17 +26,17 @@ def sentence(a: Answer) -> str:
 
 
 def _nothing(a: Answer) -> str:
-    return f"Nothing is missing: what is left is noise ({errors(a.baseline['error'])})."
+    return f"Nothing is missing: what is left is noise ({format_signals(a.baseline['error'])})."
 
 
 def _explained(a: Answer) -> str:
     named = [c for c in a.candidates if c.effect in a.explanation.effects]
-    said = f"{listed(c.effect for c in named)} {'explain it together' if len(named) > 1 else 'explains it'}: "
+    said = f"{join_words(c.effect for c in named)} {'explain it together' if len(named) > 1 else 'explains it'}: "
     return f"{said}{'; '.join(_sizes(c) for c in named)}; {_change(a, named[-1])}."
 
 
 def _ambiguous(a: Answer) -> str:
-    return f"{listed(a.explanation.effects, 'or')}: each explains it, and these data cannot tell which; " \
+    return f"{join_words(a.explanation.effects, 'or')}: each explains it, and these data cannot tell which; " \
            f"{_change(a, a.candidates[0])}."
 
 
@@ -36,7 +44,7 @@ def _partly(a: Answer) -> str:
     named = [c for c in a.candidates if c.effect in a.explanation.effects]
     if not named:
         return _unexplained(a)
-    said = f"{listed(c.effect for c in named)} {'explain' if len(named) > 1 else 'explains'} a part: "
+    said = f"{join_words(c.effect for c in named)} {'explain' if len(named) > 1 else 'explains'} a part: "
     return f"{said}{'; '.join(_sizes(c) for c in named)}; {_change(a, named[-1])}. Something else is missing."
 
 
@@ -45,15 +53,15 @@ def _unexplained(a: Answer) -> str:
     if _firmware_left(a):
         return "The firmware answers otherwise than the model's, and no effect of the catalogue explains how."
     error, floor = (_amount(a.baseline[which], worst) for which in ("error", "floor"))
-    said = f"Nothing in the catalogue explains it: error of {SHOWN[worst]} {error} where noise leaves {floor}"
+    said = f"Nothing in the catalogue explains it: error of {SIGNAL_NAMES[worst]} {error} where noise leaves {floor}"
     best = min(a.candidates, key=lambda c: c.ratio, default=None)
     return f"{said}; {best.effect} does best and leaves {_amount(best.error, worst)}." if best else f"{said}."
 
 
 def _unresolved(a: Answer) -> str:
     c = a.candidates[0]
-    return f"The error is at the floor ({errors(a.baseline['error'])}). {c.effect} may be there ({_sizes(c)}), too " \
-           f"small in this test to be sure."
+    return f"The error is at the floor ({format_signals(a.baseline['error'])}). {c.effect} may be there " \
+           f"({_sizes(c)}), too small in this test to be sure."
 
 
 def _firmware_left(a: Answer) -> bool:
@@ -66,7 +74,7 @@ def _sizes(c: Candidate) -> str:
 
 def value(name: str, v: Value) -> str:
     """A parameter with its interval."""
-    return f"{spoken(name)} {interval(v.value, v.low, v.high, v.unit)}"
+    return f"{name_parameter(name)} {format_interval(v.value, v.low, v.high, v.unit)}"
 
 
 def _worst(a: Answer) -> str:
@@ -78,20 +86,20 @@ def _worst(a: Answer) -> str:
 def _change(a: Answer, c: Candidate) -> str:
     """Error before and after, floor, held-out run."""
     s = _worst(a)
-    said = f"error of {SHOWN[s]} {_amount(a.baseline['error'], s)} -> {_amount(c.error, s)}, floor " \
+    said = f"error of {SIGNAL_NAMES[s]} {_amount(a.baseline['error'], s)} -> {_amount(c.error, s)}, floor " \
            f"{_amount(a.baseline['floor'], s)}"
     return said + (f"; on the held-out run {_amount(c.holdout, s)}" if s in c.holdout else "")
 
 
 def _amount(by: Mapping[str, float], signal: str) -> str:
-    return amount(by.get(signal, math.nan), UNITS[signal])
+    return format_amount(by.get(signal, math.nan), SIGNAL_UNITS[signal])
 
 
 def lines(a: Answer) -> list[tuple[str, str]]:
     """(label, text) of what else there is to know."""
     found = []
     if a.separate:
-        said = f"{a.separate['by']}: in simulation that tells {listed(a.separate['between'])} apart"
+        said = f"{a.separate['by']}: in simulation that tells {join_words(a.separate['between'])} apart"
         found.append(("to split", said))
     elif a.verdict == "AMBIGUOUS":
         found.append(("to split", "no sensor and no command that was tried tells them apart"))
@@ -105,7 +113,7 @@ def lines(a: Answer) -> list[tuple[str, str]]:
 def suspicious(found: Sequence[Suspicious]) -> str:
     """Parameters that are off by more than units differ."""
     worst = sorted(found, key=lambda s: -abs(s.tolerances))
-    said = [f"{s.parameter} {amount(s.value, s.unit)} ({s.tolerances:+.1f} tolerances)" for s in worst[:FEWEST]]
+    said = [f"{s.parameter} {format_amount(s.value, s.unit)} ({s.tolerances:+.1f} tolerances)" for s in worst[:FEWEST]]
     more = f" and {len(worst) - FEWEST} more" if len(worst) > FEWEST else ""
     return f"{', '.join(said)}{more}, further off than a healthy unit has them"
 
@@ -114,10 +122,11 @@ def blind(a: Answer) -> str:
     """What this test would not have seen, and how much it would."""
     unseen = [b for b in a.blind if not b.smallest <= b.usual]
     seen = len(a.blind) - len(unseen) + len(a.noiseless)
-    named = listed(_below(b) for b in unseen[:FEWEST])
+    named = join_words(_below(b) for b in unseen[:FEWEST])
     more = f" and {len(unseen) - FEWEST} more" if len(unseen) > FEWEST else ""
     return f"{named + more if unseen else 'nothing of usual size'}; {seen} other effects would have been seen"
 
 
 def _below(b: Blind) -> str:
-    return f"{b.effect} (any size)" if math.isinf(b.smallest) else f"{b.effect} (below {amount(b.smallest, b.unit)})"
+    size = "any size" if math.isinf(b.smallest) else f"below {format_amount(b.smallest, b.unit)}"
+    return f"{b.effect} ({size})"

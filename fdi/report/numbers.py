@@ -1,101 +1,168 @@
-"""Numbers and findings in the words that people use."""
+"""Numbers as people read them: amounts with units, intervals, ratios to the noise floor, p-values, joined words.
+
+Every printed estimate goes through here, so that it has the same digits and unit on the terminal and on a page.
+"""
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
 
-SHOWN = {"xj": "XJ", "p12": "P12", "xs": "XS", "cor": "Cor"}
-UNITS = {"xj": "m", "p12": "Pa", "xs": "m", "cor": "A"}
-SCALES = {  # the units people use, the smallest first
+SIGNAL_NAMES = {"xj": "XJ", "p12": "P12", "xs": "XS", "cor": "Cor"}
+SIGNAL_UNITS = {"xj": "m", "p12": "Pa", "xs": "m", "cor": "A"}
+READABLE_UNITS = {  # SI unit to the units that people use, the smallest first
     "m": ((1e-6, "um"), (1e-3, "mm")), "A": ((1e-6, "uA"), (1e-3, "mA")), "s": ((1e-6, "us"), (1e-3, "ms"), (1.0, "s")),
     "N": ((1.0, "N"), (1e3, "kN")), "Pa": ((1e5, "bar"),), "m/s": ((1e-3, "mm/s"),), "m/N": ((1e-9, "nm/N"),),
     "N/m": ((1.0, "N/m"), (1e3, "kN/m")),
 }
-MOST = 6  # digits; no measurement here tells more
+NO_NUMBER = "-"  # printed for NaN and infinity
 
 
-def amount(value: float, unit: str) -> str:
-    """An SI value with three digits, in the unit that people use.
+def format_amount(value: float, unit: str, digits: int = 3) -> str:
+    """An SI value with three digits, in the unit that people use; "-" for NaN and infinity.
 
-    >>> amount(2.649e-4, "m"), amount(3.77e5, "Pa"), amount(1.234e-11, "m3/s/Pa")
+    >>> format_amount(2.649e-4, "m"), format_amount(3.77e5, "Pa"), format_amount(1.234e-11, "m3/s/Pa")
     ('265 um', '3.77 bar', '1.23e-11 m3/s/Pa')
+    >>> format_amount(0.25, "1"), format_amount(float("nan"), "m")
+    ('0.250', '-')
     """
     if not math.isfinite(value):
-        return "-"
-    scale, name = _scale(unit, abs(value))
-    return f"{_digits(value / scale, 3)} {name}".rstrip()
+        return NO_NUMBER
+    scale, name = choose_unit(unit, abs(value))
+    return f"{format_digits(value / scale, digits)} {name}".rstrip()
 
 
-def interval(value: float, low: float, high: float, unit: str) -> str:
-    """An SI value between two limits, with as many digits as the limits are worth.
+def format_signal(value: float, signal: str) -> str:
+    """A value of one of the measured signals.
 
-    >>> interval(45.01, 44.6, 45.4, "N"), interval(2.2e-5, 2.18e-5, 2.22e-5, "m")
+    >>> format_signal(1.8e-5, "xj")
+    '18.0 um'
+    """
+    return format_amount(value, SIGNAL_UNITS[signal])
+
+
+def format_signals(by_signal: Mapping[str, float]) -> str:
+    """A value of each signal in one line.
+
+    >>> format_signals({"xj": 1.8e-5, "p12": 4.2e4})
+    'XJ 18.0 um, P12 0.420 bar'
+    """
+    return ", ".join(f"{SIGNAL_NAMES[s]} {format_signal(x, s)}" for s, x in by_signal.items())
+
+
+def format_interval(value: float, low: float, high: float, unit: str, most_digits: int = 6) -> str:
+    """An SI value with its interval, with as many digits as the interval is worth.
+
+    >>> format_interval(45.01, 44.6, 45.4, "N"), format_interval(2.2e-5, 2.18e-5, 2.22e-5, "m")
     ('45.0 N (44.6 .. 45.4)', '22.0 um (21.8 .. 22.2)')
     """
-    scale, name = _scale(unit, max(abs(value), abs(low), abs(high)))
-    half, size = 0.5 * abs(high - low) / scale, max(abs(value), abs(low), abs(high)) / scale
-    wanted = MOST if half == 0.0 else 1 + math.floor(math.log10(size)) - math.floor(math.log10(half)) if size else 1
-    count = min(max(wanted, 2), MOST)
-    shown = [_digits(x / scale, count, size) for x in (value, low, high)]
+    limits = [x for x in (value, low, high) if math.isfinite(x)]
+    largest = max(map(abs, limits), default=0.0)
+    scale, name = choose_unit(unit, largest)
+    digits = _digits_of_interval(0.5 * abs(high - low), largest, most_digits)
+    shown = [format_digits(x / scale, digits, largest / scale) for x in (value, low, high)]
     return f"{shown[0]} {name}".rstrip() + f" ({shown[1]} .. {shown[2]})"
 
 
-def _scale(unit: str, size: float) -> tuple[float, str]:
+def _digits_of_interval(half: float, largest: float, most: int) -> int:
+    """Digits that show an interval of this half-width to two digits."""
+    if largest == 0.0 or not math.isfinite(half):
+        return 2
+    if half == 0.0:
+        return most
+    wanted = 1 + math.floor(math.log10(largest)) - math.floor(math.log10(half))
+    return min(max(wanted, 2), most)
+
+
+def format_ratio(ratio: float) -> str:
+    """An error over its noise floor, 1 for noise alone.
+
+    >>> format_ratio(1.0234), format_ratio(16.47), format_ratio(4995.6), format_ratio(499452.6), format_ratio(0.008)
+    ('1.02', '16.5', '4996', '>10000', '<0.1')
+    """
+    if math.isnan(ratio):
+        return NO_NUMBER
+    if ratio > 1e4:
+        return ">10000"
+    if ratio < 0.1:
+        return "<0.1"
+    return format_digits(ratio, 3) if ratio < 1000.0 else f"{ratio:.0f}"
+
+
+def format_p_value(p: float) -> str:
+    """A p-value with two digits.
+
+    >>> format_p_value(0.0312), format_p_value(2e-30), format_p_value(1e-300)
+    ('0.031', '2e-30', '<1e-99')
+    """
+    if p >= 1e-3:
+        return f"{p:.2g}"
+    return f"{p:.0e}" if p >= 1e-99 else "<1e-99"
+
+
+def format_percent(share: float, digits: int = 2) -> str:
+    """A share of 1 in percent.
+
+    >>> format_percent(0.4567), format_percent(0.0012), format_percent(1.0)
+    ('46 %', '0.12 %', '100 %')
+    """
+    return f"{format_digits(100.0 * share, digits)} %" if math.isfinite(share) else NO_NUMBER
+
+
+def format_digits(x: float, digits: int = 3, size: float | None = None) -> str:
+    """A number with so many digits, counted from the first digit of `size` (default: of the number itself).
+
+    >>> format_digits(0.0312), format_digits(45.0), format_digits(3.0, 3, 45.0), format_digits(1.2e-7)
+    ('0.0312', '45.0', '3.0', '1.20e-07')
+    """
+    if not math.isfinite(x):
+        return NO_NUMBER
+    reference = abs(x) if size is None else size
+    if x == 0.0 or reference == 0.0:
+        return "0"
+    place = math.floor(math.log10(reference))
+    shown = f"{x:.{max(0, digits - 1 - place)}f}" if -4 <= place <= 6 else f"{x:.{digits - 1}e}"
+    return shown if float(shown) else shown.lstrip("-")  # not "-0.0"
+
+
+def choose_unit(unit: str, size: float) -> tuple[float, str]:
+    """The unit people use for an SI value of this size: (its SI value, its name).
+
+    >>> choose_unit("m", 2e-3), choose_unit("kg", 5.0), choose_unit("1", 0.2)
+    ((0.001, 'mm'), (1.0, 'kg'), (1.0, ''))
+    """
+    known = READABLE_UNITS.get(unit, ())
     found = (1.0, "" if unit == "1" else unit)
-    known = SCALES.get(unit, ())
     for scale, name in known:
         if size >= scale or scale == known[0][0]:
             found = (scale, name)
     return found
 
 
-def _digits(x: float, count: int, size: float | None = None) -> str:
-    """So many digits of a number as large as `size`."""
-    whole = abs(x) if size is None else size
-    if x == 0.0 or whole == 0.0:
-        return "0"
-    place = math.floor(math.log10(whole))
-    shown = f"{x:.{max(0, count - 1 - place)}f}" if -4 <= place <= 6 else f"{x:.{count - 1}e}"
-    return shown if float(shown) else shown.lstrip("-")
-
-
-def listed(words: Iterable[str], joined: str = "and") -> str:
+def join_words(words: Iterable[str], conjunction: str = "and") -> str:
     """Words with commas and an "and".
 
-    >>> listed(["a", "b", "c"])
-    'a, b and c'
+    >>> join_words(["a", "b", "c"]), join_words(["a", "b"], "or")
+    ('a, b and c', 'a or b')
     """
     every = list(words)
-    return f" {joined} ".join([", ".join(every[:-1]), every[-1]]) if len(every) > 1 else "".join(every)
+    if len(every) < 2:
+        return "".join(every)
+    return f"{', '.join(every[:-1])} {conjunction} {every[-1]}"
 
 
-def spoken(parameter: str) -> str:
-    """A parameter "group.field" as people say it, the effect being known.
+def count_nouns(count: int, noun: str) -> str:
+    """A count and its noun, which takes an "s" where it is not one.
 
-    >>> spoken("spool.static_friction")
+    >>> count_nouns(1, "repeat"), count_nouns(3, "cycle")
+    ('1 repeat', '3 cycles')
+    """
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def name_parameter(parameter: str) -> str:
+    """A parameter "group.field" in words, where the effect is known from the context.
+
+    >>> name_parameter("spool.static_friction")
     'static friction'
     """
     return parameter.partition(".")[2].replace("_", " ")
-
-
-def errors(by_signal: Mapping[str, float]) -> str:
-    """An error of each signal in a line."""
-    return ", ".join(f"{SHOWN[s]} {amount(x, UNITS[s])}" for s, x in by_signal.items())
-
-
-def ratio(value: float) -> str:
-    """How many times the floor.
-
-    >>> ratio(1.0234), ratio(16.47), ratio(4995.6)
-    ('1.02', '16.5', '4996')
-    """
-    return "-" if not math.isfinite(value) else _digits(value, 3) if value < 1000 else f"{value:.0f}"
-
-
-def chance(p: float) -> str:
-    """A p-value.
-
-    >>> chance(0.0312), chance(2e-30), chance(1e-300)
-    ('0.031', '2e-30', '<1e-99')
-    """
-    return f"{p:.2g}" if p >= 1e-3 else f"{p:.0e}" if p >= 1e-99 else "<1e-99"

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from fdi.discovery.candidates import Answer, Candidate
 from fdi.report import explain_text
-from fdi.report.numbers import SHOWN, chance, ratio
+from fdi.report.numbers import SIGNAL_NAMES, format_p_value, format_ratio
 from rig.cli.terminal import console
 
 COLOURS = {"NOTHING_MISSING": "green", "EXPLAINED": "green", "PARTLY": "yellow", "AMBIGUOUS": "yellow",
@@ -44,13 +44,13 @@ def table(a: Answer) -> Table:
     t = Table(box=None, pad_edge=False)
     t.add_column("effect")
     t.add_column("")
-    for column in [*(SHOWN[s] for s in signals), *(["held out"] if held else []), "evidence", "p"]:
+    for column in [*(SIGNAL_NAMES[s] for s in signals), *(["held out"] if held else []), "evidence", "p"]:
         t.add_column(column, justify="right")
     for c in a.explanations[:ROWS]:
         t.add_row(*_row(a, c, signals, held))
     before = a.explanation.base.ratio
     unseen = [_worst(a, a.baseline["holdout"])] if held else []
-    t.add_row("[dim]none of them[/]", "", *(f"[dim]{ratio(before[s])}[/]" for s in signals),
+    t.add_row("[dim]none of them[/]", "", *(f"[dim]{format_ratio(before[s])}[/]" for s in signals),
               *(f"[dim]{word}[/]" for word in unseen), "", "")
     t.caption = "what is left of each signal, in floors (1: noise alone)"
     t.caption_justify = "left"
@@ -60,13 +60,13 @@ def table(a: Answer) -> Table:
 def _row(a: Answer, c: Candidate, signals: Sequence[str], held: bool) -> list[str]:
     colour = WORDS.get(c.word, "dim")
     name = " + ".join(f"[bold]{x}[/]" if colour != "dim" else x for x in (*c.beside, c.effect))
-    shown = [ratio(c.ratios[s]) if s in c.ratios else "-" for s in signals]
+    shown = [format_ratio(c.ratios[s]) if s in c.ratios else "-" for s in signals]
     return [name, f"[{colour}]{c.word}[/]", *shown, *([_worst(a, c.holdout)] if held else []), f"{c.evidence:.0f}",
-            chance(c.p_value)]
+            format_p_value(c.p_value)]
 
 
 def _worst(a: Answer, holdout: object) -> str:
     """The worst signal of a held-out run, in floors."""
     floor = a.explanation.floor
     by = holdout if isinstance(holdout, dict) else {}
-    return ratio(max(x / floor[s] for s, x in by.items() if s in floor)) if by else "-"
+    return format_ratio(max(x / floor[s] for s, x in by.items() if s in floor)) if by else "-"

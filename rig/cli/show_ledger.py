@@ -10,7 +10,7 @@ from rich.table import Table
 
 from fdi.discovery.model_file import Row
 from fdi.report import explain_text
-from fdi.report.numbers import SHOWN, UNITS, amount, interval, ratio
+from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, format_amount, format_interval, format_ratio
 from rig.cli.model_update import Done
 from rig.cli.terminal import console
 
@@ -30,7 +30,7 @@ def shown(done: Done, path: Path, page: Path | None, kept: Path | None, why: str
         out.print()
         out.print(bars(done.provenance.ledger, floor))
     out.print()
-    said = [(name, interval(v.value, v.low, v.high, v.unit)) for name, v in done.effects.items()]
+    said = [(name, format_interval(v.value, v.low, v.high, v.unit)) for name, v in done.effects.items()]
     said += [("suspicious", explain_text.suspicious(done.doubts))] if done.doubts else []
     said += [("note", note) for note in done.notes]
     said.append(("model", f"{path}" + (f" (the one before: {kept})" if kept else "")))
@@ -46,12 +46,12 @@ def table(rows: Sequence[Row], floor: Mapping[str, float]) -> Table:
     t.add_column("")
     t.add_column("")
     for s in floor:
-        t.add_column(SHOWN[s], justify="right")
+        t.add_column(SIGNAL_NAMES[s], justify="right")
     for row in rows:
         t.add_row(name_of(row), "", *(_cell(row.error, s, floor) for s in floor))
         if row.holdout:
             t.add_row("", "[dim]held out[/]", *(_cell(row.holdout, s, floor) for s in floor))
-    t.add_row("[dim]floor[/]", "", *(f"[dim]{amount(x, UNITS[s])}[/]" for s, x in floor.items()))
+    t.add_row("[dim]floor[/]", "", *(f"[dim]{format_amount(x, SIGNAL_UNITS[s])}[/]" for s, x in floor.items()))
     return t
 
 
@@ -64,7 +64,7 @@ def _cell(by: Mapping[str, float], signal: str, floor: Mapping[str, float]) -> s
     if signal not in by:
         return "-"
     good = by[signal] <= GOOD * floor[signal]
-    return f"[{'green' if good else 'red'}]{amount(by[signal], UNITS[signal])}[/]"
+    return f"[{'green' if good else 'red'}]{format_amount(by[signal], SIGNAL_UNITS[signal])}[/]"
 
 
 def bars(rows: Sequence[Row], floor: Mapping[str, float]) -> Table:
@@ -82,4 +82,4 @@ def bars(rows: Sequence[Row], floor: Mapping[str, float]) -> Table:
 
 def _bar(size: float, top: float) -> tuple[str, str]:
     length = max(1, round(WIDTH * math.log(max(size, 1.0)) / math.log(max(top, 1.1))))
-    return f"[{'green' if size <= GOOD else 'red'}]{'█' * length}[/]", f"{ratio(size)} floors"
+    return f"[{'green' if size <= GOOD else 'red'}]{'█' * length}[/]", f"{format_ratio(size)} floors"

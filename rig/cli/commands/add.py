@@ -50,14 +50,15 @@ def run_command(args: argparse.Namespace) -> int:
 
 def sentence(done: Done, effects: list[str]) -> str:
     """What came of it."""
-    from fdi.report.numbers import SHOWN, UNITS, amount, listed
+    from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, format_amount, format_signal, join_words
 
     assert done.refit is not None
     before, after = done.refit.steps[-1 - len(effects)], done.refit.last
     floor = done.provenance.floor or done.refit.floor
     s = max(before.error, key=lambda name: before.error[name] / floor[name])
-    said = f"{listed(effects)} added: error of {SHOWN[s]} {amount(before.error[s], UNITS[s])} -> " \
-           f"{amount(after.error[s], UNITS[s])}, floor {amount(floor[s], UNITS[s])}"
+    said = f"{join_words(effects)} added: error of {SIGNAL_NAMES[s]} {format_signal(before.error[s], s)} " \
+           f"-> {format_amount(after.error[s], SIGNAL_UNITS[s])}, floor {format_amount(floor[s], SIGNAL_UNITS[s])}"
     if s in after.holdout:
-        said += f"; on the held-out run {amount(before.holdout[s], UNITS[s])} -> {amount(after.holdout[s], UNITS[s])}"
+        said += f"; on the held-out run {format_amount(before.holdout[s], SIGNAL_UNITS[s])} -> " \
+                f"{format_amount(after.holdout[s], SIGNAL_UNITS[s])}"
     return f"{said}." if done.refit.helps else f"{said}. {effects[-1]} takes away nothing but noise."

@@ -55,12 +55,12 @@ def run_command(args: argparse.Namespace) -> int:
 
 def sentence(done: Done, effect: str) -> str:
     """What came of it."""
-    from fdi.report.numbers import SHOWN, UNITS, amount
+    from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, format_amount
 
     if done.refit is None:
         return f"{effect} is out."
     before, after = done.provenance.ledger[-2:]
     floor = done.provenance.floor or done.refit.floor
     s = max(after.error, key=lambda name: after.error[name] / floor[name])
-    return f"{effect} is out: error of {SHOWN[s]} {amount(before.error[s], UNITS[s])} -> " \
-           f"{amount(after.error[s], UNITS[s])}, floor {amount(floor[s], UNITS[s])}."
+    return f"{effect} is out: error of {SIGNAL_NAMES[s]} {format_amount(before.error[s], SIGNAL_UNITS[s])} -> " \
+           f"{format_amount(after.error[s], SIGNAL_UNITS[s])}, floor {format_amount(floor[s], SIGNAL_UNITS[s])}."

@@ -1,0 +1,203 @@
+"""The report: what a command answers, as one value that the terminal, HTML and JSON writers render.
+
+A command builds a `Report` once. `terminal.print_report` shows it to a person, `html.render_html` writes it as a page,
+and `json.to_json(report.data)` prints it for other programs. The report holds finished text; numbers in it went through
+`numbers`. Figures are callables, so that nothing is drawn for a terminal.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, ClassVar, Literal
+
+Mood = Literal["", "good", "doubtful", "bad", "neutral", "muted"]
+Align = Literal["left", "right"]
+
+
+class Medium(Enum):
+    """Where a part of a report is shown."""
+
+    BOTH = "both"
+    TERMINAL = "terminal"
+    PAGE = "page"
+
+    def includes(self, other: Medium) -> bool:
+        """Whether a part for this medium is shown on `other`."""
+        return self in (Medium.BOTH, other)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: its text, the mood that colours it, and whether it is printed bold."""
+
+    text: str
+    mood: Mood = ""
+    is_strong: bool = False
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table. Numbers are aligned to the right and never cut or wrapped."""
+
+    title: str
+    unit: str = ""
+    align: Align = "left"
+    medium: Medium = Medium.BOTH
+
+    @property
+    def heading(self) -> str:
+        """Title and unit.
+
+        >>> Column("error", "um").heading
+        'error [um]'
+        """
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns. Each row has a cell for every column; a plain string is a cell without mood.
+
+    Args:
+        columns: the columns, from the left.
+        rows: the rows, from the top.
+        caption: what to see in the table.
+        terminal_rows: number of rows that the terminal shows; None for all. The page has all.
+        is_list: the page gives the first column only the width it needs, as for names and values.
+        medium: where the table is shown.
+    """
+
+    kind: ClassVar[str] = "table"
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell | str]]
+    caption: str = ""
+    terminal_rows: int | None = None
+    is_list: bool = False
+    medium: Medium = Medium.BOTH
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"a row of {len(row)} cells in a table of {len(self.columns)} columns: {row}")
+
+    def select_columns(self, medium: Medium) -> Table:
+        """The same table with the columns of one medium; cells are `Cell` values."""
+        shown = [i for i, column in enumerate(self.columns) if column.medium.includes(medium)]
+        rows = [[_as_cell(row[i]) for i in shown] for row in self.rows]
+        return replace(self, columns=[self.columns[i] for i in shown], rows=rows)
+
+
+def _as_cell(cell: Cell | str) -> Cell:
+    return cell if isinstance(cell, Cell) else Cell(cell)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A label and what it says: "floor     from 1 repeat of the test"."""
+
+    kind: ClassVar[str] = "line"
+    label: str
+    text: str
+    mood: Mood = ""
+    medium: Medium = Medium.BOTH
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Running text."""
+
+    kind: ClassVar[str] = "paragraph"
+    text: str
+    mood: Mood = ""
+    medium: Medium = Medium.BOTH
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure on the page. `draw` returns it as SVG text, or "" where there is nothing to draw.
+
+    The caption says what to see. The terminal never calls `draw`.
+    """
+
+    kind: ClassVar[str] = "figure"
+    caption: str
+    draw: Callable[[], str]
+    medium: Medium = Medium.PAGE
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Text in fixed-width characters, line by line: a command, a file, a drawing made of characters.
+
+    With a `title` the page folds the listing behind it.
+    """
+
+    kind: ClassVar[str] = "listing"
+    text: str
+    title: str = ""
+    medium: Medium = Medium.BOTH
+
+
+Item = Table | Line | Paragraph | Figure | Listing
+
+
+@dataclass(frozen=True)
+class Section:
+    """Items under a heading. A section without items is not shown.
+
+    Args:
+        title: heading on the page, "" for none.
+        items: what stands below it.
+        badge: a word beside the heading, such as the level of a fault, with its mood.
+        medium: where the section is shown.
+        title_medium: where its heading is shown; most tables speak for themselves on a terminal.
+    """
+
+    title: str
+    items: Sequence[Item]
+    badge: Cell | None = None
+    medium: Medium = Medium.BOTH
+    title_medium: Medium = Medium.PAGE
+
+    def select_items(self, medium: Medium) -> list[Item]:
+        """The items that one medium shows; none if it does not show the section."""
+        if not self.medium.includes(medium):
+            return []
+        return [item for item in self.items if item.medium.includes(medium)]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a command answers.
+
+    Args:
+        command: the command that answers, such as "compare".
+        title: what it is about: the trace, the model file.
+        verdict: the verdict word of the JSON answer; "" where the command has none.
+        mood: colour of the verdict.
+        sentence: the verdict in plain English.
+        facts: (name, text) of what the answer is based on; under the title of the page.
+        notes: what a reader must know before trusting the answer.
+        sections: tables, lines, figures and text, in the order in which they are shown.
+        next_command: what to type next; "" if there is nothing left to do.
+        files: (label, path) of the files that were written.
+        data: the JSON answer: plain values, numpy values, NaN and infinity; SI units.
+    """
+
+    command: str
+    title: str
+    verdict: str = ""
+    mood: Mood = "neutral"
+    sentence: str = ""
+    facts: Sequence[tuple[str, str]] = ()
+    notes: Sequence[str] = ()
+    sections: Sequence[Section] = ()
+    next_command: str = ""
+    files: Sequence[tuple[str, str]] = ()
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    def select_sections(self, medium: Medium) -> list[tuple[Section, list[Item]]]:
+        """The sections that one medium shows, each with its items there."""
+        chosen = ((section, section.select_items(medium)) for section in self.sections)
+        return [(section, items) for section, items in chosen if items]

@@ -1,0 +1,164 @@
+"""The terminal writer: verdict, tables and labelled lines, for a person at a console of 80 columns or more."""
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from fdi.report.report import Cell, Column, Item, Line, Listing, Medium, Mood, Paragraph, Report, Table
+
+STYLES: dict[Mood, str] = {"": "", "good": "green", "doubtful": "yellow", "bad": "red", "neutral": "bold",
+                           "muted": "dim"}
+GAP = 2  # characters between two columns
+LABEL_WIDTH = 10  # characters of a label, if none is longer
+
+
+def print_report(report: Report, console: Console) -> None:
+    """Print a report: the verdict first, then its sections, notes, files, and what to type next.
+
+    A table that is wider than the console is printed in blocks of columns; a number is never cut.
+    """
+    _print_headline(report, console)
+    labels: list[Line] = []
+    for section, items in report.select_sections(Medium.TERMINAL):
+        if section.title_medium.includes(Medium.TERMINAL) or section.badge is not None:
+            _flush_lines(labels, console)
+            console.print()
+            badge = Text(f"  {section.badge.text}", style_of(section.badge)) if section.badge else Text()
+            console.print(Text.assemble((section.title, "bold"), badge), soft_wrap=True)
+        for item in items:
+            if isinstance(item, Line):
+                labels.append(item)
+            else:
+                _flush_lines(labels, console)
+                _print_item(item, console)
+    labels += [Line("note", note) for note in report.notes]
+    labels += [Line(label, path) for label, path in report.files]
+    if report.next_command:
+        labels.append(Line("next", report.next_command, "neutral"))
+    _flush_lines(labels, console)
+
+
+def _print_headline(report: Report, console: Console) -> None:
+    if report.verdict:
+        verdict = Text(report.verdict, style_of(Cell("", report.mood, True)))
+        console.print(Text.assemble(verdict, f"  {report.sentence}"), soft_wrap=True)
+    elif report.sentence:
+        console.print(Text(report.sentence, "bold"), soft_wrap=True)
+
+
+def _print_item(item: Item, console: Console) -> None:
+    if isinstance(item, Table):
+        console.print()
+        _print_table(item.select_columns(Medium.TERMINAL), console)
+    elif isinstance(item, Paragraph):
+        console.print()
+        console.print(Text(item.text, STYLES[item.mood]))
+    elif isinstance(item, Listing):
+        console.print(Text(item.text), soft_wrap=True)
+
+
+def _flush_lines(lines: list[Line], console: Console) -> None:
+    """Print labelled lines with their texts in one column; a console wraps a long text itself, so it can be copied."""
+    if not lines:
+        return
+    console.print()
+    width = max(LABEL_WIDTH, *(cell_len(line.label) + GAP for line in lines))
+    for line in lines:
+        label = Text(line.label + " " * (width - cell_len(line.label)), "dim")
+        console.print(Text.assemble(label, (line.text, STYLES[line.mood])), soft_wrap=True)
+    lines.clear()
+
+
+def _print_table(table: Table, console: Console) -> None:
+    rows = [[_as_cell(cell) for cell in row] for row in table.rows]
+    shown = rows if table.terminal_rows is None else rows[:table.terminal_rows]
+    for columns in split_columns(table.columns, shown, console.width):
+        block = [[row[i] for i in columns] for row in shown]
+        console.print(_build_table([table.columns[i] for i in columns], block, console.width))
+    if len(shown) < len(rows):
+        console.print(Text(f"and {len(rows) - len(shown)} more", "dim"))
+    if table.caption:
+        console.print(Text(table.caption, "dim italic"))
+
+
+def _as_cell(cell: Cell | str) -> Cell:
+    return cell if isinstance(cell, Cell) else Cell(cell)
+
+
+def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> RichTable:
+    out = RichTable(box=None, pad_edge=False, padding=(0, GAP, 0, 0), show_header=any(c.heading for c in columns))
+    for i, (column, wanted) in enumerate(zip(columns, heading_widths(columns, rows, width), strict=True)):
+        needed = minimal_width(column, [row[i] for row in rows])
+        if column.align == "right":
+            heading = Text("\n".join(wrap_heading(column.heading, wanted)))
+            out.add_column(heading, justify="right", no_wrap=True, min_width=needed)
+        else:
+            out.add_column(Text(column.heading), overflow="fold", min_width=needed)
+    for row in rows:
+        out.add_row(*(Text(cell.text, style_of(cell)) for cell in row))
+    return out
+
+
+def heading_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> list[int]:
+    """Characters of each heading: all of it where the table has room, else as many as the column needs anyway."""
+    needed = [minimal_width(column, [row[i] for row in rows]) for i, column in enumerate(columns)]
+    natural = [max([needed[i], *(cell_len(row[i].text) for row in rows)]) for i in range(len(columns))]
+    room = width - sum(natural) - GAP * (len(columns) - 1)
+    out = []
+    for column, own in zip(columns, needed, strict=True):
+        more = max(0, cell_len(column.heading) - own) if column.align == "right" else 0
+        if more > room:
+            more = 0
+        room -= more
+        out.append(own + more)
+    return out
+
+
+def style_of(cell: Cell) -> str:
+    """The rich style of a cell: its colour, and bold where it matters."""
+    is_bold = cell.is_strong or cell.mood == "bad"
+    return " ".join(word for word in ("bold" if is_bold else "", STYLES[cell.mood]) if word)
+
+
+def minimal_width(column: Column, cells: Sequence[Cell]) -> int:
+    """Characters that a column needs: its widest number, or its longest word where text may wrap; and its heading."""
+    heading = max(map(cell_len, column.heading.split()), default=0)
+    texts = [line for cell in cells for line in cell.text.split("\n")]
+    if column.align == "left":
+        texts = [word for text in texts for word in text.split()]
+    return max([heading, *map(cell_len, texts)], default=0)
+
+
+def wrap_heading(heading: str, width: int) -> list[str]:
+    """The words of a heading in lines of at most `width` characters.
+
+    >>> wrap_heading("from the command alone", 8)
+    ['from the', 'command', 'alone']
+    """
+    lines: list[str] = []
+    for word in heading.split():
+        if lines and cell_len(lines[-1]) + 1 + cell_len(word) <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
+def split_columns(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> Iterator[list[int]]:
+    """Numbers of the columns of each block that fits into `width` characters; each block begins with the first column.
+
+    A single column that is wider than the console makes a block of its own.
+    """
+    needed = [minimal_width(column, [row[i] for row in rows]) for i, column in enumerate(columns)]
+    block, used = [0], needed[0]
+    for i in range(1, len(columns)):
+        if len(block) > 1 and used + GAP + needed[i] > width:
+            yield block
+            block, used = [0], needed[0]
+        block.append(i)
+        used += GAP + needed[i]
+    yield block

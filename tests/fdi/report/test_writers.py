@@ -1,0 +1,240 @@
+"""The three writers: one report with an item of every kind, as terminal text, as a page and as JSON."""
+from __future__ import annotations
+
+import json
+import math
+from enum import IntEnum
+from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from fdi.report.html import render_html, write_html
+from fdi.report.json import to_json, to_plain
+from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Paragraph, Report, Section, Table
+from fdi.report.terminal import print_report
+from plant.errors import InputError
+
+HOSTILE = "<script>alert('x')</script> [bold]a & b[/] [/nothing]"
+
+
+def printed(report: Report, width: int = 80) -> str:
+    """What a person sees on a console of this width."""
+    out = StringIO()
+    print_report(report, Console(file=out, width=width, force_terminal=False, highlight=False))
+    return out.getvalue()
+
+
+class _Page(HTMLParser):
+    """The text of a page, its open elements, and its table cells."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: set[str] = set()
+        self.text = ""
+        self.cells: list[tuple[str, str]] = []  # class, text
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.add(tag)
+        if tag not in ("meta", "br", "path"):
+            self.open.append(tag)
+        if tag in ("td", "th"):
+            self.cells.append((dict(attrs).get("class") or "", ""))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag != "path":
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text += data
+        if self.open and self.open[-1] in ("td", "th"):
+            css, text = self.cells[-1]
+            self.cells[-1] = (css, text + data)
+
+
+def report_with(*items: Item, **fields: Any) -> Report:
+    return Report("compare", "run 7", "MODEL_INCOMPLETE", "bad", "The error is above the noise floor.",
+                  sections=[Section("Signals", items)], **fields)
+
+
+TABLE = Table([Column("signal"), Column("error", "um", "right"), Column("floor from", medium=Medium.PAGE),
+               Column("short form", medium=Medium.TERMINAL)],
+              [["XJ", Cell("265", "bad", True), "repeats", "rep"], ["XS", Cell("1.02", "good"), "model", "mod"]],
+              caption="A perfect model has ratio 1.")
+
+
+@pytest.fixture
+def whole() -> Report:
+    drawn = Figure("The residual stays within the green band.", lambda: '<svg id="drawing"><path d="M0 0"/></svg>')
+    items = [TABLE, Line("floor", "from 1 repeat"), Line("solver", "0.1 um", "doubtful"), drawn,
+             Paragraph("Errors are RMS values."), Paragraph("only for a page", medium=Medium.PAGE),
+             Paragraph("only for a terminal", medium=Medium.TERMINAL),
+             Listing("t,com,xj\n0,0,0", "run.csv", Medium.PAGE), Listing("*  *\n ** ", medium=Medium.TERMINAL)]
+    return report_with(*items, facts=[("model", "eha")], notes=["3 rows were left out"],
+                       next_command="rig explain run.csv", files=[("page", "compare.html")],
+                       data={"verdict": "MODEL_INCOMPLETE", "error": np.float64(2.65e-4), "floor": math.nan})
+
+
+def test_terminal_shows_every_kind_of_item(whole: Report) -> None:
+    text = printed(whole)
+    lines = text.splitlines()
+    assert lines[0] == "MODEL_INCOMPLETE  The error is above the noise floor."
+    for words in ("signal", "error [um]", "265", "A perfect model has ratio 1.", "Errors are RMS values.",
+                  "only for a terminal", "rep", "*  *\n ** "):
+        assert words in text
+    for label, words in (("floor", "from 1 repeat"), ("solver", "0.1 um"), ("note", "3 rows were left out"),
+                         ("page", "compare.html"), ("next", "rig explain run.csv")):
+        assert f"{label:<10}{words}" in lines
+    for words in ("only for a page", "floor from", "repeats", "svg", "run.csv\n", "green band", "Signals"):
+        assert words not in text
+
+
+def test_terminal_never_draws() -> None:
+    def draw() -> str:
+        raise AssertionError("drawn for a terminal")
+
+    assert "green" not in printed(report_with(Figure("green", draw, Medium.BOTH)))
+
+
+def test_page_shows_every_kind_of_item(whole: Report) -> None:
+    text = render_html(whole)
+    page = _Page(text)
+    assert page.open == []
+    for words in ("MODEL_INCOMPLETE", "run 7", "The error is above the noise floor.", "Signals", "error [um]", "265",
+                  "A perfect model has ratio 1.", "from 1 repeat", "0.1 um", "Errors are RMS values.", "floor from",
+                  "only for a page", "The residual stays within the green band.", "t,com,xj\n0,0,0", "run.csv", "model",
+                  "eha", "3 rows were left out", "rig explain run.csv"):
+        assert words in page.text
+    assert {"figure", "figcaption", "svg", "details", "pre", "h2"} <= page.seen
+    assert ("n is-bad strong", "265") in page.cells
+    assert ("n is-good ", "1.02") in page.cells
+    for words in ("only for a terminal", "short form", "*  *"):
+        assert words not in page.text
+    assert 'class="verdict bad"' in text
+
+
+def test_page_leaves_out_a_figure_without_a_drawing_and_an_empty_section() -> None:
+    empty = Section("Nothing to see", [Paragraph("only there", medium=Medium.TERMINAL)])
+    report = Report("compare", "run 7", sections=[empty, Section("Drawn", [Figure("caption", lambda: "")])])
+    page = _Page(render_html(report))
+    assert "Nothing to see" not in page.text
+    assert "figure" not in page.seen
+    assert "caption" not in page.text
+
+
+def test_neighbouring_lines_share_a_table() -> None:
+    text = render_html(report_with(Line("a", "1"), Line("b", "2"), Paragraph("between"), Line("c", "3")))
+    assert text.count("<table") == 2
+
+
+def test_section_with_a_badge() -> None:
+    section = Section("filter clogging", [Line("size", "0.3")], Cell("MAINTENANCE", "doubtful"))
+    report = Report("fdi", "run 7", sections=[section])
+    assert "filter clogging  MAINTENANCE\n" in printed(report)
+    assert '<h2>filter clogging <span class="is-doubtful">MAINTENANCE</span></h2>' in render_html(report)
+
+
+@pytest.mark.parametrize("item", [
+    Table([Column(HOSTILE)], [[HOSTILE]], HOSTILE), Line(HOSTILE, HOSTILE), Paragraph(HOSTILE),
+    Listing(HOSTILE, HOSTILE), Figure(HOSTILE, lambda: "<svg></svg>")], ids=lambda item: item.kind)
+def test_text_is_escaped(item: Item) -> None:
+    """Nothing that a file or a user says is markup, on the page or in the terminal."""
+    report = Report("compare", HOSTILE, HOSTILE, "bad", HOSTILE, [(HOSTILE, HOSTILE)], [HOSTILE],
+                    [Section(HOSTILE, [item], Cell(HOSTILE))], HOSTILE, [(HOSTILE, HOSTILE)])
+    page = _Page(render_html(report))
+    assert page.open == []
+    assert "script" not in page.seen
+    assert page.text.count(HOSTILE) >= 7
+    assert HOSTILE in printed(report, 400)
+
+
+def test_json_has_no_nan_and_no_numpy(whole: Report) -> None:
+    def reject(word: str) -> None:
+        raise AssertionError(word)
+
+    assert json.loads(to_json(whole.data), parse_constant=reject) == {
+        "verdict": "MODEL_INCOMPLETE", "error": 2.65e-4, "floor": None}
+
+
+class _Level(IntEnum):
+    HIGH = 2
+
+
+@pytest.mark.parametrize(("value", "plain"), [
+    (math.nan, None), (-math.inf, None), (np.float64("inf"), None), (np.float32(0.5), 0.5), (np.int64(3), 3),
+    (np.bool_(True), True), (True, True), (1, 1), (None, None), ("word", "word"), (_Level.HIGH, 2),
+    ((1, math.nan), [1, None]), (np.array([1.0, np.nan]), [1.0, None]), (np.arange(2), [0, 1]),
+    ({"a": {"b": np.nan}}, {"a": {"b": None}}), (Path("a/b"), "a/b")])
+def test_plain_values(value: Any, plain: Any) -> None:
+    found = to_plain(value)
+    assert found == plain
+    assert type(found) is type(plain)
+
+
+def test_other_values_are_refused() -> None:
+    with pytest.raises(TypeError, match="object in an answer"):
+        to_json({"x": object()})
+
+
+def wide_table(columns: int) -> tuple[Table, list[str]]:
+    numbers = [f"{1.23456789 * 10 ** (i % 7):.6g} um" for i in range(columns)]
+    head = [Column("effect"), *(Column(f"error of signal {i}", align="right") for i in range(columns))]
+    return Table(head, [["spool_friction", *numbers], ["null_bias", *numbers]]), numbers
+
+
+@pytest.mark.parametrize("columns", [3, 7, 12])
+@pytest.mark.parametrize("width", [40, 80])
+def test_narrow_terminal_cuts_no_number(columns: int, width: int) -> None:
+    """What does not fit goes into another block of columns, which begins with the names of the rows again."""
+    table, numbers = wide_table(columns)
+    lines = printed(report_with(table), width).splitlines()
+    own = [line for line in lines if "spool_friction" in line]
+    assert max(map(len, lines[2:])) <= width
+    assert " ".join(" ".join(line.split()[1:]) for line in own) == " ".join(numbers)
+    assert len(own) > 1 or columns < 12
+    assert len(own) == sum("null_bias" in line for line in lines)
+    assert "…" not in "".join(lines)
+
+
+def test_long_words_fold_beside_numbers() -> None:
+    table = Table([Column("block"), Column("ratio", align="right"), Column("held against")],
+                  [["servovalve", "16.5", "Cor to XS, " * 20]])
+    lines = printed(report_with(table), 80).splitlines()
+    assert any(line.startswith("servovalve") and "16.5" in line for line in lines)
+    assert max(map(len, lines)) <= 80
+    assert "\n".join(lines).count("Cor") == 20
+
+
+def test_terminal_limits_rows_and_says_how_many_are_left() -> None:
+    rows = [[f"effect_{i}"] for i in range(12)]
+    report = report_with(Table([Column("effect")], rows, terminal_rows=8))
+    assert "effect_7" in printed(report)
+    assert "effect_8" not in printed(report)
+    assert "and 4 more" in printed(report)
+    assert "effect_11" in render_html(report)
+
+
+def test_a_row_must_fit_its_columns() -> None:
+    with pytest.raises(ValueError, match="2 cells in a table of 1 columns"):
+        Table([Column("a")], [["1", "2"]])
+
+
+def test_report_without_a_verdict() -> None:
+    report = Report("effects", "catalogue", sentence="31 effects", sections=[Section("", [Line("a", "b")])])
+    assert printed(report).startswith("31 effects\n")
+    assert 'class="verdict' not in render_html(report)
+
+
+def test_page_that_cannot_be_written(tmp_path: Path, whole: Report) -> None:
+    with pytest.raises(InputError, match="--report"):
+        write_html(whole, tmp_path / "none" / "page.html", "--report")
+    write_html(whole, tmp_path / "page.html")
+    assert "run 7" in (tmp_path / "page.html").read_text(encoding="utf-8")
