@@ -160,18 +160,19 @@ def ladder(model: Model) -> list[Rung]:
     return [Rung(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
 
 
-def warm(model: Model, tell: Callable[[str, int, int], None] = lambda what, done, total: None) -> None:
-    """Compile now what runs of the model may need, or load it where it was kept; `tell` gets what and how far.
+def warm(model: Model, progress: Callable[[str, float], None] = lambda stage, share: None) -> None:
+    """Compile what runs of the model may need, or load it from the cache.
 
+    `progress` is called with each stage and the share done.
     The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
     """
     rungs = ladder(model)
     for done, rung in enumerate(rungs):
-        tell(f"compiling the plant with {len(rung.model.effects)} effects, once", done, len(rungs))
+        progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
         for run, buffer, rows in rung.blocks((), np.zeros((1, 0)), np.arange(1)):
             none = np.empty(0)
             run(buffer, none, none, none, 0.0, False, 1.0, 1, rows, np.empty((2, 3, 0)))
-    tell("", len(rungs), len(rungs))
+    progress("", 1.0)
 
 
 def _cheap(effect: Effect) -> bool:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,12 @@ from fdi.estimation.noise_floor import Floor, floors, from_data
 from fdi.estimation.repeats import Repeat, aligned, matching
 from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, open_loop, read_noise, residuals, rms
 from fdi.estimation.tolerances import Scatter, scatter
+from fdi.progress import Progress, ignore_progress
 from fdi.trace.cycles import Cycles, readings
 from fdi.trace.trace import Trace
 from plant.model import Model
 
 Floats = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 
 UNITS = {"xj": "m", "p12": "Pa", "xs": "m"}
 NOISE = {"xj": "sensors.position_noise", "p12": "sensors.pressure_noise", "xs": "sensors.spool_noise"}
@@ -83,39 +83,39 @@ class Comparison:
 
 
 def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: Sequence[str] | None = None,
-            progress: Progress = lambda what, done, total: None, source: str = "trace") -> Comparison:
+            progress: Progress = ignore_progress, source: str = "trace") -> Comparison:
     """Replay a trace and judge what is left.
 
     Raises:
         InputError: a trace, a repeat or a signal that cannot be used, in one line.
     """
-    progress("reading", 0, STAGES)
+    progress("reading", 0.0)
     c, model = best_reading(trace, model, signals, source)
     c, found = _in_step(c, model, controller_block.controller(c, model))
     others = [matching(c, other, model, number) for number, other in enumerate(repeats, 1)]
-    progress("solver", 1, STAGES)
+    progress("solver", 1 / STAGES)
     noise = sensors(c, model)
     replay = checked(c, model, {name: f.value for name, f in noise.items()})
-    progress("repeats", 2, STAGES)
+    progress("repeats", 2 / STAGES)
     runs = [(other, open_loop(other.cycles, model, replay.steps)) for other in others]
     theirs = [aligned(residuals(other.cycles, run), other.late, len(c)) for other, run in runs]
     floor = _blinder(noise, replay) | floors(replay.residual, theirs, c.period)
     judged = {name: np.where(_left_out(replay), np.nan, r) for name, r in replay.residual.items()}
-    progress("closed loop", 3, STAGES)
+    progress("closed loop", 3 / STAGES)
     closed, (free, speed) = closed_loop(c, model), drift(c, model)
     table = {name: _signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
-    progress("blocks", 4, STAGES)
+    progress("blocks", 4 / STAGES)
     ratios, parts = _blocks(c, model, replay.model, runs, table, found, noise)
-    progress("where", 5, STAGES)
+    progress("where", 5 / STAGES)
     m, z2 = motion(c, replay.model), whole(judged, {name: f.value for name, f in floor.items()})
     sections, when = places(c, z2, m, found.limit), condition(z2, m, found.limit)
     verdict, reason = _verdict(table, sections, ratios, replay, c.period)
     diagnoses = diagnose(c, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
-    progress("tolerances", 6, STAGES)
+    progress("tolerances", 6 / STAGES)
     plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
     scattered = scatter(c, model, {name: s.floor.value for name, s in table.items()}) if plant else None
-    progress("done", STAGES, STAGES)
+    progress("done", 1.0)
     return Comparison(source, model, c, verdict, reason, table, found, ratios, parts, _named(ratios), tuple(sections),
                       when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
                       (*c.notes, *_notes(floor, replay, c)))

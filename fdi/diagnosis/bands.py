@@ -22,7 +22,8 @@ from fdi.diagnosis.envelope import (
     waver,
 )
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Event, Level
-from fdi.diagnosis.simulated_units import DYNAMIC, Tell, silent
+from fdi.diagnosis.simulated_units import DYNAMIC
+from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     BAND_UNITS_QUICK,
     FAST_SLIP_RATIO,
@@ -50,8 +51,8 @@ class Judged(NamedTuple):
     notes: tuple[str, ...]
 
 
-def judge(source: Trace | Cycles, bands: Bands | None = None, model: Model | None = None, tell: Tell = silent,
-          where: object = "trace") -> Judged:
+def judge(source: Trace | Cycles, bands: Bands | None = None, model: Model | None = None,
+          progress: Progress = ignore_progress, where: object = "trace") -> Judged:
     """Judge a trace, or its cycles (whose dead and bridged samples are left out).
 
     Without `bands` the preflight's own are taken, or, for another command, load or model than they are of, bands are
@@ -61,11 +62,12 @@ def judge(source: Trace | Cycles, bands: Bands | None = None, model: Model | Non
         InputError: no position, or bands of another command or load.
     """
     com, xj, load, period, t0 = columns(source)
-    chosen = bands or suited(com, load, period, model, tell)
+    chosen = bands or suited(com, load, period, model, progress)
     return judge_columns(com, xj, period, chosen, load, t0, where)
 
 
-def suited(com: Floats, load: Floats, period: float, model: Model | None = None, tell: Tell = silent) -> Bands:
+def suited(com: Floats, load: Floats, period: float, model: Model | None = None,
+           progress: Progress = ignore_progress) -> Bands:
     """The preflight's own bands if they are of this command, load and model; else bands made for them."""
     from fdi.diagnosis.bands_file import default
     from fdi.diagnosis.learn_bands import build
@@ -73,7 +75,7 @@ def suited(com: Floats, load: Floats, period: float, model: Model | None = None,
     plain = model is None or same_plant(model)
     if plain and not loaded(load) and matches(own := default(), com, period):
         return own
-    return build(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, tell=tell)
+    return build(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, progress=progress)
 
 
 def same_plant(model: Model) -> bool:

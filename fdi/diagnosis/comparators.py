@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level
 from fdi.diagnosis.features import features
 from fdi.diagnosis.levels import of_value
-from fdi.diagnosis.simulated_units import Kind, Tell, runs, silent
+from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.progress import Progress, ignore_progress
 from fdi.trace.cycles import Cycles, held
 from fdi.trace.sections import sections
 from plant.errors import InputError
@@ -59,7 +60,7 @@ def available() -> bool:
     return find_spec("sklearn") is not None
 
 
-def lesson(c: Cycles, model: Model, seed: int = 0, tell: Tell = silent) -> Lesson:
+def lesson(c: Cycles, model: Model, seed: int = 0, progress: Progress = ignore_progress) -> Lesson:
     """Units with every pair of fault sizes on the trace's command, and the trace.
 
     Raises:
@@ -74,7 +75,7 @@ def lesson(c: Cycles, model: Model, seed: int = 0, tell: Tell = silent) -> Lesso
     pairs = [(k, f) for k in CLOGGINGS for f in FRICTIONS]
     tables = []
     for number, (k, f) in enumerate(pairs):
-        tell("simulating faults to learn from", number, len(pairs))
+        progress("simulating faults to learn from", number / len(pairs))
         made = runs(model, com, c.load, Kind(f"{k:g}, {f:g} N", k, f), EACH, seed + number)
         shown = features(com, made, c.period, parts)
         tables.append(np.column_stack([shown[name] for name in own]))

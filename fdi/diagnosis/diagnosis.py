@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Event, Le
 from fdi.diagnosis.precursors import Precursor, measure
 from fdi.diagnosis.refine import COARSE, Refined, refine
 from fdi.discovery.runs import usable
+from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     MOVING_RAM,
     RESIDUAL_JUDGES_NOTHING,
@@ -32,8 +33,6 @@ from fdi.trace.sections import sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
-
-Progress = Callable[[str, int, int], None]
 
 STAGES = 4
 WORDS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
@@ -72,7 +71,7 @@ class Diagnosis:
 
 
 def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = None,
-             progress: Progress = lambda what, done, total: None, source: str = "trace",
+             progress: Progress = ignore_progress, source: str = "trace",
              workers: int = 2) -> Diagnosis:
     """Judge the two faults from a trace of any command.
 
@@ -80,7 +79,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         trace: needs Com, XJ and Cor; P12, XS and a known load make it surer.
         model: the unit as it left the works; default the nominal one.
         bands: default: those that come with the software, if they are of this command.
-        progress: told what is being done.
+        progress: called with each stage and the share done, 0 to 1.
         source: the trace's name in refusals.
         workers: threads.
 
@@ -90,7 +89,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     model = model or load_model()
     if model.plant != "eha":
         raise InputError("--model", model.plant, "eha: the two faults are the paper's servovalve's")
-    progress("reading", 0, STAGES)
+    progress("reading", 0.0)
     model, record, c = usable(trace, model, None, source)
     assert c is not None
     measured = record.position[~np.isnan(record.position)]
@@ -98,14 +97,14 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         raise InputError(source, "com",
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
     notes = list(c.notes)
-    progress("bands", 1, STAGES)
+    progress("bands", 1 / STAGES)
     bands, judged, seen = _banded(c, model, bands, notes)
-    progress("grid", 2, STAGES)
+    progress("grid", 2 / STAGES)
     grid = _grid(c, model, notes)
-    progress("refinement", 3, STAGES)
+    progress("refinement", 3 / STAGES)
     floor = {name: f.value for name, f in sensors(c, model).items()}
     found = refine(model, record, (*_starts(grid), *COARSE), floor, workers)
-    progress("done", STAGES, STAGES)
+    progress("done", 1.0)
     return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, c, record, model, floor, bands,
                                 tuple(notes)))
 

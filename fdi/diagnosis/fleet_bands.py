@@ -22,7 +22,7 @@ from fdi.diagnosis.envelope import (
 )
 from fdi.diagnosis.faults import Level
 from fdi.diagnosis.features import features
-from fdi.diagnosis.simulated_units import Tell, silent
+from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_NEAREST_LIMIT_SD,
@@ -37,8 +37,8 @@ from plant.model import Model
 
 Floats = NDArray[np.float64]
 
-def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[str] = (), tell: Tell = silent
-          ) -> Bands:
+def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[str] = (),
+          progress: Progress = ignore_progress) -> Bands:
     """Bands from healthy traces of one command.
 
     The mean is the fleet's own. The scatter is the fleet's, too, joined with the simulated one as if that were of
@@ -49,7 +49,7 @@ def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[s
         traces: at least FLEET_FEWEST_TRACES, without load.
         model: default the nominal one.
         names: of the traces, for refusals.
-        tell: told how far it is.
+        progress: called with each stage and the share done, 0 to 1.
 
     Raises:
         InputError: too few traces, another command or period in one, a load, or a position with holes.
@@ -59,7 +59,7 @@ def learn(traces: Sequence[Trace], model: Model | None = None, names: Sequence[s
         raise InputError("--learn-bands", f"{len(traces)} traces",
                          f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
     com, _, _, period, _ = columns(traces[0])
-    base = suited(com, np.zeros_like(com), period, model, tell)
+    base = suited(com, np.zeros_like(com), period, model, progress)
     rows = [_aligned(base, trace, name) for trace, name in zip(traces, names, strict=True)]
     fleet = _Fleet(np.array([x for _, x in rows]), np.mean([c for c, _ in rows], axis=0), base)
     found = replace(base, steps=tuple(fleet.step(s) for s in base.steps),

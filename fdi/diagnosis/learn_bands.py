@@ -25,8 +25,9 @@ from fdi.diagnosis.envelope import (
 )
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.diagnosis.features import features, slow
-from fdi.diagnosis.simulated_units import STEPS, Kind, Tell, runs, silent
+from fdi.diagnosis.simulated_units import STEPS, Kind, runs
 from fdi.output import writable
+from fdi.progress import Progress, ignore_progress
 from fdi.sources import software
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
@@ -49,7 +50,7 @@ COARSE = 2  # cycles between the times at which shifts and spreads are known
 
 
 def build(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS, faulty: int = BAND_UNITS,
-          seed: int = SEED, steps: int = STEPS, tell: Tell = silent, name: str = "") -> Bands:
+          seed: int = SEED, steps: int = STEPS, progress: Progress = ignore_progress, name: str = "") -> Bands:
     """Bands of a command (n,) m with a known load (n,) N, one row per `period` s, by simulating units of a model.
 
     Raises:
@@ -65,7 +66,7 @@ def build(model: Model, com: Floats, load: Floats, period: float, count: int = B
     amounts = [sound, *(size for size in sorted({*BETWEEN, FRICTION.middle, FRICTION.most}) if size > 1.2 * sound)]
 
     def units(kind: Kind, number: int = faulty) -> Floats:
-        return runs(model, com, load, kind, number, seed, steps, tell)
+        return runs(model, com, load, kind, number, seed, steps, progress)
 
     frictions = [units(Kind("healthy"), count), *(units(Kind(f"{size:g} N", friction=size)) for size in amounts[1:])]
     clogged = [units(Kind(f"Kintas {size:g}", clogging=size)) for size in (CLOGGING.middle, CLOGGING.most)]
@@ -86,7 +87,7 @@ def build(model: Model, com: Floats, load: Floats, period: float, count: int = B
 
 
 def run(sources: Sequence[str | Path], out: str | Path, model: Model | None = None, com: Floats | None = None,
-        name: str = "", seed: int = SEED, tell: Tell = silent) -> dict[str, Any]:
+        name: str = "", seed: int = SEED, progress: Progress = ignore_progress) -> dict[str, Any]:
     """Bands from the traces `sources`, or without any by simulation over the command `com` (n,) m; written to `out`.
 
     Returns what was made, for --json.
@@ -101,14 +102,15 @@ def run(sources: Sequence[str | Path], out: str | Path, model: Model | None = No
     if sources:
         traces = []
         for done, source in enumerate(sources):
-            tell("reading", done, len(sources))
+            progress("reading", done / len(sources))
             traces.append(Trace.read(source))
-        bands = learn(traces, model, [str(source) for source in sources], tell)
+        bands = learn(traces, model, [str(source) for source in sources], progress)
     elif com is None:
         raise InputError("--learn-bands", "", "traces, or a command to simulate")
     else:
         model = model or load_model()
-        bands = build(model, com, np.zeros_like(com), model["controller.period"], seed=seed, tell=tell, name=name)
+        bands = build(model, com, np.zeros_like(com), model["controller.period"], seed=seed, progress=progress,
+                      name=name)
     save(bands, place)
     clogging, friction = bands.judges
     return {"bands": str(out), "judges": [fault.name for fault, seen in ((CLOGGING, clogging), (FRICTION, friction))

@@ -6,7 +6,7 @@ tolerances set them apart.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.tolerances import tolerances
+from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.threads import threads
 
 Floats = NDArray[np.float64]
-Tell = Callable[[str, int, int], None]
 
 DYNAMIC = "spool.dynamic_friction"
 SLIDING = 1 / 1.5  # FDS over FSS (nominal.toml)
@@ -29,10 +29,6 @@ COLOUR = 0.85  # largest correlation of the position sensor's noise from one cyc
 HUM, HUM_HZ = 0.55, 50.0  # largest amplitude of mains hum, in standard deviations of the noise; Hz
 MOVED, RESTED, STROKE = 0.5, 0.3, 1e-3  # s, s, m: before a test
 STEPS = 20  # a cycle; the docs say what that leaves out
-
-
-def silent(what: str, done: int, total: int) -> None:
-    """Tell nobody."""
 
 
 class Kind(NamedTuple):
@@ -45,7 +41,7 @@ class Kind(NamedTuple):
 
 
 def runs(model: Model, com: Floats, load: Floats, kind: Kind, count: int, seed: int, steps: int = STEPS,
-         tell: Tell = silent) -> Floats:
+         progress: Progress = ignore_progress) -> Floats:
     """Sensed position, (count, n) m, of so many units over a command (n,) m with a known load (n,) N.
 
     The same seed gives the same units, whatever their faults.
@@ -67,7 +63,7 @@ def runs(model: Model, com: Floats, load: Floats, kind: Kind, count: int, seed: 
     starts = range(0, count, NARROW)
     with ThreadPoolExecutor(threads()) as pool:
         for done, _ in enumerate(pool.map(block, starts)):
-            tell(f"simulating units, {kind.name}", done + 1, len(starts))
+            progress(f"simulating units, {kind.name}", (done + 1) / len(starts))
     return out
 
 

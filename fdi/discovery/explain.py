@@ -1,7 +1,7 @@
 """Which physical effect is missing from a model: the verdict, with its evidence and its doubt."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,12 +12,12 @@ from fdi.discovery.search import Hypothesis, Search
 from fdi.discovery.significance import SEEN, Sensitivity, sensitivity
 from fdi.estimation.fit import typical
 from fdi.estimation.problem import Problem
+from fdi.progress import Progress, ignore_progress
 from fdi.trace.record import Record
 from plant.effects import CATALOGUE
 from plant.model import Model, offered
 
 Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 FINE = 20  # steps a cycle of the last fits
 FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
@@ -51,7 +51,7 @@ class Explanation:
 
 
 def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: Record | None = None,
-            progress: Progress = lambda what, part: None, workers: int | None = None) -> Explanation:
+            progress: Progress = ignore_progress, workers: int | None = None) -> Explanation:
     """The verdict on a model and a measured run.
 
     Args:
@@ -59,7 +59,7 @@ def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: 
         est: the run to explain.
         repeats: further runs of the same command: they tell noise from physics.
         holdout: a run of another command: it tells physics from luck.
-        progress: called with what is being done and the part done, 0..1.
+        progress: called with each stage and the share done, 0 to 1.
         workers: threads; default one a core.
     """
     controller, prints = firmware(model, [est, *repeats])

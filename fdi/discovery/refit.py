@@ -1,7 +1,7 @@
 """Effects put into a model one after the other: everything fitted anew each time, and the error after each step."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from fdi.estimation.final_rounds import settled
 from fdi.estimation.fit import Fit, improved, linearised, misfit
 from fdi.estimation.model_unknowns import UNREPLAYED, effects_of, free_of
 from fdi.estimation.problem import Free, quiet, unknowns, whole
+from fdi.progress import Progress, ignore_progress
 from fdi.trace.record import Record
 from plant.effects import CATALOGUE
 from plant.errors import InputError
@@ -23,7 +24,6 @@ from plant.lanes import ladder
 from plant.model import Model, offered
 
 Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
 LAST, BEFORE = 8, 2  # of the last fit, and of those before it in the ledger
@@ -71,7 +71,7 @@ class Refit:
 
 
 def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequence[Record] = (),
-          holdout: Record | None = None, progress: Progress = lambda what, part: None,
+          holdout: Record | None = None, progress: Progress = ignore_progress,
           begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
     """Add effects to a model in this order.
 
@@ -81,7 +81,7 @@ def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequenc
         est: the run to fit.
         repeats: further runs of its command, which tell noise from physics and are fitted as well.
         holdout: a run that no fit sees.
-        progress: called with what is being done and the part done, 0..1.
+        progress: called with each stage and the share done, 0 to 1.
         begin: parameters of an earlier fit with the first `done` effects: these come in together, from there.
         done: how many.
         workers: threads; default one a core.

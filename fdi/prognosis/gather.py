@@ -4,12 +4,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.faults import FAULTS, Estimate
 from fdi.prognosis.dates import AXES, TABLE, Row, days, in_name, read_table, row_of
+from fdi.progress import Progress
 from fdi.sources import digest
 from fdi.trace.trace import Trace
 from plant.compile import cache_folder
@@ -17,7 +18,6 @@ from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model
 
-Progress = Callable[[str, int, int], None]
 Keep = Path | None
 
 ENDINGS = (".mcap", ".csv", ".csv.gz")
@@ -70,7 +70,7 @@ def gather(folder: Path, model: Model, options: Options, progress: Progress) -> 
               if row not in [row_of(table, file.relative_to(folder).as_posix()) for file in rows]]
     points = []
     for i, (file, row) in enumerate(rows.items()):
-        progress(f"trace {i + 1} of {len(rows)}", i, len(rows))
+        progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
         name = file.relative_to(folder).as_posix()
         try:
             told = diagnosed(file, model, options.again)
@@ -79,7 +79,7 @@ def gather(folder: Path, model: Model, options: Options, progress: Progress) -> 
             continue
         sizes = {f.name: Estimate(*told["sizes"][f.name]) for f in FAULTS}
         points.append(Point(name, row[list(AXES).index(axis)], sizes, told["note"]))
-    progress("trend", len(rows), len(rows))
+    progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
     return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes))

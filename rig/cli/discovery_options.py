@@ -1,11 +1,10 @@
-"""What `rig explain`, `rig add` and `rig remove` share: their options, runs, places for results, and patience."""
+"""What `rig explain`, `rig add` and `rig remove` share: their options, runs, places for results."""
 from __future__ import annotations
 
 import argparse
-import contextlib
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +13,8 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.discovery.model_file import Provenance
     from fdi.discovery.runs import Runs
+    from fdi.progress import Progress
     from plant import Model
-
-Progress = Callable[[str, float], None]
 
 
 def add_runs(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +74,7 @@ def prepare(runs: Runs, progress: Progress, effects: Sequence[str] | None = None
     model = whole(runs.model) if effects is None else lean(runs.model, replayed)
     with laws(model):
         if effects is None:
-            warm(model, lambda what, done, total: progress(what, 0.0))
+            warm(model, lambda stage, share: progress(stage, 0.0))
         else:
             progress("compiling the plant with it, once", 0.0)
             _tried(model, replayed)
@@ -94,15 +92,6 @@ def _tried(model: Model, effects: Sequence[str]) -> None:
     usual = np.array([model[name] for name in names])
     rows = usual + np.vstack([0.0 * usual, np.diag([sizes.get(n, x) - x for n, x in zip(names, usual, strict=True)])])
     Lanes(model, names, 1, 1).replay(rows, np.zeros(2), np.zeros(2))
-
-
-@contextlib.contextmanager
-def patience(silent: bool) -> Iterator[Progress]:
-    """Progress as the search tells it, shown to whoever has to wait for it."""
-    from rig.cli.progress_bar import waiting
-
-    with waiting(silent) as update:
-        yield lambda what, part: update(what, round(100 * part), 100 if part else 0)
 
 
 def place(out: str | None, suffixes: tuple[str, ...], source: str, option: str = "--out") -> Path | None:

@@ -14,6 +14,7 @@ from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, model_of, refit
 from fdi.discovery.runs import Runs
 from fdi.output import write_text
+from fdi.progress import Progress
 from fdi.sources import software
 from plant import InputError, Model
 from plant.model import meaning, offered
@@ -85,7 +86,7 @@ def runs_of(args: argparse.Namespace, trace: str | None, model: Model, known: Pr
 
 
 def added(new: Sequence[str], runs: Runs, model: Model, known: Provenance,
-          progress: discovery_options.Progress) -> Done:
+          progress: Progress) -> Done:
     """The model with `new` effects as well. `runs.model` is the model before any effect was added."""
     goes_on = bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.signals)
     done = len(known.effects) if goes_on else 0
@@ -97,7 +98,7 @@ def added(new: Sequence[str], runs: Runs, model: Model, known: Provenance,
 
 
 def removed(name: str, runs: Runs | None, model: Model, known: Provenance,
-            progress: discovery_options.Progress) -> Done:
+            progress: Progress) -> Done:
     """The model without an effect: refitted where runs are given, else all other values as they are."""
     left, less = model_file.without(model, known, name)
     if runs is None:

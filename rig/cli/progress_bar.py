@@ -1,34 +1,74 @@
-"""A progress bar that only those see who have to wait."""
+"""The progress bar of every command, on standard error."""
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+import sys
+from collections.abc import Iterator
+from threading import Timer
 
-from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-PATIENCE = 2.0  # s; what is over by then needs no bar
-
-Update = Callable[[str, int, int], None]
-
-
-class _Late(Progress):
-    """Shows nothing at first."""
-
-    def get_renderables(self) -> Iterable[RenderableType]:
-        if self.tasks and (self.tasks[0].elapsed or 0.0) > PATIENCE:
-            yield self.make_tasks_table(self.tasks)
+from fdi.progress import Progress, ignore_progress
 
 
 @contextlib.contextmanager
-def waiting(silent: bool) -> Iterator[Update]:
-    """Call it with what is being done, how much is done and of how much; a bar on standard error if it takes long.
+def show_progress(*, is_silent: bool, is_realtime: bool = False, delay: float = 2.0) -> Iterator[Progress]:
+    """Give a `Progress` whose calls move a bar on standard error; the bar disappears at the end.
 
-    Nothing is shown if `silent`, or where standard error is no terminal.
+    Args:
+        is_silent: show nothing.
+        is_realtime: show a plain line without a refreshing thread, which would delay a real-time loop.
+        delay: s before the bar appears: shorter work needs none.
+
+    Nothing is shown where standard error is no terminal.
     """
-    errors = Console(stderr=True)
-    bar = _Late(TextColumn("{task.description:<14}", markup=False), BarColumn(40), TimeElapsedColumn(),
-                console=errors, transient=True, disable=silent or not errors.is_terminal)
-    with bar:
-        task = bar.add_task("", total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total or None)
+    if is_silent or not sys.stderr.isatty():
+        yield ignore_progress
+    elif is_realtime:
+        with _show_line() as update:
+            yield update
+    else:
+        with _show_bar(delay) as update:
+            yield update
+
+
+@contextlib.contextmanager
+def _show_bar(delay: float) -> Iterator[Progress]:
+    from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    bar = Bar(TextColumn("{task.description:<14}", markup=False), BarColumn(40),
+              TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
+              console=Console(stderr=True), transient=True)
+    task = bar.add_task("", total=None)
+
+    def update(stage: str, share: float) -> None:
+        bar.update(task, description=stage, completed=share, total=1.0 if share > 0.0 else None)
+
+    starter = Timer(delay, bar.start)
+    starter.daemon = True
+    starter.start()
+    try:
+        yield update
+    finally:
+        starter.cancel()
+        starter.join()
+        bar.stop()
+
+
+@contextlib.contextmanager
+def _show_line() -> Iterator[Progress]:
+    shown = ("", -1)
+
+    def update(stage: str, share: float) -> None:
+        nonlocal shown
+        now = (stage, int(20 * share))  # each write may cost the loop some microseconds: only every 5 %
+        if now != shown:
+            shown = now
+            sys.stderr.write(f"\r\033[K{stage:<14} {100 * share:3.0f} %")
+            sys.stderr.flush()
+
+    try:
+        yield update
+    finally:
+        sys.stderr.write("\r\033[K")
+        sys.stderr.flush()

@@ -5,16 +5,15 @@ import contextlib
 import json
 import math
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from fdi.progress import Progress
+from rig.cli.progress_bar import show_progress
 from rig.cli.terminal import console
 from rig.run.job import Job
 from rig.run.outcome import Outcome
@@ -24,32 +23,19 @@ COLOURS = {"PASS": "green", "FAIL": "red", "ABORTED": "red", "INVALID_TIMING": "
 
 
 @contextlib.contextmanager
-def progress(job: Job, why: str, silent: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on standard error, and who is who on standard output; nothing at all if `silent`."""
-    if silent:
-        yield lambda what, done, total: None
-        return
-    errors = Console(stderr=True)
-    live = errors.is_terminal and not job.realtime  # its refreshing thread would make a real-time loop late
-    bar = Progress(TextColumn("{task.description:<14}", markup=False), BarColumn(40),
-                   TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
-                   console=errors, transient=True, disable=not live)
-    with bar:
-        task = bar.add_task("bring-up", total=None)
-        told = False
-
-        def update(what: str, done: int, total: int) -> None:
-            nonlocal told
-            if not told:  # not before there is a bus and a place for the results: an error is one line
-                told = True
+def progress(job: Job, why: str, silent: bool) -> Iterator[Progress]:
+    """The progress bar of a run, and a line on standard output that says what runs; nothing at all if `silent`."""
+    announced = silent
+    with show_progress(is_silent=silent, is_realtime=job.realtime) as update:
+        def announce(stage: str, share: float) -> None:
+            nonlocal announced
+            if not announced:  # not before there is a bus and a place for the results: an error is one line
+                announced = True
                 console().print(f"[bold]{escape(job.sequence.title)}[/], {job.sequence.duration:g} s, "
                                 f"{job.pace}, seed {job.seed}, {escape(why)}", soft_wrap=True)
-            bar.update(task, description=what, completed=done, total=total or None)
-            if errors.is_terminal and job.realtime and done % 1000 == 0:
-                sys.stderr.write(f"\r\033[K{what:<14} {100 * done // max(total, 1):3d} %" if total else "\r\033[K")
-                sys.stderr.flush()
+            update(stage, share)
 
-        yield update
+        yield announce
 
 
 @contextlib.contextmanager

@@ -1,16 +1,16 @@
-"""Compiles what `rig explain` and `rig add` need ahead of their first use: `python -m rig.cli.main.warm`."""
+"""Compiles what `rig explain` and `rig add` need ahead of their first use: `python -m rig.cli.warm`."""
 from __future__ import annotations
 
 from plant import Model
 from plant.lanes import warm
 from plant.model import offered
-from rig.cli.progress_bar import waiting
+from rig.cli.progress_bar import show_progress
 
 
 def main() -> None:
-    """The kernels of the reference plant with the whole catalogue, into the user's cache."""
-    with waiting(silent=False) as update:
-        warm(Model().having(effect.name for effect in offered()), update)
+    """Compile the kernels of the reference plant with the whole catalogue into the user's cache."""
+    with show_progress(is_silent=False) as progress:
+        warm(Model().having(effect.name for effect in offered()), progress)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi.progress import Progress
 from plant import Actuator, Columns, InputError
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
@@ -19,7 +20,7 @@ from rig.run.job import Job
 from rig.run.outcome import Outcome, timing
 from rig.run.participants import crew
 from rig.run.priority import elevated, scheduler, undisturbed
-from rig.run.session import MAIN, Progress, Session
+from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, evaluate
 
 
@@ -33,7 +34,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         Actuator(job.scenario.model).warm()
     with taken(folder), crew(job) as wire, log(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
-        progress("bring-up", 0, 0)
+        progress("bring-up", 0.0)
         session.bring_up()
         assert session.loop is not None
         stopwatch = WallClock()

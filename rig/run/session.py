@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from canopen.emcy import EmcyError
 
+from fdi.progress import Progress
 from plant.profile import Profile
 from plant.segments import RATE
 from rig.device.nmt import NmtState
@@ -31,7 +32,6 @@ from rig.sequences.guards import Watch
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
 _ENABLING = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
-Progress = Callable[[str, int, int], None]  # phase or section, cycles done, cycles in all
 
 
 class Happening(NamedTuple):
@@ -148,7 +148,7 @@ class Session:
                 load = self.scenario.force[self.loop.k] * FORCE if phase == MAIN else 0.0
                 closed = self.loop.cycle(Step(phase, self._demand, load, self._control(phase, i)))
                 if self.loop.k % 50 == 0:
-                    self._progress(shown, self.loop.k, max(self._plan.stop, self.loop.k))
+                    self._progress(shown, self.loop.k / max(self._plan.stop, self.loop.k))
                 if phase != CLEANUP and self._must_end(closed):
                     return False
         return True

@@ -6,10 +6,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.diagnosis import Diagnosis
+from fdi.progress import Progress
 from plant.errors import InputError
 from rig.network.clock import WallClock
-
-Progress = Callable[[str, int, int], None]
 
 
 class Row(NamedTuple):
@@ -35,7 +34,7 @@ def optimisers(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
     start = (d.grid.merged.kintas, d.grid.merged.fss) if d.grid else (0.1, 15.0)
     for number, method in enumerate(ways.METHODS):
         name = method.__name__.replace("_", " ")
-        progress(name, number, len(ways.METHODS))
+        progress(name, number / len(ways.METHODS))
         if not ways.available(method):
             continue
         found, seconds = timed(partial(method, model, record, start, d.floor, seed))
@@ -54,7 +53,7 @@ def comparators(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
         raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
     data, before = timed(lambda: learners.lesson(d.cycles, d.model, seed, progress))
     for learner in learners.LEARNERS:
-        progress(learner.__name__.replace("_", " "), 1, 1)
+        progress(learner.__name__.replace("_", " "), 1.0)
         found, seconds = timed(partial(learner, data, seed))
         yield Row(found.method, _known(found.kintas), _known(found.fss), None, _known(found.error_kintas),
                   _known(found.error_fss), found.right, {name: level.word for name, level in found.levels.items()},

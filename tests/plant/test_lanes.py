@@ -149,9 +149,9 @@ def test_threads_do_not_matter() -> None:
 
 
 def test_warming_tells_how_far_it_is() -> None:
-    told: list[tuple[str, int, int]] = []
-    warm(QUIET.having(EFFECTS), lambda *how: told.append(how))
-    assert [done for _, done, _ in told] == [0, 1, 2, 3] and "0 effects" in told[0][0]
+    calls: list[tuple[str, float]] = []
+    warm(QUIET.having(EFFECTS), lambda *call: calls.append(call))
+    assert [share for _, share in calls] == [0, 1 / 3, 2 / 3, 1] and "0 effects" in calls[0][0]
 
 
 def test_what_does_not_fit_is_refused() -> None:

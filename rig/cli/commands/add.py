@@ -26,12 +26,13 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.discovery import model_file as ledgers
     from fdi.discovery.refit import addable
     from rig.cli import model_update, show_ledger
+    from rig.cli.progress_bar import show_progress
 
     model, known = discovery_options.model_of(args)
     effects, trace = model_update.split(args.words, args.trace, model.plant)
     path = model_update.target(args, trace or args.words[0])
     page = discovery_options.place(str(path.with_suffix(".html")), (".html",), trace or args.words[0])
-    with discovery_options.patience(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
         runs = model_update.runs_of(args, trace, ledgers.original(model, known), known)
         addable(runs.model, [*known.effects, *effects])

@@ -32,13 +32,13 @@ def run_command(args: argparse.Namespace) -> int:
 
         return trial(args)
     from fdi.output import write_text
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
     from rig.sequences import load_sequence
     from rig.studies.benchmarks import plant_step
 
     command = load_sequence("preflight").main_profile().command
-    with waiting(args.quiet) as update:
-        answer = plant_step.report(command, lambda what: update(what, 0, 0))
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        answer = plant_step.report(command, progress)
     rows = plant_step.accuracy(command) if args.accuracy else []
     if rows:
         answer["accuracy"] = [row._asdict() for row in rows]

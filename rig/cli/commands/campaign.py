@@ -150,14 +150,14 @@ def _jobs(asked: int | None) -> int:
 @contextmanager
 def _told(silent: bool) -> Iterator[Callable[[Progress], None]]:
     """A bar on a terminal; elsewhere a line now and then, for logs."""
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
     from rig.network.clock import WallClock
     from rig.studies.campaign.show_campaign import line
 
     clock, said = WallClock(), [0.0]
-    with waiting(silent) as update:
+    with show_progress(is_silent=silent) as update:
         def tell(progress: Progress) -> None:
-            update(line(progress), progress.done, progress.total)
+            update(line(progress), progress.done / max(progress.total, 1))
             now = clock.now() * 1e-9
             if not silent and not sys.stderr.isatty() and now - said[0] >= EVERY:
                 said[0] = now

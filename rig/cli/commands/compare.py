@@ -30,12 +30,12 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.report.compare_text import to_json
     from fdi.trace.trace import Trace
     from rig.cli import show_compare
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
 
     page, answer = places(args)
     model = options.model_of(args)
     chosen = [name.strip() for name in args.signals.split(",")] if args.signals is not None else None
-    with waiting(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         trace = Trace.read(args.trace)
         repeats = [Trace.read(file) for file in args.repeat]
         found = compare(trace, model, repeats, chosen, progress, str(args.trace))

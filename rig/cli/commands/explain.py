@@ -35,10 +35,11 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.discovery.runs import read
     from fdi.output import write_text
     from rig.cli import show_explain
+    from rig.cli.progress_bar import show_progress
 
     page, answer_file = places(args)
     model, _ = discovery_options.model_of(args)
-    with discovery_options.patience(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
         runs = read(model, args.trace, args.repeat, args.holdout, discovery_options.signals_of(args))
         discovery_options.prepare(runs, progress)

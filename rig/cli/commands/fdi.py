@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.diagnosis.diagnosis import Diagnosis
     from fdi.diagnosis.envelope import Bands
+    from fdi.progress import Progress
     from rig.studies.fault_size_methods import Row
 
 
@@ -44,19 +45,19 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.output import write_text
     from fdi.trace.trace import Trace
     from rig.cli import show_fdi
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
 
     if args.trace is None:
         raise InputError("TRACE", "", "a trace to judge, or --learn-bands")
     answer = places(args)
     model = options.model_of(args)
-    with waiting(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         found = diagnose(Trace.read(args.trace), model, bands_of(args), progress, str(args.trace))
         rows = methods_of(args, found, progress)
         if answer is not None and answer.suffix == ".html":
             from fdi.report.diagnosis_page import render
 
-            progress("the page", 0, 0)
+            progress("writing the page", 0.0)
             write_text(answer, render(found))
         elif answer is not None:
             write_text(answer, json.dumps(as_json(found, rows)) + "\n")
@@ -67,7 +68,7 @@ def run_command(args: argparse.Namespace) -> int:
     return 0 if found.passed else 1
 
 
-def methods_of(args: argparse.Namespace, found: Diagnosis, progress: Callable[[str, int, int], None]) -> list[Row]:
+def methods_of(args: argparse.Namespace, found: Diagnosis, progress: Progress) -> list[Row]:
     """What other methods find, as far as they are asked for."""
     if not (args.optimisers or args.comparators):
         return []
@@ -90,7 +91,7 @@ def learned(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.cli import show_fdi
     from rig.cli.commands.simulate import command_of
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
 
     if args.trace is not None:
         raise InputError("--learn-bands", str(args.trace), "traces behind it, not before it")
@@ -98,7 +99,7 @@ def learned(args: argparse.Namespace) -> int:
         raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
     model = options.model_of(args)
     com, _, name = command_of(args.command_file, model["controller.period"])
-    with waiting(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         made = learn(args.learn_bands, args.out, model, com, name, args.seed, progress)
     if args.json:
         print(json.dumps(made))

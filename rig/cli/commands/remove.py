@@ -27,6 +27,7 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.discovery import model_file as ledgers
     from plant import InputError
     from rig.cli import model_update, show_ledger
+    from rig.cli.progress_bar import show_progress
 
     if not args.model or not Path(args.model).is_file():
         raise InputError("--model", str(args.model or ""), "the model FILE to take it out of")
@@ -36,7 +37,7 @@ def run_command(args: argparse.Namespace) -> int:
         raise InputError("effect", effects[1], "one effect at a time")
     path = model_update.target(args, trace or args.model + " ")
     page = discovery_options.place(str(path.with_suffix(".html")), (".html",), trace or "") if trace else None
-    with discovery_options.patience(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         runs = None
         if trace is not None:
             progress("reading", 0.0)

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from rig.cli import options
 
 if TYPE_CHECKING:
+    from fdi.progress import Progress
     from rig.run.job import Job
     from rig.run.outcome import Outcome
 
@@ -49,7 +49,7 @@ def run_command(args: argparse.Namespace) -> int:
     silent = args.json or args.quiet
     with show_run.progress(job, why, silent) as progress, show_run.stoppable() as stop:
         outcome = do(job, folder, progress, stop)
-        progress("report", 0, 0)
+        progress("report", 0.0)
         write_report(folder / "trace.mcap", folder / "report.html")
         if args.fdi:
             outcome = diagnosed(outcome, progress)
@@ -61,7 +61,7 @@ def run_command(args: argparse.Namespace) -> int:
     return outcome.status
 
 
-def diagnosed(outcome: Outcome, progress: Callable[[str, int, int], None]) -> Outcome:
+def diagnosed(outcome: Outcome, progress: Progress) -> Outcome:
     """The outcome with what `rig fdi` says of its trace, in verdict.json as well; the run's own verdict stays."""
     from fdi.diagnosis.diagnosis import diagnose
     from fdi.report.diagnosis_text import to_json

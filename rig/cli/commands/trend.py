@@ -56,10 +56,10 @@ def _found(args: argparse.Namespace) -> Answer:
     """From the folder's traces, or from the points of an earlier answer."""
     from fdi.prognosis.gather import Options, gather
     from fdi.prognosis.unit_trend import answer, read
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
 
     model, source = options.model_of(args), Path(args.folder)
-    with waiting(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         if source.suffix == ".json" and not source.is_dir():
             return answer(read(source))
         table = None if args.dates is None else Path(args.dates)
@@ -105,11 +105,11 @@ def _score(args: argparse.Namespace) -> int:
     """The table of scores; always exit status 0."""
     from fdi.output import write_text
     from rig.cli import show_trend
-    from rig.cli.progress_bar import waiting
+    from rig.cli.progress_bar import show_progress
     from rig.studies.prognosis.summary import table, to_json
 
     place = _place(args)
-    with waiting(args.json or args.quiet) as progress:
+    with show_progress(is_silent=args.json or args.quiet) as progress:
         found = table(args.units, args.seed, progress)
     if place is not None:
         write_text(place, json.dumps(to_json(found)) + "\n")

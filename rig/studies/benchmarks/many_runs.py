@@ -2,13 +2,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import STEPS, Lanes
 from rig.studies.benchmarks.peers import (
@@ -42,20 +42,20 @@ class Rival(NamedTuple):
     note: str
 
 
-def many(command: Array, tell: Callable[[str], None] = lambda what: None, rounds: int = 7,
+def many(command: Array, progress: Progress = ignore_progress, rounds: int = 7,
          cycles: int = CYCLES) -> list[Rival]:
     """Runs of the bare model, with different friction and drag, from the current of a run over `command` (n,) m."""
     task = _task(command, cycles)
     with tempfile.TemporaryDirectory() as folder:
-        tell("many runs at once: compiling the rivals")
+        progress("many runs at once: compiling the rivals", 0.0)
         runs, skipped = _rivals(task, Path(folder))
         rows = {name: run().copy() for name, run in runs.items()}
-        tell("many runs at once")
+        progress("many runs at once", 0.0)
         seconds = durations(runs, rounds)
     work = MEMBERS * cycles * task.steps
     found = [Rival(name, float(work / np.median(s)), float(np.median(s / seconds[OURS])),
                    float(np.abs(rows[name] - rows[OURS])[..., 0].max()), "") for name, s in seconds.items()]
-    return [*found, *skipped, _progpy(task, work / float(np.median(seconds[OURS])), rows[OURS], tell)]
+    return [*found, *skipped, _progpy(task, work / float(np.median(seconds[OURS])), rows[OURS], progress)]
 
 
 def _task(command: Array, cycles: int) -> Task:
@@ -86,11 +86,11 @@ def _rivals(task: Task, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
     return runs, skipped
 
 
-def _progpy(task: Task, our_speed: float, our_rows: Array, tell: Callable[[str], None]) -> Rival:
+def _progpy(task: Task, our_speed: float, our_rows: Array, progress: Progress) -> Rival:
     """On a short piece, as it is so much slower."""
     if why := missing("progpy"):
         return Rival("ProgPy, vectorised", None, None, None, f"skipped, {why}")
-    tell("many runs at once: ProgPy")
+    progress("many runs at once: ProgPy", 0.0)
     run = in_progpy(task._replace(current=task.current[:PIECE], load=task.load[:PIECE]))
     rows, seconds = run(), float(np.median(durations({"": run}, 3)[""]))
     speed = MEMBERS * (PIECE - 1) * task.steps / seconds  # the last row is a state, not a cycle

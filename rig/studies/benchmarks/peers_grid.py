@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import Lanes
 from plant.monitor import FAULTS, Cell, Monitor, cells
@@ -48,21 +48,21 @@ class Work:
         return np.ascontiguousarray(np.pad(made, ((0, 0), (0, -len(self.values) % width)), "edge"))
 
 
-def grid(command: Array, tell: Callable[[str], None] = lambda what: None, rounds: int = 5) -> list[Rival]:
+def grid(command: Array, progress: Progress = ignore_progress, rounds: int = 5) -> list[Rival]:
     """Runs of all cells over `command` (n,) m; speeds are cycles of a cell per second."""
     work = Work(command)
     with tempfile.TemporaryDirectory() as folder:
-        tell("the RMS grid: compiling the rivals")
+        progress("the RMS grid: compiling the rivals", 0.0)
         runs, skipped = _rivals(work, Path(folder))
         maps = {name: run().copy() for name, run in runs.items()}
-        tell("the RMS grid")
+        progress("the RMS grid", 0.0)
         seconds = durations(runs, rounds)
     cycles = work.values.size // 2 * len(command)
     found = [Rival(name, float(cycles / np.median(s)), float(np.median(s / seconds[OURS])),
                    float(np.abs(maps[name] - maps[OURS]).max()), "") for name, s in seconds.items()]
     note = "another model: what the monitor leaves out is the difference"
     found = [rival._replace(note=note) if rival.name == REFERENCE else rival for rival in found]
-    return [*found, *skipped, _progpy(work, cycles / float(np.median(seconds[OURS])), tell)]
+    return [*found, *skipped, _progpy(work, cycles / float(np.median(seconds[OURS])), progress)]
 
 
 def _rivals(work: Work, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
@@ -144,11 +144,11 @@ def _in_jax(work: Work) -> Replay:
     return lambda: np.asarray(compiled(made, acting, work.position))
 
 
-def _progpy(work: Work, our_speed: float, tell: Callable[[str], None]) -> Rival:
+def _progpy(work: Work, our_speed: float, progress: Progress) -> Rival:
     """NASA ProgPy, vectorised over the cells, on a short piece, as it is so much slower."""
     if why := missing("progpy"):
         return Rival("ProgPy, vectorised", None, None, None, f"skipped, {why}")
-    tell("the RMS grid: ProgPy")
+    progress("the RMS grid: ProgPy", 0.0)
     plant, acting = _progpy_plant(work), np.r_[0.0, work.current[:-1]]
 
     def inputs(t: float, x: Any = None) -> Any:

@@ -7,13 +7,13 @@ from __future__ import annotations
 import ctypes
 import subprocess
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.progress import Progress, ignore_progress
 from plant import Actuator, Model, simulate
 from plant.model import STEPS, kernel
 from plant.run import noise
@@ -131,15 +131,15 @@ def lockstep() -> float:
     speeds = []
     for _ in range(3):
         with tempfile.TemporaryDirectory() as folder:
-            speeds.append(run(job, Path(folder), lambda what, done, total: None, lambda: False).speed)
+            speeds.append(run(job, Path(folder), ignore_progress, lambda: False).speed)
     return max(speeds)
 
 
-def report(command: Array, tell: Callable[[str], None] = lambda what: None) -> dict[str, Any]:
-    """Everything about cost as one JSON object; `step` is None without gcc. `tell` gets what is under way."""
-    tell("one run, and a run on the embedded bus")
+def report(command: Array, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Everything about cost as one JSON object; `step` is None without gcc. `progress` gets the stage."""
+    progress("one run, and a run on the embedded bus", 0.0)
     cost = step_vs_c(command)
     one = {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
            "lockstep": lockstep()}
-    return one | {"many": [rival._asdict() for rival in many(command, tell)],
-                  "grid": [rival._asdict() for rival in grid(command, tell)]}
+    return one | {"many": [rival._asdict() for rival in many(command, progress)],
+                  "grid": [rival._asdict() for rival in grid(command, progress)]}

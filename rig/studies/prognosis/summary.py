@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi.progress import Progress
 from rig.studies.prognosis import degrading_units
 from rig.studies.prognosis.score import LAMBDAS, Score, score, told_without_reason
-
-Progress = Callable[[str, int, int], None]
 
 HEALTHY = 5  # times as many healthy units as of each law
 
@@ -47,10 +46,10 @@ def table(units: int, seed: int, progress: Progress) -> Scores:
     with ProcessPoolExecutor(cpu_count(), get_context("spawn")) as pool:
         for i, one in enumerate(pool.map(_unit, jobs)):
             found.append(one)
-            progress("units", i + 1, len(jobs) + healthy)
+            progress("units", (i + 1) / (len(jobs) + healthy))
         for i, wrong in enumerate(pool.map(_healthy, range(seed, seed + healthy))):
             told += wrong
-            progress("healthy units", len(jobs) + i + 1, len(jobs) + healthy)
+            progress("healthy units", (len(jobs) + i + 1) / (len(jobs) + healthy))
     groups = {law: [s for s in found if s.law == law] for law in degrading_units.LAWS}
     groups["laws fitted"] = [s for s in found if s.law in degrading_units.FITTED]
     groups["other laws"] = [s for s in found if s.law in degrading_units.OTHERS]

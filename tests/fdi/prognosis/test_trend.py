@@ -18,6 +18,7 @@ from fdi.prognosis import gather, regression, remaining_life
 from fdi.prognosis.dates import Row, days, in_name, iso, read_table, row_of
 from fdi.prognosis.growth_laws import basis, shapes
 from fdi.prognosis.trend import Trend, follow
+from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.provenance import provenance
@@ -266,7 +267,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(gather, "started", started)
 
     def gathered(axis: str | None = None) -> gather.Gathered:
-        return gather.gather(folder, load_model(), gather.Options(axis), lambda what, done, total: None)
+        return gather.gather(folder, load_model(), gather.Options(axis), ignore_progress)
 
     with pytest.raises(InputError, match=r"table.csv: date: expected .*dates.csv"):
         gathered()
