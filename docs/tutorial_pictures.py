@@ -17,7 +17,7 @@ from fdi.discovery.residual_pattern import pattern
 from fdi.discovery.runs import read
 from fdi.estimation.replay import open_loop, residuals
 from fdi.report import explain_figures
-from fdi.report.figures import STYLE, smaller, svg
+from fdi.report.drawing import STYLE, shorten_svg, to_svg
 from fdi.trace.cycles import readings
 from plant import Model
 from plant.effects import load_effects
@@ -49,7 +49,7 @@ def left_over(run: str, repeat: str, model: Model) -> str:
                 ax.axhline(side * floor[name].floor.value * scale, color=explain_figures.FLOOR, lw=0.8, ls=":")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
-        return svg(figure, run)
+        return to_svg(figure, run)
 
 
 def main(folder: str) -> None:
@@ -58,14 +58,14 @@ def main(folder: str) -> None:
     runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
     shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.trace.t)
-    (HERE / "shape.svg").write_text(smaller(shape), encoding="utf-8")
+    (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for story, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                      ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load(Path(file))
-        (HERE / f"{story}_left.svg").write_text(smaller(left_over(run, repeat, model)), encoding="utf-8")
+        (HERE / f"{story}_left.svg").write_text(shorten_svg(left_over(run, repeat, model)), encoding="utf-8")
         drawn = explain_figures.ledger(known.ledger, known.floor or {})
-        (HERE / f"{story}_ledger.svg").write_text(smaller(drawn), encoding="utf-8")
+        (HERE / f"{story}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from fdi import Trace
 from fdi.diagnosis.bands import excursions, suited
 from fdi.diagnosis.rms_grid import search
 from fdi.report import paper_figures as figures
-from fdi.report.figures import smaller
+from fdi.report.drawing import shorten_svg
 from plant import Model, simulate
 
 HERE = Path(__file__).parent / "worked_cases"
@@ -65,7 +65,7 @@ def main() -> None:
     HERE.mkdir(exist_ok=True)
 
     def save(number: str, text: str) -> None:
-        (HERE / f"fig{number}.svg").write_text(smaller(text), encoding="utf-8")
+        (HERE / f"fig{number}.svg").write_text(shorten_svg(text), encoding="utf-8")
 
     with tempfile.TemporaryDirectory() as folder:
         healthy = run(folder)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fdi.comparison.compare import Comparison
 from fdi.comparison.residual_tests import Depends, Diagnosis
 from fdi.report.compare_text import SHOWN
-from fdi.report.figures import COMMAND, INK, RED, STYLE, svg, thin
+from fdi.report.drawing import COMMAND, INK, RED, STYLE, thin_line, to_svg
 from fdi.trace.sections import sections
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,8 @@ def overview(found: Comparison) -> str:
         heights = [1.5] + [1.3, 1.3] * len(names)
         figure = Figure(figsize=(11, 0.8 + sum(heights)), layout="constrained")
         axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        axes[0].plot(*thin(c.t, c.com * 1e3), color=COMMAND, lw=2.2, label="Com, command")
-        axes[0].plot(*thin(c.t, c.xj * 1e3), color=COLOURS["xj"], lw=1.0, label="XJ, ram")
+        axes[0].plot(*thin_line(c.t, c.com * 1e3), color=COMMAND, lw=2.2, label="Com, command")
+        axes[0].plot(*thin_line(c.t, c.xj * 1e3), color=COLOURS["xj"], lw=1.0, label="XJ, ram")
         axes[0].set_ylabel("position [mm]")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)
         for i, name in enumerate(names):
@@ -43,14 +43,14 @@ def overview(found: Comparison) -> str:
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
         figure.align_ylabels()
-        return svg(figure, "overview")
+        return to_svg(figure, "overview")
 
 
 def _replayed(ax: Axes, found: Comparison, name: str) -> None:
     label, unit, scale = SHOWN[name]
     t = found.cycles.t
-    ax.plot(*thin(t, found.cycles.measured(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
-    ax.plot(*thin(t, found.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
+    ax.plot(*thin_line(t, found.cycles.measured(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
+    ax.plot(*thin_line(t, found.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
     ax.set_ylabel(f"{label} [{unit}]")
     ax.legend(loc="upper right", ncols=2, frameon=False)
 
@@ -59,7 +59,7 @@ def _left(ax: Axes, found: Comparison, name: str) -> None:
     label, unit, scale = SHOWN[name]
     floor = TWICE * found.signals[name].floor.value * scale
     ax.axhspan(-floor, floor, color=NOISE, alpha=0.25, lw=0)
-    ax.plot(*thin(found.cycles.t, found.replay.residual[name] * scale), color=INK, lw=0.7)
+    ax.plot(*thin_line(found.cycles.t, found.replay.residual[name] * scale), color=INK, lw=0.7)
     ax.set_ylabel(f"left of {label}\n[{unit}]")
 
 
@@ -88,7 +88,7 @@ def shares(found: Comparison) -> str:
         ax.grid(axis="y", visible=False)
         ax.set_xlabel("share of the squared error [%]")
         ax.set_xlim(0, 112 * max(p.share for p in places))
-        return svg(figure, "shares")
+        return to_svg(figure, "shares")
 
 
 def whiteness(found: Comparison) -> str:
@@ -102,7 +102,7 @@ def whiteness(found: Comparison) -> str:
             _autocorrelation(axes[0], d, found.cycles.period, SHOWN[name][0])
             _periodogram(axes[1], d)
             _cross(axes[2], d)
-        return svg(figure, "whiteness")
+        return to_svg(figure, "whiteness")
 
 
 def _autocorrelation(ax: Axes, d: Diagnosis, period: float, label: str) -> None:
@@ -116,7 +116,7 @@ def _autocorrelation(ax: Axes, d: Diagnosis, period: float, label: str) -> None:
 def _periodogram(ax: Axes, d: Diagnosis) -> None:
     f, line = d.frequencies, np.linspace(0.0, 1.0, len(d.frequencies))
     ax.fill_between(f, line - d.allowed, line + d.allowed, color=NOISE, alpha=0.25, lw=0)
-    ax.plot(*thin(f, d.power), color=INK, lw=1.0)
+    ax.plot(*thin_line(f, d.power), color=INK, lw=1.0)
     ax.set_ylim(0, 1)
     ax.set_ylabel("cumulative power")
     ax.set_xlabel("frequency [Hz]")
@@ -146,7 +146,7 @@ def dependence(found: Comparison) -> str:
         for name, axes in zip(names, rows, strict=True):
             by = {d.on: d for d in found.diagnoses[name].depends}
             _means(axes, kinds, by, name, TWICE * found.signals[name].floor.value)
-        return svg(figure, "dependence")
+        return to_svg(figure, "dependence")
 
 
 def _means(axes: Sequence[Axes], kinds: Sequence[str], by: dict[str, Depends], name: str, floor: float) -> None:

@@ -14,7 +14,7 @@ from fdi.diagnosis.envelope import Bands, RampBand, StepBand, Width, judged_rows
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Event, Fault
 from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
-from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
+from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.cycles import Cycles
 from fdi.trace.sections import Section, sections
@@ -32,14 +32,14 @@ def overview(c: Cycles, judged: Judged) -> str:
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 2.4), layout="constrained")
         ax = figure.subplots()
-        ax.plot(*thin(c.t, c.com * MM), color=COMMAND, lw=2.2, label="Com, command")
-        ax.plot(*thin(c.t, c.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
+        ax.plot(*thin_line(c.t, c.com * MM), color=COMMAND, lw=2.2, label="Com, command")
+        ax.plot(*thin_line(c.t, c.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
         ax.set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
         _shade(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
         ax.set_xlabel("time [s]")
         ax.legend(loc="upper right", ncols=2, frameon=False)
-        return svg(figure, "overview")
+        return to_svg(figure, "overview")
 
 
 def steps(c: Cycles, bands: Bands, judged: Judged) -> str:
@@ -57,7 +57,7 @@ def steps(c: Cycles, bands: Bands, judged: Judged) -> str:
         for ax in axes[len(bands.steps):]:
             ax.set_axis_off()
         axes[0].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
-        return svg(figure, "steps")
+        return to_svg(figure, "steps")
 
 
 def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged: Judged) -> None:
@@ -92,7 +92,7 @@ def ramps(c: Cycles, bands: Bands, judged: Judged) -> str:
         axes[0, 0].set_ylabel("error [µm]")
         axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
         axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
-        return svg(figure, "ramps")
+        return to_svg(figure, "ramps")
 
 
 def _ramp(axes: Sequence[Axes], c: Cycles, ramp: RampBand, s: Section, judged: Judged) -> None:
@@ -103,7 +103,7 @@ def _ramp(axes: Sequence[Axes], c: Cycles, ramp: RampBand, s: Section, judged: J
     signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
         _widths(ax, width, unit, nearer)
-        ax.plot(*thin(c.t[rows], values * unit), color=INK, lw=0.8, label="measured")
+        ax.plot(*thin_line(c.t[rows], values * unit), color=INK, lw=0.8, label="measured")
         ax.set_xlim(float(c.t[rows.start]), float(c.t[rows.stop - 1]))
         _shade(ax, judged.events, 1.0, 0.0, name)
     axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(c.t[rows.start]):.4g} s", fontsize=9)
@@ -155,7 +155,7 @@ def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: Judged |
         figure = Figure(figsize=(11, 1.9), layout="constrained")
         for ax, fault in zip(figure.subplots(1, 2), (CLOGGING, FRICTION), strict=True):
             _sizes(ax, fault, marks[fault.name])
-        return svg(figure, "estimates")
+        return to_svg(figure, "estimates")
 
 
 def _sizes(ax: Axes, fault: Fault, marks: list[tuple[str, Estimate]]) -> None:
@@ -197,4 +197,4 @@ def telling(found: Mapping[str, Precursor]) -> str:
         ax.grid(axis="y", visible=False)
         ax.set_xlabel("shift over healthy scatter (dotted: 3, below it a single test does not tell)")
         ax.legend(loc="lower right", frameon=False)
-        return svg(figure, "telling")
+        return to_svg(figure, "telling")

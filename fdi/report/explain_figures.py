@@ -13,7 +13,7 @@ from fdi.discovery.candidates import Candidate
 from fdi.discovery.model_file import Row
 from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.search import Hypothesis
-from fdi.report.figures import COMMAND, INK, STYLE, svg, thin
+from fdi.report.drawing import COMMAND, INK, STYLE, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES
 from fdi.trace.record import Record
 from fdi.trace.sections import sections
@@ -36,13 +36,15 @@ def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floo
         figure = Figure(figsize=(11, 1.4 + 1.7 * len(record.signals)), layout="constrained")
         heights = [0.8] + [1.2] * len(record.signals)
         axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        axes[0].plot(*thin(t, record.com * 1e3), color=COMMAND, lw=1.6)
+        axes[0].plot(*thin_line(t, record.com * 1e3), color=COMMAND, lw=1.6)
         axes[0].set_ylabel("Com [mm]")
         for i, (ax, name) in enumerate(zip(axes[1:], record.signals, strict=True)):
             scale, unit = SCALES[name]
-            ax.plot(*thin(t, before.fit.residuals[i, :n] * scale), color=BEFORE, lw=0.9, label="the model as it was")
+            line = thin_line(t, before.fit.residuals[i, :n] * scale)
+            ax.plot(*line, color=BEFORE, lw=0.9, label="the model as it was")
             if after is not None:
-                ax.plot(*thin(t, after.fit.residuals[i, :n] * scale), color=AFTER, lw=0.9, label=name_of_after)
+                line = thin_line(t, after.fit.residuals[i, :n] * scale)
+                ax.plot(*line, color=AFTER, lw=0.9, label=name_of_after)
             for side in (-1, 1):
                 ax.axhline(side * TWICE * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
                            label="twice the floor" if side > 0 else None)
@@ -53,7 +55,7 @@ def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floo
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(t[0]), float(t[-1]))
         figure.align_ylabels()
-        return svg(figure, "left")
+        return to_svg(figure, "left")
 
 
 def _shaded(ax: Axes, record: Record) -> None:
@@ -81,7 +83,7 @@ def ranking(candidates: Sequence[Candidate], floor: Mapping[str, float]) -> str:
         ax.set_yticks(rows, [" + ".join([*c.beside, c.effect]) for c in shown])
         ax.set_xlabel("what is left, worst signal, in floors")
         ax.legend(loc="lower right", frameon=False)
-        return svg(figure, "ranking")
+        return to_svg(figure, "ranking")
 
 
 def ledger(rows: Sequence[Row], floor: Mapping[str, float]) -> str:
@@ -103,7 +105,7 @@ def ledger(rows: Sequence[Row], floor: Mapping[str, float]) -> str:
             ax.set_title(SIGNAL_NAMES[s], fontsize=9, color=INK)
         axes[0].set_ylabel("error, in floors")
         axes[0].legend(loc="upper right", frameon=False)
-        return svg(figure, "ledger")
+        return to_svg(figure, "ledger")
 
 
 def _step(row: Row) -> str:
@@ -128,6 +130,6 @@ def shape(p: Pattern, t: Floats) -> str:
                 over.set_xlabel(f"{state} within a period of {scale * length:.4g} {unit}; dashed: a wave")
         over.set_ylabel(f"what is missing [{p.unit}]")
         n = min(len(t), len(p.trace))
-        along.plot(*thin(t[:n], p.trace[:n]), color=HELD, lw=0.8)
+        along.plot(*thin_line(t[:n], p.trace[:n]), color=HELD, lw=0.8)
         along.set_xlabel("time [s]")
-        return svg(figure, "shape")
+        return to_svg(figure, "shape")

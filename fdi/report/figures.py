@@ -1,10 +1,7 @@
 """The drawings of a report, as SVG text that stands inside an HTML page."""
 from __future__ import annotations
 
-import io
 import math
-import re
-from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -12,18 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from fdi.report.drawing import COMMAND, GREEN, INK, LINE_COLUMNS, RED, STYLE, thin_line, to_svg
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
-INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
-STYLE: Any = {  # matplotlib's types want each key as a literal
-    "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
-    "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
-    "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
 FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
 SHORTEST = 0.1  # us, the left end of a histogram; no clock here tells less
-COLUMNS = 1400  # a line is drawn by its extremes in this many columns; more cannot be seen
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
           ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
           ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
@@ -45,8 +37,8 @@ def signals(trace: Trace) -> str:
         axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
             if name == "xj":
-                ax.plot(*thin(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
-            ax.plot(*thin(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
+                ax.plot(*thin_line(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
+            ax.plot(*thin_line(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
             _missing(ax, trace, values[name])
             ax.set_ylabel(label)
             if name == "close":
@@ -63,7 +55,7 @@ def signals(trace: Trace) -> str:
         axes[-1].set_xlabel("time from the start of the main phase [s]")
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
         figure.align_ylabels()
-        return svg(figure, "signals")
+        return to_svg(figure, "signals")
 
 
 def faults(trace: Trace) -> list[tuple[str, float, float]]:
@@ -98,23 +90,7 @@ def timing(trace: Trace) -> str:
             ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
             ax.set_xlabel(f"{name} [µs]")
         axes[0].set_ylabel("cycles (dotted: p99)")
-        return svg(figure, "timing")
-
-
-def thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """The smallest and largest value of each of COLUMNS pieces, in their order: looks like the whole line."""
-    if len(t) <= 2 * COLUMNS:
-        return t, values
-    rows: list[int] = []
-    for piece in np.array_split(np.arange(len(t)), COLUMNS):
-        inside = values[piece]
-        if np.isnan(inside).all():
-            rows.append(int(piece[0]))
-        else:
-            rows += sorted({int(piece[np.nanargmin(inside)]), int(piece[np.nanargmax(inside)])})
-            rows += [int(piece[np.isnan(inside)][0])] if np.isnan(inside).any() else []
-    chosen = np.unique(rows)
-    return t[chosen], values[chosen]
+        return to_svg(figure, "timing")
 
 
 def _bridged(values: Floats) -> Floats:
@@ -131,7 +107,7 @@ def _bridged(values: Floats) -> Floats:
 
 def _missing(ax: Axes, trace: Trace, values: Floats) -> None:
     """A red mark at the foot of the panel wherever samples are missing."""
-    pieces = np.array_split(np.isnan(values), min(COLUMNS, len(values)))
+    pieces = np.array_split(np.isnan(values), min(LINE_COLUMNS, len(values)))
     lost = np.array([piece.any() for piece in pieces])
     starts = np.cumsum([0, *map(len, pieces)])
     edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
@@ -176,17 +152,3 @@ def _windows(ax: Axes, trace: Trace) -> None:
     ax.set_ylim(len(trace.checks) - 0.4, -0.6)
     ax.set_yticks([])
     ax.set_ylabel("checks")
-
-
-def svg(figure: Figure, salt: str) -> str:
-    """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures."""
-    out = io.StringIO()
-    with rc_context(STYLE | {"svg.hashsalt": salt}):  # ids must differ between the drawings of a page
-        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = out.getvalue()
-    return text[text.index("<svg"):]
-
-
-def smaller(drawing: str) -> str:
-    """The same drawing with one decimal of a point in its lines, for a file that is kept; words stay as they are."""
-    return re.sub(r'(?<= d=")[^"]*', lambda line: re.sub(r"(\d+\.\d)\d+", r"\1", line[0]), drawing)

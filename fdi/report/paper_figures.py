@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.bands import Excursion
 from fdi.diagnosis.envelope import Bands, StepBand
 from fdi.diagnosis.rms_grid import LEFT, RIGHT, Grid, Map
-from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg, thin
+from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.trace.sections import Section
 from fdi.trace.trace import Trace
 
@@ -52,7 +52,7 @@ def steps(traces: Mapping[str, Trace], number: int = 0) -> str:
         far.set_title("overshoot, close up", fontsize=9)
         near.set_ylabel("position [mm]")
         near.legend(loc="center right", frameon=False)
-        return svg(figure, "steps")
+        return to_svg(figure, "steps")
 
 
 def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
@@ -63,14 +63,14 @@ def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
         for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
             s = _section(trace, "ramp", number)
             t, rows = _time(trace, s), slice(s.start, s.stop)
-            way.plot(*thin(t, trace.xj[rows] * 1e3), color=colour, lw=1.0, label=label)
-            error.plot(*thin(t, (trace.com - trace.xj)[rows] * 1e6), color=colour, lw=1.0)
+            way.plot(*thin_line(t, trace.xj[rows] * 1e3), color=colour, lw=1.0, label=label)
+            error.plot(*thin_line(t, (trace.com - trace.xj)[rows] * 1e6), color=colour, lw=1.0)
         way.plot(t, trace.com[rows] * 1e3, color=COMMAND, lw=1.0, ls=":", label="command")
         way.set_ylabel("position [mm]")
         error.set_ylabel("error [µm]")
         error.set_xlabel("time [s]")
         way.legend(loc="lower right" if s.rate > 0 else "upper right", frameon=False)
-        return svg(figure, "ramps")
+        return to_svg(figure, "ramps")
 
 
 def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
@@ -106,7 +106,7 @@ def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Tr
         unit = "mm" if kind == "step" else "departure, µm" if signal == "position" else "departure, mm/s"
         axes[0].set_ylabel(f"{signal} [{unit}]")
         axes[0].legend(loc="best", frameon=True, edgecolor="none", fontsize=7)
-        return svg(figure, f"banded {kind} {signal}")
+        return to_svg(figure, f"banded {kind} {signal}")
 
 
 def _band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
@@ -142,10 +142,10 @@ def _on_ramp(ax: Axes, trace: Trace, e: Excursion) -> None:
     ax.fill_between(t, 0.0 * e.middle, e.middle * scale, color=GREEN, alpha=0.10, lw=0)
     for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
         ax.plot(t[[0, -1]], limit[[0, -1]] * scale, color=colour, lw=1.0, label=label)
-    ax.plot(*thin(t, e.departure * scale), color=INK, lw=0.8, label="measured")
+    ax.plot(*thin_line(t, e.departure * scale), color=INK, lw=0.8, label="measured")
     with np.errstate(invalid="ignore"):
         beyond = np.where(e.departure > e.middle, e.departure, np.nan)
-    ax.plot(*thin(t, beyond * scale), color=RED, lw=1.6, label="outside")
+    ax.plot(*thin_line(t, beyond * scale), color=RED, lw=1.6, label="outside")
     ax.set_ylim(0.0, 1.1 * scale * max(float(np.nanmax(e.departure)), float(e.most[0])))
     ax.set_xlabel("time [s]")
 
@@ -177,7 +177,7 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
         axes[0].set_ylabel("FSS [N]")
         for ax in axes:
             ax.legend(loc="upper right", fontsize=7)
-        return svg(figure, "maps")
+        return to_svg(figure, "maps")
 
 
 def _map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:

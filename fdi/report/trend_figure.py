@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from fdi.prognosis.trend import Trend
 from fdi.prognosis.unit_trend import NAMES, Answer
-from fdi.report.figures import COMMAND, INK, RED, STYLE, svg
+from fdi.report.drawing import COMMAND, INK, RED, STYLE, to_svg
 from plant.errors import InputError
 
 COURSE, AHEAD, MIDDLE = "#1f6feb", "#d9730d", "#b7791f"
@@ -22,7 +22,7 @@ LABELS = {"kintas": "filter clogging, Kintas", "fss": "spool friction, FSS"}
 def drawing(found: Answer) -> str:
     """Both faults as SVG text that stands inside a page."""
     with rc_context(STYLE):
-        return svg(_figure(found), "trend")
+        return to_svg(_figure(found), "trend")
 
 
 def save(found: Answer, out: Path) -> None:

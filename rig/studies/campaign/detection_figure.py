@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fdi.diagnosis.faults import FAULTS, Fault
-from fdi.report.figures import COMMAND, GREEN, INK, RED, STYLE, svg
+from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, to_svg
 from rig.studies.campaign.summary import title
 
 BLUE = "#1f6feb"
@@ -28,7 +28,7 @@ def detection(part: Mapping[str, Any]) -> str:
         axes[0].set_ylim(-3, 103)
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(LINES), frameon=False)
-        return svg(figure, "detection")
+        return to_svg(figure, "detection")
 
 
 def _curve(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from synthetic_run import record
 
-from fdi.report import figures
+from fdi.report import drawing, figures
 from fdi.report.run_page import render, write_report
 from fdi.report.run_verdict import verdict
 from fdi.trace.trace import Event, Trace
@@ -141,7 +141,7 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     assert np.isnan(figures._bridged(np.full(5, np.nan))).all()
     columns = {"com": values, "xj": values, "cor": values}
     sound, broken = (figures.signals(Trace.of({**columns, "xj": xj}, 1e-3, {})) for xj in (values, holes))
-    assert figures.RED in broken and figures.RED not in sound
+    assert drawing.RED in broken and drawing.RED not in sound
 
 
 def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_thinned_line_keeps_its_extremes() -> None:
     t, values = np.arange(50_000) * 1e-3, np.zeros(50_000)
     values[[12_345, 40_001]] = 1.0, -1.0
     values[20_000:20_100] = np.nan
-    thin_t, thin = figures.thin(t, values)
+    thin_t, thin = drawing.thin_line(t, values)
     assert len(thin) < 5000 and np.nanmax(thin) == 1 and np.nanmin(thin) == -1 and np.isnan(thin).any()
     assert t[12_345] in thin_t and (np.diff(thin_t) > 0).all()
 

@@ -1,0 +1,67 @@
+"""What all figures share: style, colours, thinning of long lines, and SVG text that stands inside a page.
+
+Nothing here loads matplotlib before a figure is drawn.
+"""
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
+STYLE: Any = {  # matplotlib's types want each key as a literal
+    "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
+    "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
+    "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+LINE_COLUMNS = 1400  # a line is drawn by its extremes in this many columns; a page shows no more
+
+
+@contextmanager
+def start_figure(height: float, width: float = 11.0) -> Iterator[Figure]:
+    """An empty figure of this size in inches; the style of all reports holds while it is drawn."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """The smallest and largest value in each of `LINE_COLUMNS` pieces, in order of time: looks like the whole line."""
+    if len(t) <= 2 * LINE_COLUMNS:
+        return t, values
+    rows: list[int] = []
+    for piece in np.array_split(np.arange(len(t)), LINE_COLUMNS):
+        inside = values[piece]
+        if np.isnan(inside).all():
+            rows.append(int(piece[0]))
+        else:
+            rows += sorted({int(piece[np.nanargmin(inside)]), int(piece[np.nanargmax(inside)])})
+            rows += [int(piece[np.isnan(inside)][0])] if np.isnan(inside).any() else []
+    chosen = np.unique(rows)
+    return t[chosen], values[chosen]
+
+
+def to_svg(figure: Figure, salt: str) -> str:
+    """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures."""
+    from matplotlib import rc_context
+
+    out = io.StringIO()
+    with rc_context(STYLE | {"svg.hashsalt": salt}):
+        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = out.getvalue()
+    return text[text.index("<svg"):]
+
+
+def shorten_svg(drawing: str) -> str:
+    """The same drawing with one decimal of a point in its lines, for a file that is kept; its texts stay."""
+    return re.sub(r'(?<= d=")[^"]*', lambda line: re.sub(r"(\d+\.\d)\d+", r"\1", line[0]), drawing)
