@@ -39,16 +39,23 @@ def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     """The smallest and largest value in each of `LINE_COLUMNS` pieces, in order of time: looks like the whole line."""
     if len(t) <= 2 * LINE_COLUMNS:
         return t, values
-    rows: list[int] = []
-    for piece in np.array_split(np.arange(len(t)), LINE_COLUMNS):
-        inside = values[piece]
-        if np.isnan(inside).all():
-            rows.append(int(piece[0]))
-        else:
-            rows += sorted({int(piece[np.nanargmin(inside)]), int(piece[np.nanargmax(inside)])})
-            rows += [int(piece[np.isnan(inside)][0])] if np.isnan(inside).any() else []
-    chosen = np.unique(rows)
+    starts = _piece_starts(len(t))
+    length = np.diff(starts, append=len(t))
+    missing = np.isnan(values)
+    low = np.minimum.reduceat(np.where(missing, np.inf, values), starts)
+    high = np.maximum.reduceat(np.where(missing, -np.inf, values), starts)
+    # the first row of a piece that has its extreme, and the first that is missing
+    candidates = (values == np.repeat(low, length), values == np.repeat(high, length), missing)
+    pieces = np.repeat(np.arange(len(starts)), length)
+    rows = [found[np.unique(pieces[found], return_index=True)[1]] for found in map(np.flatnonzero, candidates)]
+    chosen = np.unique(np.concatenate(rows))
     return t[chosen], values[chosen]
+
+
+def _piece_starts(rows: int) -> NDArray[np.intp]:
+    """First row of each of LINE_COLUMNS pieces of nearly equal length, as `numpy.array_split` cuts them."""
+    short, longer = divmod(rows, LINE_COLUMNS)
+    return np.cumsum([0, *[short + 1] * longer, *[short] * (LINE_COLUMNS - longer - 1)])
 
 
 def to_svg(figure: Figure, salt: str) -> str:

@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from fdi.report.drawing import COMMAND, GREEN, INK, LINE_COLUMNS, RED, STYLE, thin_line, to_svg
@@ -33,8 +35,7 @@ def signals(trace: Trace) -> str:
     panels = [panel for panel in PANELS if panel[0] in values and not np.isnan(values[panel[0]]).all()]
     heights = [1.7] * len(panels) + [0.15 * len(trace.checks) + 0.25] * bool(trace.checks)
     with rc_context(STYLE):
-        figure = Figure(figsize=(11, 0.8 + sum(heights)), layout="constrained")
-        axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        figure, axes = _stack(heights)
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
             if name == "xj":
                 ax.plot(*thin_line(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
@@ -54,8 +55,25 @@ def signals(trace: Trace) -> str:
             _windows(axes[-1], trace)
         axes[-1].set_xlabel("time from the start of the main phase [s]")
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
-        figure.align_ylabels()
         return to_svg(figure, "signals")
+
+
+def _stack(heights: Sequence[float]) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of panels above each other, each as high as `heights` says (inches), on one time axis.
+
+    The margins are fixed: a layout that measures every tick label first takes as long as the drawing.
+    """
+    width, left, right, top, bottom, gap = 11.0, 0.85, 0.1, 0.3, 0.5, 0.12
+    height = top + sum(heights) + gap * (len(heights) - 1) + bottom
+    figure = Figure(figsize=(width, height))
+    mean = sum(heights) / len(heights)
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights, gridspec_kw={
+        "left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height,
+        "hspace": gap / mean})[:, 0]
+    for panel in axes:
+        panel.yaxis.set_label_coords(-0.6 / (width - left - right), 0.5)
+    axes[-1].xaxis.set_label_coords(0.5, -0.3 / heights[-1])
+    return figure, list(axes)
 
 
 def faults(trace: Trace) -> list[tuple[str, float, float]]:
@@ -81,15 +99,21 @@ def timing(trace: Trace) -> str:
     if not drawn:
         return ""
     with rc_context(STYLE):
-        figure = Figure(figsize=(11, 2.5), layout="constrained")
-        axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+        figure = Figure(figsize=(11, 2.5))
+        axes = figure.subplots(1, len(drawn), squeeze=False, gridspec_kw={
+            "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})[0]
         for ax, (name, values, colour) in zip(axes, drawn, strict=True):
             low, high = math.log10(values.min()), math.log10(max(float(values.max()), 1.0))
             ax.hist(values, bins=np.logspace(low, high + 0.02, 60).tolist(), color=colour, log=True)
             ax.set_xscale("log")
+            for axis in (ax.xaxis, ax.yaxis):  # plain numbers: the powers of ten take longer to set than to draw
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axis.set_minor_locator(NullLocator())
+            ax.xaxis.set_label_coords(0.5, -0.14)
             ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
             ax.set_xlabel(f"{name} [µs]")
         axes[0].set_ylabel("cycles (dotted: p99)")
+        axes[0].yaxis.set_label_coords(-0.06 * len(drawn), 0.5)
         return to_svg(figure, "timing")
 
 
