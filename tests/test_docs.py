@@ -1,8 +1,9 @@
-"""What the documentation says is there, is there; what it shows, works."""
+"""The documentation is complete, its links have targets, and its examples work."""
 from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -12,9 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rig_command import rig
+from short_runs import HIDDEN, measured, words
 
 from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, effect, load_effects
+from plant.parameters import GROUPS
+from plant.quantity import quantities
 from plant.state import Input, Ports, State
 from rig.cli import main
 from rig.cli.command_list import HELP_OF_COMMAND
@@ -24,16 +28,17 @@ from rig.sequences.sequence import Sequence, parse_sequence
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
 SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 
 
-def blocks(text: str) -> list[str]:
+def indented_blocks(text: str) -> list[str]:
     """The indented blocks of a Markdown text, without their indentation."""
     found = re.findall(r"(?:^    .*\n(?:\s*\n(?=    ))?)+", text, re.MULTILINE)
     return [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in found]
 
 
-def keys() -> Iterator[tuple[str, str]]:
+def documented_keys() -> Iterator[tuple[str, str]]:
     for kinds in (segments.KINDS, faults.KINDS, checks.KINDS):
         for kind, cls in kinds.items():
             yield kind, kind
@@ -42,19 +47,19 @@ def keys() -> Iterator[tuple[str, str]]:
     yield from (("guard", f.name) for f in fields(Guard))
 
 
-@pytest.mark.parametrize(("where", "key"), sorted(set(keys())))
+@pytest.mark.parametrize(("where", "key"), sorted(set(documented_keys())))
 def test_every_key_of_a_sequence_is_described(where: str, key: str) -> None:
     assert re.search(rf"`{key}`", SEQUENCES), f"docs/sequences.md says nothing about {key} of {where}"
 
 
-def test_the_sequence_in_the_readme_is_one() -> None:
-    text = next(block for block in blocks(README) if block.startswith("title ="))
-    sequence = parse_sequence(text, "readme.toml", lambda name: b"")
+def test_the_example_of_a_sequence_is_valid() -> None:
+    text = next(block for block in indented_blocks(SEQUENCES) if block.startswith("title ="))
+    sequence = parse_sequence(text, "example.toml", lambda name: b"")
     assert sequence.faults and sequence.checks and sequence.guards and sequence.load
 
 
-def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
-    text = next(block for block in blocks(README) if block.startswith("# my_effects.py")).split("\nrig ")[0]
+def test_the_effect_in_the_readme_works(tmp_path: Path) -> None:
+    text = next(block for block in indented_blocks(README) if block.startswith("# my_effects.py")).split("\nrig ")[0]
     (tmp_path / "my_effects.py").write_text(text)
     try:
         assert load_effects(tmp_path / "my_effects.py") == ["cogging"]
@@ -65,10 +70,10 @@ def test_the_effect_in_the_readme_is_one(tmp_path: Path) -> None:
         CATALOGUE.pop("cogging", None)
 
 
-def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
+def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     """The worked example as a user goes through it: file, trial, simulation."""
     text = (ROOT / "docs" / "effects.md").read_text()
-    code = [block for block in blocks(text) if re.match(r"# my_effects\.py|class ", block)]
+    code = [block for block in indented_blocks(text) if re.match(r"# my_effects\.py|class ", block)]
     assert all(len(block.splitlines()) <= 25 for block in code)
     (tmp_path / "my_effects.py").write_text("\n".join(code))
     try:
@@ -92,8 +97,8 @@ def test_the_effects_in_the_manual_are_ones(tmp_path: Path) -> None:
 
 
 def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
-    said = set(re.findall(r"\brig ([a-z]+)\b", "\n".join(blocks(README)))) | set(re.findall(r"`rig ([a-z]+)", README))
-    assert said == set(HELP_OF_COMMAND)
+    typed = re.findall(r"\brig ([a-z]+)\b", "\n".join(indented_blocks(README)))
+    assert {*typed, *re.findall(r"`rig ([a-z]+)", README)} == set(HELP_OF_COMMAND)
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))
@@ -101,14 +106,34 @@ def test_every_page_is_linked(page: str) -> None:
     assert f"docs/{page}" in README + (ROOT / "ARCHITECTURE.md").read_text()
 
 
-def test_every_link_leads_somewhere() -> None:
-    for page in [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *(ROOT / "docs").glob("*.md")]:
+def test_every_link_has_a_target() -> None:
+    for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-TUTORIAL = ROOT / "docs" / "tutorial.md"
-TYPED = [line for block in blocks(TUTORIAL.read_text()) for line in block.splitlines() if line.startswith("rig ")]
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_figure_has_a_caption(page: Path) -> None:
+    """A line in italics below the figure that says what to see in it."""
+    lines = page.read_text().splitlines()
+    for number, line in enumerate(lines):
+        if line.startswith("!["):
+            assert not lines[number + 1] and lines[number + 2].startswith("*"), f"{page.name}: {line}"
+
+
+def commands_shown(page: Path) -> list[str]:
+    """The lines of a page that a user types, without the remark behind them."""
+    lines = [line for block in indented_blocks(page.read_text()) for line in block.splitlines()]
+    return [re.split(r"\s{2,}#", line)[0] for line in lines if line.startswith("rig ")]
+
+
+@pytest.mark.parametrize(("page", "line"), [(page.name, line) for page in PAGES for line in commands_shown(page)])
+def test_the_commands_shown_are_accepted(page: str, line: str) -> None:
+    main.build_parser().parse_args(shlex.split(line)[1:])
 
 
 def values(args: argparse.Namespace, *names: str) -> list[str]:
@@ -116,16 +141,96 @@ def values(args: argparse.Namespace, *names: str) -> list[str]:
     return [str(word) for value in found for word in (value if isinstance(value, list) else [value] if value else [])]
 
 
-@pytest.mark.parametrize("line", TYPED)
-def test_the_commands_of_the_tutorial_are_accepted(line: str) -> None:
-    main.build_parser().parse_args(shlex.split(line)[1:])
-
-
 def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
     there = {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
     effects = {"null_bias", "jack_friction", "discovered"}
-    for line in TYPED:
+    typed = commands_shown(ROOT / "docs" / "tutorial.md")
+    assert len(typed) > 10
+    for line in typed:
         args = main.build_parser().parse_args(shlex.split(line)[1:])
         used = values(args, "trace", "words", "repeat", "holdout", "effects", "model", "command_file")
         assert set(used) - effects - {"eha"} <= there, line
         there |= set(values(args, "out", "write_effect"))
+
+
+PHYSICS = (ROOT / "docs" / "physics.md").read_text()
+SYMBOLS = re.findall(r"^\|\s*(\S*?)\s*\| `([a-z_]+\.[a-z_]+)`[^|]*\| ([^|]+) \|", PHYSICS, re.MULTILINE)
+
+
+def test_the_table_of_symbols_has_every_parameter_and_its_symbol() -> None:
+    known = {name: quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol for name in Model().names()}
+    assert {name: symbol for symbol, name, _ in SYMBOLS} == known
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for _, name, value in SYMBOLS if name != "filter.law"])
+def test_the_table_of_symbols_has_the_nominal_values(name: str, value: str) -> None:
+    assert float(value) == pytest.approx(Model()[name], rel=2e-3)
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_the_catalogue_in_the_physics_page_is_complete(name: str) -> None:
+    assert f"| `{name}` | {CATALOGUE[name].port or 'base'} |" in PHYSICS
+
+
+JSON = (ROOT / "docs" / "json.md").read_text()
+NAMED_BY_DATA = {"precursors", "inputs", "parameters", "moved", "others"}  # their keys are parameters, inputs, features
+
+
+def json_keys(value: object, parent: str = "") -> Iterator[str]:
+    """Every key of an answer, at any depth, that does not come from the data."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if parent not in NAMED_BY_DATA:
+                yield key
+            yield from json_keys(inner, key if parent not in NAMED_BY_DATA else "")
+    elif isinstance(value, list):
+        for inner in value:
+            yield from json_keys(inner)
+
+
+def assert_documented(answer: object, heading: str) -> None:
+    section = next(part for part in JSON.split("\n## ") if part.startswith(heading))
+    undocumented = set(json_keys(answer)) - set(re.findall(r"`(\w+)`", section)) - {"xj", "p12", "xs", "cor"}
+    assert not undocumented, f"docs/json.md, {heading}"
+
+
+def test_the_keys_of_a_run_are_documented(preflight: Path) -> None:
+    answer = json.loads((preflight / "verdict.json").read_text())
+    assert answer.pop("fdi") == {}
+    assert_documented(answer, "rig run")
+
+
+def test_the_keys_of_a_diagnosis_are_documented(preflight: Path) -> None:
+    assert_documented(rig("fdi", preflight, "--json").json, "rig fdi")
+
+
+@pytest.fixture(scope="module")
+def short_runs_with_a_null_bias(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return measured(tmp_path_factory.mktemp("documented"), HIDDEN)
+
+
+def test_the_keys_of_a_comparison_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
+    runs = short_runs_with_a_null_bias
+    answer = rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json
+    assert answer["where"] and answer["tolerances"] and answer["diagnostics"]
+    assert_documented(answer, "rig compare")
+
+
+def test_the_keys_of_an_explanation_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
+    answer = rig("explain", *words(short_runs_with_a_null_bias), "--json").json
+    assert answer["candidates"] and answer["blind_to"]
+    assert_documented(answer, "rig explain")
+
+
+def test_the_glossary_has_every_verdict() -> None:
+    glossary = (ROOT / "docs" / "glossary.md").read_text()
+    verdicts = re.findall(r"`([A-Z_]{4,})`", "".join(re.findall(r"^\| `verdict` .*|^`trends.*", JSON, re.MULTILINE)))
+    assert len(verdicts) > 15
+    assert not [word for word in verdicts if not re.search(rf"\b{word}\b", glossary)]
+
+
+def test_the_glossary_explains_a_term_once() -> None:
+    glossary = (ROOT / "docs" / "glossary.md").read_text().split("## Verdict words")[0]
+    terms = [term.strip() for row in re.findall(r"^\| ([^|]+) \| [^|]+\|$", glossary, re.MULTILINE)
+             for term in row.split(",") if term not in ("term", "---")]
+    assert len(terms) > 100 and len(terms) == len(set(terms))
