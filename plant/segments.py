@@ -2,7 +2,7 @@
 
 A segment starts from the demand that the one before it reached at its end (the value it would take in the cycle after
 its last), so a list of them is continuous except where a step, a CSV file or a wave with given phases says otherwise.
-The same segments describe a load on the ram: read N for m. The waves are those of physics.md section 4.
+The same segments describe a load on the ram: read N for m. The waves are those of docs/physics.md.
 """
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def _weights(friction: float, known: Floats) -> Floats:
 
 
 def waver(error: Floats) -> Floats:
-    """Half the range of a following error (.., n), time last, from its 1st to its 99th percentile, m (physics.md 3)."""
+    """Half the range of a following error (.., n), time last, from 1st to 99th percentile, m (docs/physics.md)."""
     low, high = np.nanpercentile(error, (1, 99), axis=-1)
     half: Floats = (high - low) / 2
     return half

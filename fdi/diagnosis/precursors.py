@@ -1,7 +1,7 @@
 """What a trace's response says in single numbers, each beside its healthy scatter and what either fault does to it.
 
 The mean error on a slow ramp is the classic sign of friction, and does not depend on it while the ram slides
-(physics.md, 3): the signal-to-noise in the table shows which precursors really tell.
+(docs/physics.md, "Closed forms"): the signal-to-noise in the table shows which precursors really tell.
 """
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an explanation says, effect by effect, as people and programs read it (interface.md, 4)."""
+"""What an explanation says, effect by effect, as people and programs read it (docs/json.md)."""
 from __future__ import annotations
 
 import math
@@ -89,7 +89,7 @@ class Answer:
 
     @property
     def verdict(self) -> str:
-        """As interface.md has it."""
+        """One of the six words of docs/json.md."""
         return self.explanation.verdict
 
     @property

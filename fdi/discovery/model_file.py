@@ -29,7 +29,7 @@ class Row(NamedTuple):
     removed: bool = False
 
     def plain(self) -> dict[str, Any]:
-        """As interface.md has it."""
+        """The row as JSON values (docs/json.md)."""
         row: dict[str, Any] = {"effect": self.effect, "error": dict(self.error), "holdout": dict(self.holdout)}
         return row | {"removed": True} if self.removed else row
 

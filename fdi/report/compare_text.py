@@ -1,4 +1,4 @@
-"""A comparison in words, for terminal and page, and as JSON (interface.md, 4)."""
+"""A comparison in words, for terminal and page, and as JSON (docs/json.md)."""
 from __future__ import annotations
 
 import math

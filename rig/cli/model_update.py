@@ -158,7 +158,7 @@ def _intervals(done: Done) -> dict[str, Value]:
 
 
 def to_json(path: Path, done: Done, page: Path | None) -> dict[str, object]:
-    """`rig add --json`, `rig remove --json` (interface.md, 4)."""
+    """`rig add --json`, `rig remove --json` (docs/json.md)."""
     r = done.refit
     return {"model": str(path), "ledger": [row.plain() for row in done.provenance.ledger],
             "floor": dict(done.provenance.floor or {}),

@@ -93,7 +93,7 @@ def rise_time(position: Array, com: Array, before: float) -> float:
 
 
 def ramp_error(error: Array, com: Array) -> float:
-    """Mean lag behind a ramp, m, positive when the ram is behind whichever way it goes (physics.md section 3)."""
+    """Mean lag behind a ramp, m, positive when the ram is behind whichever way it goes (docs/physics.md)."""
     if com[-1] == com[0]:
         raise NotMeasurable("the command does not move here")
     return float(error.mean() * np.sign(com[-1] - com[0]))
@@ -102,7 +102,7 @@ def ramp_error(error: Array, com: Array) -> float:
 def break_away(error: Array) -> float:
     """Position error that builds up before the spool lets go, m: half the band that stick-slip draws on a slow ramp.
 
-    physics.md section 3: FSS KF / (GPF1 ASV GM GAP). The band is taken from the 1st to the 99th percentile of the
+    docs/physics.md: FSS KF / (GPF1 ASV GM GAP). The band is taken from the 1st to the 99th percentile of the
     filtered error, so that noise and single outliers do not widen it; a triangle loses 2 % by that. The mean (ramp
     error) drops out.
     """

@@ -1,4 +1,4 @@
-"""Every closed form of physics.md, section 3, on the plant itself."""
+"""Every closed form of docs/physics.md on the plant itself."""
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A run to record without a bench: the plant over the preflight command (physics.md, 4), as frames and cycles."""
+"""A run to record without a bench: the plant over the preflight command (docs/physics.md), as frames and cycles."""
 from __future__ import annotations
 
 import math

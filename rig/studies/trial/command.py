@@ -1,4 +1,4 @@
-"""The commands of the trial's traces, and the known load on them: the preflight of physics.md, and random hold-outs."""
+"""Commands and known loads of the trial's traces: the preflight of docs/physics.md, and random held-out commands."""
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""What the trial hides: the catalogue's effects as physics.md tables them, and some that no catalogue has.
+"""What the trial hides: the catalogue's effects as docs/physics.md lists them, and some that no catalogue has.
 
 Written from the table alone, in the symbols of truth.c. A size is drawn log-uniformly from about the sensors' floor to
 the large end of what is typical.
@@ -110,7 +110,7 @@ CATALOGUE: dict[str, Law] = {
     "transport_delay": Law(0.07, 3, _set("delay"), "delay"),
     "command_rate_limit": Law(0.05, 0.3, _set("rate"), "rate"),
 }
-"""The 33 effects of physics.md, section 6."""
+"""The 33 effects of the catalogue (docs/physics.md)."""
 
 OUTSIDE: dict[str, Law] = {
     "force periodic in position": Law(300, 3000, _set("cog"), extra={"cog_l": (0.8e-3, 4e-3)}),

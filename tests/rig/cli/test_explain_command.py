@@ -1,4 +1,4 @@
-"""`rig explain`: what it says of runs made with a tenth of its step, as JSON (interface.md, 4), in words, as a page."""
+"""`rig explain`: what it says of runs made with a tenth of its step, as JSON (docs/json.md), in words, as a page."""
 from __future__ import annotations
 
 import doctest
