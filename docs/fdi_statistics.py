@@ -11,9 +11,9 @@ from typing import Any
 
 from fdi.diagnosis.faults import FAULTS
 from rig.studies.campaign.detection_figure import detection
-from rig.studies.campaign.folder import matrix_of, read_rows
+from rig.studies.campaign.folder import read_campaign_rows, read_matrix_of_folder
 from rig.studies.campaign.show_campaign import asked, percent
-from rig.studies.campaign.summary import summary, title
+from rig.studies.campaign.summary import name_size, summarise_campaign
 
 PAGE = Path(__file__).with_suffix(".md")
 BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
@@ -40,36 +40,36 @@ def part(figures: Mapping[str, Any]) -> str:
     for fault in FAULTS:
         points = figures["curves"][fault.name]
         if len(points) > 1:
-            out += table((title(fault), "maintenance or worse", "share", "95 % interval", "non-nominal", "ruling",
+            out += table((name_size(fault), "maintenance or worse", "share", "95 % interval", "non-nominal", "ruling",
                           "by the bands alone"),
                          [(f"{p['size']:g}", *percent(p["detected"]),
                            *(percent(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
     for fault in FAULTS:
         counts = figures["levels"][fault.name]
         said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
-        out += table((f"{title(fault)}: true level, said", *said),
+        out += table((f"{name_size(fault)}: true level, said", *said),
                      [(name, *(str(row[word]) for word in said)) for name, row in counts.items() if any(row.values())])
     said = sorted({word for row in figures["ruling"].values() for word in row})
     out += table(("ruling fault: truth, said", *said),
                  [(name, *(str(row.get(word, 0)) for word in said)) for name, row in figures["ruling"].items()])
     return out + table(
         ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
-        [(e["label"], title(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
+        [(e["label"], name_size(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
           *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *percent(e["covered"])[1:])
          for e in figures["errors"]])
 
 
 def other(folder: str) -> str:
     """The rates of a further campaign."""
-    figures = summary(read_rows(folder))
-    out = f"## Truth by the {matrix_of(folder).spec['simulator']} simulator: {figures['cases']} cases\n\n"
+    figures = summarise_campaign(read_campaign_rows(folder))
+    out = f"## Truth by the {read_matrix_of_folder(folder).spec['simulator']} simulator: {figures['cases']} cases\n\n"
     return out + "".join(f"{100 * of['tolerance']:g} % scatter, {of['cases']} cases\n\n{rates(of['rates'])}"
                          for of in reversed(figures["tolerances"]))
 
 
 def main(folder: str, *others: str) -> None:
     """Write page and picture."""
-    figures = summary(read_rows(folder))
+    figures = summarise_campaign(read_campaign_rows(folder))
     took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
     text = f"{figures['cases']} cases: {status}. Time a trace on one core, beside other work: {took['median']:.1f} s " \
            f"(median), {took['p95']:.1f} s (95 of 100), {took['most']:.1f} s (most).\n\n"

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import predict
+from rig.studies.prognosis.score import predict_unit
 
 PARTICLES, PARTS = 2000, (0.3, 0.5, 0.7, 0.9)
 START, SPREAD = np.log(0.2), 1.5  # of the logarithm of a, and of c
@@ -44,7 +44,7 @@ def moved(x: np.ndarray, a: np.ndarray, c: np.ndarray, dt: float) -> np.ndarray:
 
 def ours(u: degrading_units.Unit, n: int) -> np.ndarray:
     """`rig trend`."""
-    return predict(u, n).most
+    return predict_unit(u, n).most
 
 
 def unscented(u: degrading_units.Unit, n: int) -> np.ndarray:
@@ -111,7 +111,7 @@ def line(name: str, method: Callable[[degrading_units.Unit, int], np.ndarray],
     """One line of the table."""
     rows = []
     for u in units:
-        end = u.reached(u.fault.most)
+        end = u.time_of_size(u.fault.most)
         for part in PARTS:
             n = int(np.searchsorted(u.t, u.onset + part * (end - u.onset)))
             if n < 3:
@@ -130,7 +130,7 @@ def line(name: str, method: Callable[[degrading_units.Unit, int], np.ndarray],
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 5
-    fleet_units = [degrading_units.unit(law, 5000 + 100 * i + k)
+    fleet_units = [degrading_units.simulate_unit(law, 5000 + 100 * i + k)
                    for i, law in enumerate(degrading_units.LAWS) for k in range(count)]
     print("| method | 95 % to MaxBand | within 20 % | upper end / true | error of the median | a prediction |")
     print("|---|---|---|---|---|---|")

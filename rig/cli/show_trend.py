@@ -12,7 +12,7 @@ from fdi.prognosis.trend import Trend
 from fdi.prognosis.unit_trend import NAMES, Answer, date, left, sentences
 from rig.cli.terminal import console
 from rig.studies.prognosis.score import LAMBDAS
-from rig.studies.prognosis.summary import Line, Scores
+from rig.studies.prognosis.summary import LawScores, Scores
 
 COLOURS = ("green", "yellow", "red")  # by level
 WIDTH, HEIGHT = 72, 11  # characters of a drawing
@@ -121,7 +121,7 @@ def scores(found: Scores) -> None:
     out.print(f"\nhealthy units in which a trend was told: {found.told} of {found.healthy}")
 
 
-def _cells(one: Line) -> list[str]:
+def _cells(one: LawScores) -> list[str]:
     def share(pair: tuple[int, int]) -> str:
         return f"{pair[0]}/{pair[1]} {100 * pair[0] / max(pair[1], 1):.0f} %"
 

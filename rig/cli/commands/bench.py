@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rig.studies.benchmarks.plant_step import Accuracy
+    from rig.studies.resumable.batch import BatchProgress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,18 +20,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step and of others, against 0.2 us (half a minute)")
     add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
-    add("--cases", type=int, default=200, metavar="N", help="how many (default: 200)")
-    add("--seed", type=int, default=0, help="of the first case; the next has the next (default: 0)")
-    add("--jobs", type=int, default=2, metavar="N", help="cases at a time; one for honest times (default: 2)")
-    add("--folder", metavar="DIR", help="keeps cases and answers; a trial that was stopped goes on there")
+    add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
+    add("--seed", type=int, default=0, help="seed of the first case; each case uses the next seed (default: 0)")
+    add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
+    add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Measure the plant: a step, a run, a cycle from Python, and many runs at once, beside C and other libraries."""
     if args.what == "explain":
-        from rig.studies.trial.trial_command import trial
-
-        return trial(args)
+        return _run_trial(args)
     from fdi.output import write_text
     from rig.cli.progress_bar import show_progress
     from rig.sequences import load_sequence
@@ -49,6 +48,47 @@ def run_command(args: argparse.Namespace) -> int:
     elif not args.quiet:
         _show(answer, rows)
     return 0
+
+
+def _run_trial(args: argparse.Namespace) -> int:
+    """The blind trial; exit status 0 if every requested rate that was counted is reached, 1 otherwise.
+
+    Raises:
+        InputError: no cases, no C compiler, or a place that cannot be written.
+    """
+    import tempfile
+    from pathlib import Path
+
+    from fdi.output import writable, write_text
+    from plant.errors import InputError
+    from rig.cli.terminal import console
+    from rig.studies.trial import show_trial
+    from rig.studies.trial.blackbox import RIG_EXPLAIN
+    from rig.studies.trial.run_trial import run_trial
+    from rig.studies.trial.score import summarise_trial
+
+    for option, count in (("--cases", args.cases), ("--jobs", args.jobs)):
+        if count < 1:
+            raise InputError(option, str(count), "1 or more")
+    if args.out is not None:
+        writable(args.out, "--out")
+    out = console()
+
+    def report_progress(progress: BatchProgress) -> None:
+        if not (args.json or args.quiet):
+            out.print(show_trial.line(progress), markup=False)
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(args.folder or temporary)
+        seeds = range(args.seed, args.seed + args.cases)
+        figures = summarise_trial(run_trial(RIG_EXPLAIN, seeds, folder, args.jobs, report_progress))
+    if args.out is not None:
+        write_text(args.out, json.dumps(figures, indent=1) + "\n")
+    if args.json:
+        print(json.dumps(figures))
+    elif not args.quiet:
+        show_trial.summary(figures, out)
+    return 0 if all(rate["met"] or not rate["of"] for rate in figures["rates"]) else 1
 
 
 def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:

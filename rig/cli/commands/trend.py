@@ -106,11 +106,11 @@ def _score(args: argparse.Namespace) -> int:
     from fdi.output import write_text
     from rig.cli import show_trend
     from rig.cli.progress_bar import show_progress
-    from rig.studies.prognosis.summary import table, to_json
+    from rig.studies.prognosis.summary import score_laws, to_json
 
     place = _place(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        found = table(args.units, args.seed, progress)
+        found = score_laws(args.units, args.seed, progress)
     if place is not None:
         write_text(place, json.dumps(to_json(found)) + "\n")
     if args.json:

@@ -1,4 +1,4 @@
-"""One case of a campaign: the run, simulated or read, and what the judgement makes of it, as one flat row."""
+"""One case of a campaign: a run is simulated or read, then judged; the answer is one flat row."""
 from __future__ import annotations
 
 import platform
@@ -18,39 +18,37 @@ from plant.model import entry, parse_model
 from plant.solve import NOISES
 from rig.network.clock import WallClock
 from rig.studies.campaign.matrix import Case
+from rig.studies.resumable.row_file import Row
 from rig.studies.trial import cases, command, truth
 from rig.studies.trial.hidden import CATALOGUE
 
 Array = NDArray[np.float64]
-Row = dict[str, Any]
-Work = Callable[[Trace, Model], Row]
-"""What judges a run: trace and healthy model to a flat row of JSON values."""
+Judgement = Callable[[Trace, Model], Row]
+"""A function that judges a run: from the trace and the healthy model to a flat row of JSON values."""
 
 OK, REFUSED, FAILED = "ok", "refused", "failed"
-MAKERS = ("rig/studies/campaign/case.py", "rig/studies/campaign/judge.py", "rig/studies/campaign/matrix.py",
-          "rig/studies/trial")
 
 
-class Drawn(NamedTuple):
-    """What chance decides in a case."""
+class RandomParts(NamedTuple):
+    """The random parts of a simulated case."""
 
-    scatter: dict[str, float]  # "group.field" to factor
+    scatter: dict[str, float]  # parameter "group.field" to the factor on its nominal value
     noise: Array  # (n, NOISES), in units of the sensors' noise
 
 
-def one(case: Case, spec: Mapping[str, Any], code: str) -> Row:
-    """The row of a case. Whatever goes wrong in it is its answer.
+def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Row:
+    """The row of a case. A refused trace or an exception of the judgement is a row as well.
 
     Raises:
-        RigError: the code here is not `code`, what `sources` gave where the case was ordered.
+        RigError: the code of this machine is not that of `expected_sources`, the hash made where the campaign runs.
     """
-    if sources() != code:
-        raise RigError(f"the code of {platform.node()} is not that of the campaign: install the same there")
-    clock, row, model = WallClock(), told(case, spec), _model(spec)
+    if hash_campaign_sources() != expected_sources:
+        raise RigError(f"the code on {platform.node()} differs from the code of the campaign: install the same version")
+    clock, row, model = WallClock(), describe_case(case, spec), _parse_healthy_model(spec)
     try:
-        trace = Trace.read(case.trace) if case.trace else run(case, spec, model)
-        begun = clock.now()
-        row |= {"status": OK, **find_work(spec["work"])(trace, model), "seconds": (clock.now() - begun) * 1e-9}
+        trace = Trace.read(case.trace) if case.trace else simulate_case(case, spec, model)
+        start = clock.now()
+        row |= {"status": OK, **load_judgement(spec["work"])(trace, model), "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:
         row |= {"status": REFUSED, "reason": " ".join(str(error).split())}
     except Exception as error:
@@ -58,54 +56,59 @@ def one(case: Case, spec: Mapping[str, Any], code: str) -> Row:
     return row
 
 
-def told(case: Case, spec: Mapping[str, Any]) -> Row:
-    """What is known of a case before it is judged: of a simulated one the truth, too."""
+def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
+    """What is known of a case before it is judged; of a simulated case also the true fault sizes."""
     row = {"case": case.number, "label": case.label, "faults": len(case.sizes), "tolerance": case.tolerance,
            "seed": case.seed, "status": FAILED, "reason": ""}
     if case.trace:
         return row
-    model = _model(spec)
+    model = _parse_healthy_model(spec)
     return row | {"true_kintas": case.sizes.get("filter_clogging", model["filter.clogging"]),
                   "true_fss": case.sizes.get("spool_friction", model["spool.static_friction"])}
 
 
-def _model(spec: Mapping[str, Any]) -> Model:
+def _parse_healthy_model(spec: Mapping[str, Any]) -> Model:
     return parse_model(tomllib.loads(spec["model"]), "campaign")
 
 
-def run(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
+def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     """The preflight check of a plant with the faults, scatter and noise of a case.
 
     Raises:
-        InputError: values that contradict each other; a fault or change that the chosen simulator does not have.
+        InputError: values that contradict each other, or a fault or change that the chosen simulator does not have.
     """
-    com = np.round(command.preflight(), 12)
-    chance = draw(case, len(com), spec["colour"], spec["hum"])
-    there = {"source": case.label, "seed": str(case.seed)}
+    com = np.round(command.preflight_command(), 12)
+    random_parts = draw_random_parts(case, len(com), spec["colour"], spec["hum"])
+    provenance = {"source": case.label, "seed": str(case.seed)}
     if spec["simulator"] == "independent":
-        columns = _independent(case, model, com, chance)
+        columns = _simulate_independently(case, model, com, random_parts)
     else:
-        healthy = model.replace({name: factor * model[name] for name, factor in chance.scatter.items()})
-        columns = simulate(faulty(healthy, case.sizes), com, drawn=chance.noise)._asdict()
+        unit = model.replace({name: factor * model[name] for name, factor in random_parts.scatter.items()})
+        columns = simulate(add_faults(unit, case.sizes), com, drawn=random_parts.noise)._asdict()
     measured = {"com", "cor", "load", *spec["signals"].split(",")}
-    return Trace.of({name: columns[name] for name in columns if name in measured}, model["controller.period"], there)
+    return Trace.of({name: columns[name] for name in columns if name in measured}, model["controller.period"],
+                    provenance)
 
 
-def draw(case: Case, cycles: int, colour: float, hum: float) -> Drawn:
-    """Scatter and noise as the blind trial draws them; other labels get other numbers, other tolerances the same."""
+def draw_random_parts(case: Case, cycles: int, colour: float, hum: float) -> RandomParts:
+    """Scatter and noise, drawn as in the blind trial.
+
+    Another label gives other random numbers. Another tolerance gives the same, so that a unit is comparable with
+    itself at another tolerance.
+    """
     rng = np.random.default_rng([case.seed, 11, zlib.crc32(case.label.encode())])
-    usual = truth.nominal_symbols()
-    symbols = cases.scattered(case.tolerance, rng)
-    position = cases.coloured(cycles, cases.Level(case.tolerance, colour, hum), rng) / cases.FLOORS["xj"]
-    noise = np.column_stack([position, rng.standard_normal((cycles, NOISES - 1))])
-    return Drawn({truth.SYMBOLS[s]: x / usual[s] for s, x in symbols.items()}, noise)
+    nominal = truth.nominal_symbols()
+    symbols = cases.draw_healthy_plant(case.tolerance, rng)
+    position = cases.draw_position_noise(cycles, cases.BenchLevel(case.tolerance, colour, hum), rng)
+    noise = np.column_stack([position / cases.FLOORS["xj"], rng.standard_normal((cycles, NOISES - 1))])
+    return RandomParts({truth.SYMBOLS[symbol]: value / nominal[symbol] for symbol, value in symbols.items()}, noise)
 
 
-def faulty(model: Model, sizes: Mapping[str, float]) -> Model:
-    """The model with effects of these sizes: values of their first parameters.
+def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:
+    """The model with effects of these sizes: values of each effect's first parameter.
 
-    What belongs to a size goes with it: dynamic friction in proportion to static; of an effect that the reference
-    model lacks, the further parameters of the start whose first one is nearest.
+    The effect's further parameters follow: of a parameter of the base model in proportion to the first one (dynamic
+    friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
     """
     for name, size in sizes.items():
         effect = entry(name, model.plant)
@@ -119,33 +122,35 @@ def faulty(model: Model, sizes: Mapping[str, float]) -> Model:
     return model
 
 
-def _independent(case: Case, model: Model, com: Array, chance: Drawn) -> dict[str, Array]:
-    """The same by the blind trial's simulator, which shares no physics with `plant`."""
-    known = {name: symbol for symbol, name in truth.SYMBOLS.items()}
-    for name in model.differences().keys() - known.keys():
+def _simulate_independently(case: Case, model: Model, com: Array, random_parts: RandomParts) -> dict[str, Array]:
+    """The same plant by the blind trial's simulator, which shares no physics with `plant`."""
+    symbol_of = {name: symbol for symbol, name in truth.SYMBOLS.items()}
+    for name in model.differences().keys() - symbol_of.keys():
         raise InputError("--simulator", name, "a parameter of the independent simulator")
-    symbols = {known[name]: value for name, value in model.differences().items()}
-    symbols |= {known[name]: factor * model[name] for name, factor in chance.scatter.items()}
+    symbols = {symbol_of[name]: value for name, value in model.differences().items()}
+    symbols |= {symbol_of[name]: factor * model[name] for name, factor in random_parts.scatter.items()}
     for name, size in case.sizes.items():
         law = CATALOGUE[name]
         changes = law.apply(size, truth.nominal_symbols() | symbols)
         if changes.get(law.shown) != size or law.extra or law.choices:
-            raise InputError("--simulator", name, "an effect of one size, which the independent simulator has")
+            raise InputError("--simulator", name, "an effect with a single size, which the independent simulator has")
         symbols |= changes
-    made = truth.simulate(com, symbols, cases.FLOORS["xj"] * chance.noise[:, 0])
-    return made._asdict() | {"p12": made.p12 + cases.FLOORS["p12"] * chance.noise[:, 1],
-                             "xs": made.xs + cases.FLOORS["xs"] * chance.noise[:, 2]}
+    noise = random_parts.noise
+    run = truth.simulate_truth(com, symbols, cases.FLOORS["xj"] * noise[:, 0])
+    return run._asdict() | {"p12": run.p12 + cases.FLOORS["p12"] * noise[:, 1],
+                            "xs": run.xs + cases.FLOORS["xs"] * noise[:, 2]}
 
 
-def find_work(name: str) -> Work:
+def load_judgement(name: str) -> Judgement:
     """The judgement "module:function".
 
     Raises:
-        InputError: there is no such thing.
+        InputError: there is no such function.
     """
     return named(name, "--work", "a judgement")
 
 
-def sources() -> str:
+def hash_campaign_sources() -> str:
     """A hash of all code and data that a row depends on."""
-    return digest("plant", "fdi", *MAKERS)
+    campaign = (f"rig/studies/campaign/{name}.py" for name in ("case", "judge", "matrix"))
+    return digest("plant", "fdi", *campaign, "rig/studies/trial")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from fdi.diagnosis.faults import FAULTS, Fault
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, to_svg
-from rig.studies.campaign.summary import title
+from rig.studies.campaign.summary import name_size
 
 BLUE = "#1f6feb"
 LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN),
@@ -43,4 +43,4 @@ def _curve(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:
         ax.axvline(size, color=COMMAND, lw=0.9, ls="--", zorder=0)
         ax.text(size, 50, f" {word}", color=INK, fontsize=8, rotation=90, va="center", ha="right")
     unit = f" [{fault.unit}]" if fault.unit != "1" else ""
-    ax.set_xlabel(f"{fault.name}, {title(fault)}{unit}")
+    ax.set_xlabel(f"{fault.name}, {name_size(fault)}{unit}")

@@ -1,4 +1,4 @@
-"""What a campaign does with a run: a judgement, from trace and healthy model to a flat row."""
+"""The judgement of a campaign: from a trace and the healthy model to a flat row."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -9,13 +9,13 @@ from fdi.trace.trace import Trace
 from plant import Model
 from plant.threads import threads
 
-WORKS: Mapping[str, str] = {"fdi": "rig.studies.campaign.judge:fdi"}
-"""Short names of judgements."""
+WORKS: Mapping[str, str] = {"fdi": "rig.studies.campaign.judge:judge_by_fdi"}
+"""Judgements by the short name that --work accepts."""
 CANNOT_TELL = "cannot_tell"
 
 
-def fdi(trace: Trace, model: Model) -> dict[str, Any]:
-    """What `rig fdi` says of the trace: levels, ruling fault, sizes with intervals, events, what else is off.
+def judge_by_fdi(trace: Trace, model: Model) -> dict[str, Any]:
+    """The diagnosis of `rig fdi`: levels, ruling fault, sizes with intervals, events, precursors, other effects.
 
     Raises:
         InputError: a trace that cannot be judged.
@@ -26,11 +26,11 @@ def fdi(trace: Trace, model: Model) -> dict[str, Any]:
     row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
     for fault in FAULTS:
         size = found.sizes[fault.name]
-        row[f"level_{fault.name}"] = _word(found.levels[fault.name])
+        row[f"level_{fault.name}"] = _format_level(found.levels[fault.name])
         row |= {fault.symbol: size.value, f"{fault.symbol}_low": size.low, f"{fault.symbol}_high": size.high}
     if found.judged is not None:
         levels, by = found.judged.levels, found.judged.severity
-        row |= {f"band_{fault.name}": _word(levels.get(fault.name)) for fault in FAULTS}
+        row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in FAULTS}
         row |= {f"severity_{fault.name}": by[fault.name] for fault in FAULTS if fault.name in by}
     if found.grid is not None:
         row |= {"grid_kintas": found.grid.merged.kintas, "grid_fss": found.grid.merged.fss}
@@ -42,5 +42,5 @@ def fdi(trace: Trace, model: Model) -> dict[str, Any]:
         "notes": list(found.notes)}
 
 
-def _word(level: Level | None) -> str:
+def _format_level(level: Level | None) -> str:
     return CANNOT_TELL if level is None else level.word

@@ -1,4 +1,6 @@
-"""What a campaign does: a matrix of faults, sizes, tolerances and seeds, or the traces of a folder. Data, in and out.
+"""The cases of a campaign: a matrix of faults, sizes, tolerances and seeds, or the traces of a folder.
+
+A matrix file is TOML:
 
     seeds = 20                       # runs of each size, each with its own scatter and noise
     tolerance = [0.015]              # standard deviation of the base parameters, relative
@@ -42,163 +44,173 @@ DEFAULTS: dict[str, Any] = {
 
 
 class Case(NamedTuple):
-    """One run to judge; all that is random in it follows from label and seed."""
+    """One run to judge; everything random in it follows from its label and seed."""
 
-    number: int  # place in the campaign
+    number: int  # its place in the matrix
     label: str  # "healthy", "filter_clogging=0.17 spool_friction=45", or the trace's name in its folder
     sizes: Mapping[str, float]  # effect to the value of its first parameter, SI
     tolerance: float
     seed: int
-    trace: str = ""  # path of a recorded run; then nothing is simulated
+    trace: str = ""  # path of a recorded run; if given, nothing is simulated
 
 
 class Matrix(NamedTuple):
-    """A campaign: what all cases share, and the cases, in an order in which any beginning is a fair sample."""
+    """The settings and the cases of a campaign, ordered such that the first cases are a fair sample of all."""
 
-    spec: Mapping[str, Any]  # JSON: what makes this campaign another than others
+    spec: Mapping[str, Any]  # JSON values from which `restore_matrix` makes the same matrix
     cases: tuple[Case, ...]
 
 
-def shipped() -> list[str]:
-    """The names of the matrices that come with the rig."""
-    return sorted(f.name.removesuffix(".toml") for f in files("rig.studies.campaign").iterdir()
-                  if f.name.endswith(".toml"))
+def list_shipped_matrices() -> list[str]:
+    """The names of the matrices that come with this software."""
+    names = [file.name for file in files("rig.studies.campaign").iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def read_matrix(source: str) -> dict[str, Any]:
     """The tables of a matrix file, or of a shipped one by name. Raises InputError."""
-    if source in shipped():
+    if source in list_shipped_matrices():
         return parse_toml((files("rig.studies.campaign") / f"{source}.toml").read_text(encoding="utf-8"), source)
     return read_toml(Path(source))
 
 
-def matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) -> Matrix:
+def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: object) -> Matrix:
     """The campaign that the tables of a matrix file describe.
 
     Raises:
-        InputError: an unknown key or effect, a value or model that cannot be, or no case at all.
+        InputError: an unknown key or effect, a value out of range, another plant than `eha`, or no case at all.
     """
     given = {key: value for key, value in tables.items() if key != "case"}
     for key in given.keys() - DEFAULTS.keys():
         raise InputError(where, key, f"one of {', '.join([*DEFAULTS, '[[case]]'])}")
     common = {**DEFAULTS, **given}
-    _check(common, where)
-    _checked(model)
+    _check_common(common, where)
+    _check_model(model)
     blocks = tables.get("case", [])
     if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
-        raise InputError(where, "case", "at least one [[case]]; an empty one is a healthy plant")
-    cleaned = [_block(block, common, model, where) for block in blocks]
-    spec = {**common, "model": model.to_toml(), "work": work, "case": cleaned}
-    return Matrix(spec, _cases(spec))
+        raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
+    parsed = [_parse_block(block, common, model, where) for block in blocks]
+    spec = {**common, "model": model.to_toml(), "work": work, "case": parsed}
+    return Matrix(spec, _expand_cases(spec))
 
 
-def _check(common: dict[str, Any], where: object) -> None:
-    common["tolerance"] = _tolerances(common["tolerance"], where)
-    common["colour"] = _number(where, "colour", common["colour"], 0.0, 0.99)
-    common["hum"] = _number(where, "hum", common["hum"], 0.0, 1e-3)
+def _check_common(common: dict[str, Any], where: object) -> None:
+    """Check the keys that all cases share; numbers become floats. Raises InputError."""
+    common["tolerance"] = _check_tolerances(common["tolerance"], where)
+    common["colour"] = _check_number(where, "colour", common["colour"], 0.0, 0.99)
+    common["hum"] = _check_number(where, "hum", common["hum"], 0.0, 1e-3)
     if common["simulator"] not in SIMULATORS:
         raise InputError(where, "simulator", f"one of {', '.join(SIMULATORS)}, not {common['simulator']!r}")
     if common["signals"] not in SIGNALS:
         raise InputError(where, "signals", f"one of {'; '.join(SIGNALS)}, not {common['signals']!r}")
-    _count(where, "seeds", common["seeds"], 1)
-    _count(where, "first", common["first"], 0)
+    _check_count(where, "seeds", common["seeds"], 1)
+    _check_count(where, "first", common["first"], 0)
 
 
-def _checked(model: Model) -> None:
-    """The preflight check, its scatter and its noise are those of one plant in its own cycle."""
+def _check_model(model: Model) -> None:
+    """Accept only the plant and the period that the preflight check, its scatter and its noise are made for."""
     if model.plant != "eha":
         raise InputError("--model", model.plant, "eha, whose preflight check this is")
     if model["controller.period"] != PERIOD:
         raise InputError("--set", "controller.period", f"{PERIOD:g} s, the cycle of the preflight check")
 
 
-def _tolerances(value: Any, where: object) -> list[float]:
+def _check_tolerances(value: Any, where: object) -> list[float]:
     if value == []:
         raise InputError(where, "tolerance", "at least one")
-    return [_number(where, "tolerance", x, 0.0, 0.2) for x in _listed(value)]
+    return [_check_number(where, "tolerance", x, 0.0, 0.2) for x in _as_list(value)]
 
 
-def _block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, where: object) -> dict[str, Any]:
+def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, where: object) -> dict[str, Any]:
+    """A [[case]] table with its defaults filled in. Raises InputError."""
     sizes = {}
     for name, values in block.items():
-        if name not in ("seeds", "tolerance"):
-            quantity = _effect(name, model, where).parameters[_effect(name, model, where).fitted[0]]
-            sizes[name] = [accept(where, name, quantity, value) for value in _listed(values)]
-            if not sizes[name]:
-                raise InputError(where, name, "at least one size")
-    return {"seeds": _count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes,
-            "tolerance": _tolerances(block.get("tolerance", common["tolerance"]), where)}
+        if name in ("seeds", "tolerance"):
+            continue
+        effect = _find_sized_effect(name, model, where)
+        quantity = effect.parameters[effect.fitted[0]]
+        sizes[name] = [accept(where, name, quantity, value) for value in _as_list(values)]
+        if not sizes[name]:
+            raise InputError(where, name, "at least one size")
+    return {"seeds": _check_count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes,
+            "tolerance": _check_tolerances(block.get("tolerance", common["tolerance"]), where)}
 
 
-def _effect(name: str, model: Model, where: object) -> Effect:
+def _find_sized_effect(name: str, model: Model, where: object) -> Effect:
     found = entry(name, model.plant)
     if not found.fitted:
-        raise InputError(where, name, "an effect with a size; this is noise of the bench")
+        raise InputError(where, name, "an effect with a size; this one is noise of the bench")
     return found
 
 
-def _listed(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def _number(where: object, field: str, value: Any, low: float, high: float) -> float:
+def _check_number(where: object, field: str, value: Any, low: float, high: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise InputError(where, field, f"a number from {low:g} to {high:g}, not {value!r}")
     return float(value)
 
 
-def _count(where: object, field: str, value: Any, least: int) -> int:
+def _check_count(where: object, field: str, value: Any, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise InputError(where, field, f"a whole number from {least}, not {value!r}")
     return value
 
 
-def _cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
-    """All cases; those of few seeds are spread among those of many, so that what is done first is of every kind."""
-    found: dict[tuple[str, float, int], tuple[float, dict[str, float]]] = {}
+def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
+    """All cases of all blocks; a case that two blocks have counts once.
+
+    Each block's seeds are spread evenly over the campaign, so that the first cases are of every kind.
+    """
+    cases: dict[tuple[str, float, int], Case] = {}
+    places: dict[tuple[str, float, int], float] = {}  # from 0 to 1
     for block in spec["case"]:
         for values in itertools.product(*block["sizes"].values()):
             sizes = dict(sorted(zip(block["sizes"], values, strict=True)))
             for tolerance, k in itertools.product(block["tolerance"], range(block["seeds"])):
-                key = label(sizes), tolerance, spec["first"] + k
-                found.setdefault(key, ((k + 0.5) / block["seeds"], sizes))
-    ordered = sorted(found.items(), key=lambda item: item[1][0])  # stable: within a round as the file has them
-    return tuple(Case(i, name, sizes, tolerance, seed) for i, ((name, tolerance, seed), (_, sizes))
-                 in enumerate(ordered))
+                seed = spec["first"] + k
+                key = label_plant(sizes), tolerance, seed
+                cases.setdefault(key, Case(0, label_plant(sizes), sizes, tolerance, seed))
+                places.setdefault(key, (k + 0.5) / block["seeds"])
+    ordered = sorted(cases, key=lambda key: places[key])  # stable: equal places keep the order of the file
+    return tuple(cases[key]._replace(number=number) for number, key in enumerate(ordered))
 
 
-def label(sizes: Mapping[str, float]) -> str:
-    """What to call a plant with faults of these sizes."""
+def label_plant(sizes: Mapping[str, float]) -> str:
+    """The label of a plant with faults of these sizes: "filter_clogging=0.17 spool_friction=45", or "healthy"."""
     return " ".join(f"{name}={size:.9g}" for name, size in sizes.items()) or HEALTHY
 
 
-def of_traces(folder: str | Path, model: Model, work: str) -> Matrix:
-    """A campaign over the recorded runs below a folder: trace.mcap of runs, and every CSV.
+def build_trace_matrix(folder: str | Path, model: Model, work: str) -> Matrix:
+    """The recorded runs below a folder as cases: the trace.mcap of each run, and every CSV file.
 
     Raises:
         InputError: no such folder, or no trace in it.
     """
     root = Path(folder).absolute()
-    found = traces(root)
-    names = {path.relative_to(root).as_posix(): path for path in found}
+    names = {path.relative_to(root).as_posix(): path for path in traces(root)}
     digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
     spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work}
-    return of_spec(spec)
+    return restore_matrix(spec)
 
 
-def of_spec(spec: Mapping[str, Any]) -> Matrix:
-    """The campaign that `Matrix.spec` of another describes."""
+def restore_matrix(spec: Mapping[str, Any]) -> Matrix:
+    """The matrix that has these settings: the inverse of `Matrix.spec`."""
     if "traces" not in spec:
-        return Matrix(spec, _cases(spec))
+        return Matrix(spec, _expand_cases(spec))
     root = Path(spec["traces"])
     return Matrix(spec, tuple(Case(i, name, {}, 0.0, 0, str(root / name)) for i, name in enumerate(spec["files"])))
 
 
-def parsed(words: Sequence[str]) -> list[dict[str, Any]]:
-    """The cases of --fault: "healthy", "filter_clogging=0.1,0.2" or "filter_clogging=0.17/spool_friction=45".
+def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
+    """The [[case]] tables of the words of --fault.
+
+    A word is "healthy", "filter_clogging=0.1,0.2" or "filter_clogging=0.17/spool_friction=45".
 
     Raises:
-        InputError: something else.
+        InputError: a word that is none of these.
     """
     blocks: list[dict[str, Any]] = []
     for word in words:

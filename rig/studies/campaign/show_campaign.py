@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.table import Table
 
 from fdi.diagnosis.faults import FAULTS
-from rig.studies.campaign.run_campaign import Progress
-from rig.studies.campaign.summary import title
+from rig.studies.campaign.summary import name_size
+from rig.studies.resumable.batch import BatchProgress
 
 REASONS = 10  # failed or refused cases that are listed
 
 
-def line(progress: Progress) -> str:
+def line(progress: BatchProgress) -> str:
     """How far it is, in a few words."""
     failed = f", {progress.failed} failed" if progress.failed else ""
     return f"{progress.done}/{progress.total}{failed}, {time(progress.left)} left"
@@ -123,8 +123,8 @@ def _errors(errors: Sequence[Mapping[str, Any]]) -> Table:
         fault = next(fault for fault in FAULTS if fault.name == e["fault"])
         plant = e["label"]
         for other in FAULTS:
-            plant = plant.replace(f"{other.name}=", f"{title(other)} ")
-        table.add_row(plant, title(fault), str(e["cases"]), *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")),
+            plant = plant.replace(f"{other.name}=", f"{name_size(other)} ")
+        table.add_row(plant, name_size(fault), str(e["cases"]), *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")),
                       *percent(e["covered"])[1:])
     return table
 

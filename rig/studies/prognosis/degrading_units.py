@@ -44,35 +44,35 @@ class Unit(NamedTuple):
     t: Floats  # days, of the traces
     sizes: tuple[Estimate, ...]
 
-    def reached(self, limit: float) -> float:
-        """When the size first reaches the limit, days."""
+    def time_of_size(self, limit: float) -> float:
+        """The time at which the size first reaches `limit`, days."""
         return float(self.course_t[int((self.course >= limit * (1.0 - 1e-9)).argmax())])
 
 
-def linear(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_linearly(x: Floats, rng: np.random.Generator) -> Floats:
     """Of a fault from its onset, x = 0, to MaxBand, x = 1."""
     return x
 
 
-def exponential(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_exponentially(x: Floats, rng: np.random.Generator) -> Floats:
     """1.5 to 4.5 e-foldings."""
     bend = rng.uniform(1.5, 4.5)
     return np.asarray(np.expm1(bend * x) / np.expm1(bend))
 
 
-def power(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_by_power(x: Floats, rng: np.random.Generator) -> Floats:
     """An exponent from 0.6 to 2.8."""
     return np.asarray(x ** rng.uniform(0.6, 2.8))
 
 
-def crack(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_like_crack(x: Floats, rng: np.random.Generator) -> Floats:
     """Growth in proportion to the size to the power 1.5, as a crack's by Paris with an exponent of 3."""
     start = rng.uniform(0.08, 0.25)
     root = 1.0 - (1.0 - np.sqrt(start)) * x
     return np.asarray((start / root ** 2 - start) / (1.0 - start))
 
 
-def logistic(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_logistically(x: Floats, rng: np.random.Generator) -> Floats:
     """An S that would flatten at 1.15 to 1.6 times MaxBand."""
     steep, middle = rng.uniform(4.0, 8.0), rng.uniform(0.4, 0.7)
     s = 1.0 / (1.0 + np.exp(-steep * (np.linspace(0.0, 1.5, 3000) - middle)))
@@ -82,25 +82,26 @@ def logistic(x: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(grown / grown[-1])
 
 
-def kinked(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_at_two_rates(x: Floats, rng: np.random.Generator) -> Floats:
     """Two rates: the second, 1.5 to 4 times the first, begins somewhere in the middle of the life."""
     at, ratio = rng.uniform(0.25, 0.6), rng.uniform(1.5, 4.0)
     s = x + (ratio - 1.0) * np.maximum(x - at, 0.0)
     return np.asarray(s / s[-1])
 
 
-def gamma(x: Floats, rng: np.random.Generator) -> Floats:
+def grow_by_jumps(x: Floats, rng: np.random.Generator) -> Floats:
     """A gamma process: many small jumps, 60 of the mean size to MaxBand."""
     s = np.cumsum(rng.gamma(60.0 / len(x), size=len(x)))
     return np.asarray(s / s[-1])
 
 
-FITTED: dict[str, Law] = {"linear": linear, "exponential": exponential, "power": power}
-OTHERS: dict[str, Law] = {"crack": crack, "logistic": logistic, "two rates": kinked, "gamma process": gamma}
+FITTED: dict[str, Law] = {"linear": grow_linearly, "exponential": grow_exponentially, "power": grow_by_power}
+OTHERS: dict[str, Law] = {"crack": grow_like_crack, "logistic": grow_logistically, "two rates": grow_at_two_rates,
+                           "gamma process": grow_by_jumps}
 LAWS = FITTED | OTHERS
 
 
-def unit(law: str, seed: int) -> Unit:
+def simulate_unit(law: str, seed: int) -> Unit:
     """A unit whose fault begins in the first third of the traces and ends at MaxBand after 15 to 40 more of them."""
     rng = np.random.default_rng([seed, 17])
     fault = (CLOGGING, FRICTION)[seed % 2]
@@ -112,19 +113,19 @@ def unit(law: str, seed: int) -> Unit:
     course = fault.healthy + (fault.most - fault.healthy) * shape
     t = np.arange(0.0, onset + life, INTERVAL)
     t = np.sort(np.maximum(t + rng.uniform(-2.0, 2.0, len(t)), 0.0))
-    return Unit(law, fault, onset, course_t, course, t, measured(fault, np.interp(t, course_t, course), rng))
+    return Unit(law, fault, onset, course_t, course, t, measure_sizes(fault, np.interp(t, course_t, course), rng))
 
 
-def healthy(seed: int, traces: int = 25) -> Unit:
+def simulate_healthy_unit(seed: int, traces: int = 25) -> Unit:
     """A unit in which nothing grows."""
     rng = np.random.default_rng([seed, 11])
     fault = (CLOGGING, FRICTION)[seed % 2]
     t = INTERVAL * np.arange(traces) + rng.uniform(-2.0, 2.0, traces)
     true = np.full(traces, fault.healthy)
-    return Unit("none", fault, np.inf, t, true, t, measured(fault, true, rng))
+    return Unit("none", fault, np.inf, t, true, t, measure_sizes(fault, true, rng))
 
 
-def measured(fault: Fault, true: Floats, rng: np.random.Generator) -> tuple[Estimate, ...]:
+def measure_sizes(fault: Fault, true: Floats, rng: np.random.Generator) -> tuple[Estimate, ...]:
     """What the refinement would say of true sizes, shape (n,), in traces of one unit."""
     error = ERRORS[fault.name]
     sigma = error.base + error.share * true

@@ -1,30 +1,29 @@
 """The scores of many simulated units, law by law."""
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from os import cpu_count
+import os
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi.progress import Progress
+from fdi.report.json import to_plain
+from plant.errors import RigError
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import LAMBDAS, Score, score, told_without_reason
+from rig.studies.prognosis.score import LAMBDAS, Score, find_false_trends, score_unit
+from rig.studies.resumable.batch import Workers, run_jobs
 
-HEALTHY = 5  # times as many healthy units as of each law
 
-
-class Line(NamedTuple):
-    """Of all units of a law; tuples are over LAMBDAS."""
+class LawScores(NamedTuple):
+    """The scores of all units of a law; tuples are over LAMBDAS."""
 
     law: str
     units: int
     alpha_lambda: tuple[float, ...]  # share of units within alpha
     horizon: float  # median
     relative: tuple[float, ...]  # median relative accuracy
-    held: tuple[int, int]  # 95 % intervals to MaxBand that hold the truth, of how many
+    held: tuple[int, int]  # 95 % intervals to MaxBand that contain the truth, and their number
     held_middle: tuple[int, int]  # the same to MidBand
     early: tuple[int, int]  # MaxBand came before the interval
     width: tuple[float, ...]  # median width of the interval over the true time left
@@ -32,60 +31,67 @@ class Line(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """The table, and trends told of healthy units."""
+    """The scores by law, and the trends reported for healthy units."""
 
-    lines: tuple[Line, ...]
-    healthy: int
-    told: int
+    lines: tuple[LawScores, ...]
+    healthy: int  # healthy units
+    told: int  # of these with a trend
 
 
-def table(units: int, seed: int, progress: Progress) -> Scores:
-    """Score so many units of each law, on all cores."""
+def score_laws(units: int, seed: int, progress: Progress, healthy_ratio: int = 5) -> Scores:
+    """Score `units` units of each law, and `healthy_ratio` times as many healthy units, on all cores."""
     jobs = [(law, seed + 1000 * i + k) for i, law in enumerate(degrading_units.LAWS) for k in range(units)]
-    found, told, healthy = [], 0, HEALTHY * units
-    with ProcessPoolExecutor(cpu_count(), get_context("spawn")) as pool:
-        for i, one in enumerate(pool.map(_unit, jobs)):
-            found.append(one)
-            progress("units", (i + 1) / (len(jobs) + healthy))
-        for i, wrong in enumerate(pool.map(_healthy, range(seed, seed + healthy))):
-            told += wrong
-            progress("healthy units", (len(jobs) + i + 1) / (len(jobs) + healthy))
-    groups = {law: [s for s in found if s.law == law] for law in degrading_units.LAWS}
-    groups["laws fitted"] = [s for s in found if s.law in degrading_units.FITTED]
-    groups["other laws"] = [s for s in found if s.law in degrading_units.OTHERS]
-    groups["all"] = found
-    return Scores(tuple(line(law, group) for law, group in groups.items()), healthy, told)
+    healthy = list(range(seed, seed + healthy_ratio * units))
+    total = len(jobs) + len(healthy)
+    scores = _run_in_order(_score_simulated_unit, jobs, lambda done: progress("units", done / total))
+    false_trends = _run_in_order(_count_false_trends, healthy,
+                                 lambda done: progress("healthy units", (len(jobs) + done) / total))
+    groups = {law: [s for s in scores if s.law == law] for law in degrading_units.LAWS}
+    groups["laws fitted"] = [s for s in scores if s.law in degrading_units.FITTED]
+    groups["other laws"] = [s for s in scores if s.law in degrading_units.OTHERS]
+    groups["all"] = scores
+    return Scores(tuple(summarise_law(law, group) for law, group in groups.items()), len(healthy), sum(false_trends))
 
 
-def _unit(job: tuple[str, int]) -> Score:
-    return score(degrading_units.unit(*job))
+def _run_in_order(work: Callable[[Any], Any], jobs: Sequence[Any], progress: Callable[[int], None]) -> list[Any]:
+    """The results of all jobs in the order of the jobs."""
+    results = {}
+    for job, result in run_jobs(work, jobs, Workers(os.cpu_count() or 1), _raise_failure):
+        results[job] = result
+        progress(len(results))
+    return [results[job] for job in jobs]
 
 
-def _healthy(seed: int) -> int:
-    return len(told_without_reason([degrading_units.healthy(seed)]))
+def _raise_failure(job: object, reason: str) -> Any:
+    raise RigError(f"unit {job}: {reason}")
 
 
-def line(law: str, group: list[Score]) -> Line:
-    """One line of the table, at least one unit."""
-    def over(name: str, how: Callable[..., Any]) -> tuple[float, ...]:
-        return tuple(float(x) for x in how([getattr(s, name) for s in group], axis=0))
+def _score_simulated_unit(job: tuple[str, int]) -> Score:
+    return score_unit(degrading_units.simulate_unit(*job))
 
-    def count(name: str) -> tuple[int, int]:
-        values = np.array([getattr(s, name) for s in group])
+
+def _count_false_trends(seed: int) -> int:
+    return len(find_false_trends([degrading_units.simulate_healthy_unit(seed)]))
+
+
+def summarise_law(law: str, group: Sequence[Score]) -> LawScores:
+    """The scores of one law; `group` has at least one unit."""
+    def reduce_each(name: str, reduce: Callable[..., Any]) -> tuple[float, ...]:
+        return tuple(float(x) for x in reduce([getattr(score, name) for score in group], axis=0))
+
+    def count_true(name: str) -> tuple[int, int]:
+        values = np.array([getattr(score, name) for score in group])
         return int(np.nansum(values)), int(np.isfinite(values).sum())
 
-    return Line(law, len(group), over("alpha_lambda", np.mean), float(np.median([s.horizon for s in group])),
-                over("relative", np.nanmedian), count("held_most"), count("held_middle"), count("below"),
-                over("width", np.nanmedian), float(np.nanmedian([s.latency for s in group])))
+    return LawScores(
+        law, len(group), reduce_each("alpha_lambda", np.mean), float(np.median([score.horizon for score in group])),
+        reduce_each("relative", np.nanmedian), count_true("held_most"), count_true("held_middle"), count_true("below"),
+        reduce_each("width", np.nanmedian), float(np.nanmedian([score.latency for score in group])))
 
 
-def to_json(found: Scores) -> dict[str, Any]:
-    """The table as JSON values."""
-    rows = [{name: _finite(value) for name, value in one._asdict().items()} for one in found.lines]
-    return {"lambda": list(LAMBDAS), "lines": rows, "healthy": {"units": found.healthy, "told": found.told}}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_finite(x) for x in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def to_json(scores: Scores) -> dict[str, Any]:
+    """The scores as JSON values; null for NaN and infinity."""
+    content: dict[str, Any] = to_plain({
+        "lambda": LAMBDAS, "lines": [line._asdict() for line in scores.lines],
+        "healthy": {"units": scores.healthy, "told": scores.told}})
+    return content

@@ -1,4 +1,4 @@
-"""`rig explain` as others use it: a process of its own, files in, one JSON object out."""
+"""`rig explain` as a user runs it: a separate process that reads files and prints one JSON object."""
 from __future__ import annotations
 
 import json
@@ -9,23 +9,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-NAME = "rig.studies.trial.blackbox:explain"
-PATIENCE = 600.0  # s; whoever takes longer has crashed
+RIG_EXPLAIN = "rig.studies.trial.blackbox:run_rig_explain"
+"""The name of `run_rig_explain` for `rig.studies.trial.run_trial`."""
 
 
-def explain(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str]) -> dict[str, Any]:
-    """What `rig explain --json` says of a case.
+def run_rig_explain(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str], timeout: float = 600.0
+                    ) -> dict[str, Any]:
+    """The JSON of `rig explain` for a case; `timeout` in s.
 
     Raises:
-        RuntimeError: it ends with an error; the text is its last line.
-        subprocess.TimeoutExpired: it does not end.
+        RuntimeError: the command ended with an error; the text is the last line of its standard error.
+        subprocess.TimeoutExpired: the command took longer.
     """
-    words = ["explain", est, "--holdout", holdout, "--signals", ",".join(signals), "--json"]
+    arguments = ["explain", est, "--holdout", holdout, "--signals", ",".join(signals), "--json"]
     for repeat in repeats:
-        words += ["--repeat", repeat]
-    done = subprocess.run([sys.executable, "-m", "rig.cli.main", *map(str, words)], capture_output=True, text=True,
-                          timeout=PATIENCE, check=False, env=os.environ | {"COLUMNS": "500"})
-    if done.returncode not in (0, 1):
-        raise RuntimeError((done.stderr.strip().splitlines() or ["no word"])[-1])
-    answer: dict[str, Any] = json.loads(done.stdout)
+        arguments += ["--repeat", repeat]
+    command = [sys.executable, "-m", "rig.cli.main", *map(str, arguments)]
+    wide = os.environ | {"COLUMNS": "500"}  # so that an error message stays on one line
+    process = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, env=wide)
+    if process.returncode not in (0, 1):
+        raise RuntimeError((process.stderr.strip().splitlines() or ["no message"])[-1])
+    answer: dict[str, Any] = json.loads(process.stdout)
     return answer

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rig.studies.trial import command, hidden
 from rig.studies.trial.hidden import Hidden
-from rig.studies.trial.truth import PERIOD, Run, nominal_symbols, simulate
+from rig.studies.trial.truth import PERIOD, Run, nominal_symbols, simulate_truth
 
 Array = NDArray[np.float64]
 
@@ -25,13 +25,14 @@ KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
 SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
 FLOORS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
 """RMS noise of the sensors: m, Pa, m."""
-SCATTERED = ("GM", "JF", "BF", "KF", "KSF", "GQF", "GPF", "GQ", "GP", "PSR", "AJ", "MJ", "CJ", "FSJ", "FDJ", "CLK")
+SCATTERED_SYMBOLS = ("GM", "JF", "BF", "KF", "KSF", "GQF", "GPF", "GQ", "GP", "PSR", "AJ", "MJ", "CJ", "FSJ", "FDJ",
+                     "CLK")
 BETWEEN = 20  # cycles over which positions are compared when their slow drift shall not count
 HUM_HZ, HUM_PHASE = 50.0, 1.0
 LOADED = 0.1  # of the cases that do not need a known load have one
 
 
-class Level(NamedTuple):
+class BenchLevel(NamedTuple):
     """How far the bench is from ideal."""
 
     scatter: float  # standard deviation of the plant's parameters, relative
@@ -39,7 +40,7 @@ class Level(NamedTuple):
     hum: float  # m, amplitude of the mains on the position sensor
 
 
-LEVELS = {"exact": Level(0.0, 0.0, 0.0), "bench": Level(0.015, 0.8, 0.7e-6)}
+LEVELS = {"exact": BenchLevel(0.0, 0.0, 0.0), "bench": BenchLevel(0.015, 0.8, 0.7e-6)}
 
 
 class Case(NamedTuple):
@@ -49,44 +50,44 @@ class Case(NamedTuple):
     kind: str
     effects: tuple[Hidden, ...]
     signals: str
-    level: Level
+    level: BenchLevel
     plant: dict[str, float]  # symbols of the healthy plant that differ from nominal
     load: float  # N, of the known load
 
 
-def draw(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
-         sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
+def draw_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
+              sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
     """The case of a seed; `kind`, the effects' names and the level ("exact", "bench") leave the rest to chance.
 
     `sizes` are fractions of the logarithmic range that a size is drawn from; of two effects both are in its upper half.
     """
     rng = np.random.default_rng([seed, 3])
     kind = kind or ("one" if effects else str(rng.choice(list(KINDS), p=list(KINDS.values()))))
-    drawn = _level(rng)
+    drawn = _draw_level(rng)
     quality = LEVELS[level] if level else drawn
     signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
-    plant = scattered(quality.scatter, rng)
+    plant = draw_healthy_plant(quality.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
-    found = tuple(hidden.draw(name, nominal_symbols() | plant, rng, low, sizes[1])
-                  for name in effects or _names(kind, rng))
+    found = tuple(hidden.draw_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
+                  for name in effects or _draw_effect_names(kind, rng))
     needed = max((effect.known_load for effect in found), default=0.0)
     chance = float(rng.uniform(2000, 8000)) if rng.random() < LOADED and quality.scatter > 0 else 0.0
     return Case(seed, kind, found, signals, quality, plant, needed or chance)
 
 
-def scattered(spread: float, rng: np.random.Generator) -> dict[str, float]:
+def draw_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
     """The symbols of a healthy plant, each off its nominal value by the standard deviation `spread`, relative."""
-    return {symbol: nominal_symbols()[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED}
+    return {symbol: nominal_symbols()[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED_SYMBOLS}
 
 
-def _level(rng: np.random.Generator) -> Level:
+def _draw_level(rng: np.random.Generator) -> BenchLevel:
     """Scatter 0 to 2 %; noise white in one case of three, else coloured and with hum."""
     scatter, white = float(rng.uniform(0, 0.02)), rng.random() < 1 / 3
     colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
-    return Level(scatter, 0.0, 0.0) if white else Level(scatter, colour, hum)
+    return BenchLevel(scatter, 0.0, 0.0) if white else BenchLevel(scatter, colour, hum)
 
 
-def _names(kind: str, rng: np.random.Generator) -> list[str]:
+def _draw_effect_names(kind: str, rng: np.random.Generator) -> list[str]:
     if kind == "nothing":
         return []
     if kind == "outside":
@@ -97,7 +98,7 @@ def _names(kind: str, rng: np.random.Generator) -> list[str]:
             return names
 
 
-def symbols(case: Case, without: Iterable[str] = ()) -> dict[str, float]:
+def list_changed_symbols(case: Case, without: Iterable[str] = ()) -> dict[str, float]:
     """The plant's symbols that differ from nominal, some of the hidden effects left out."""
     changes = dict(case.plant)
     for effect in case.effects:
@@ -113,18 +114,19 @@ class Measured(NamedTuple):
     noise: dict[str, Array]
 
 
-def measure(case: Case, name: str) -> Measured:
+def measure_case(case: Case, name: str) -> Measured:
     """Trace `name` ("est", "repeat" or "holdout") of a case as its bench records it."""
     turn = ("est", "repeat", "holdout").index(name)
     rng = np.random.default_rng([case.seed, 5, turn])
-    com = np.round(command.holdout(rng) if name == "holdout" else command.preflight(), 12)
+    com = np.round(command.draw_holdout_command(rng) if name == "holdout" else command.preflight_command(), 12)
     n = len(com)
-    noise = {"xj": coloured(n, case.level, rng)} | {s: FLOORS[s] * rng.standard_normal(n) for s in ("p12", "xs")}
-    run = simulate(com, symbols(case), noise["xj"], command.known_load(n, case.load))
+    noise = {"xj": draw_position_noise(n, case.level, rng)}
+    noise |= {signal: FLOORS[signal] * rng.standard_normal(n) for signal in ("p12", "xs")}
+    run = simulate_truth(com, list_changed_symbols(case), noise["xj"], command.known_load_profile(n, case.load))
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
 
 
-def coloured(n: int, level: Level, rng: np.random.Generator) -> Array:
+def draw_position_noise(n: int, level: BenchLevel, rng: np.random.Generator) -> Array:
     """Noise of the position sensor, (n,) m: first order, of the floor's RMS, and hum."""
     white, colour = FLOORS["xj"] * rng.standard_normal(n), level.colour
     out, last = np.empty(n), float(white[0])
@@ -134,14 +136,14 @@ def coloured(n: int, level: Level, rng: np.random.Generator) -> Array:
     return out
 
 
-def ratios(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, float]:
+def measure_effect_ratios(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, float]:
     """What an effect does to a trace, over the sensors' floors: replay from the measured Cor of the same plant without.
 
     `xj_drift` counts the position as it drifts off, `xj` its differences over 20 cycles; `cor` is the answer's
     departure from the control law, over what the position's floor does to it.
     """
     run, noise, floor = measured.trace, measured.noise, FLOORS
-    bare = simulate(run.com, symbols(case, without), None, run.load, run.cor)
+    bare = simulate_truth(run.com, list_changed_symbols(case, without), None, run.load, run.cor)
     xj = run.xj - noise["xj"] - bare.xj
     p = nominal_symbols()
     law = np.clip(p["GAP"] * (run.com - run.xj), -p["Imax"], p["Imax"])
@@ -155,14 +157,14 @@ def _rms(x: Array) -> float:
     return float(np.sqrt((x**2).mean()))
 
 
-def write(case: Case, folder: Path) -> None:
+def write_case(case: Case, folder: Path) -> None:
     """The case's traces and truth.toml into `folder`, made if need be."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("est", "repeat", "holdout"):
-        measured = measure(case, name)
+        measured = measure_case(case, name)
         _write_trace(measured.trace, folder / f"{name}.csv.gz")
         if name == "est":
-            (folder / "truth.toml").write_text(_truth(case, measured), encoding="utf-8")
+            (folder / "truth.toml").write_text(_format_truth(case, measured), encoding="utf-8")
 
 
 def _write_trace(run: Run, path: Path) -> None:
@@ -172,22 +174,22 @@ def _write_trace(run: Run, path: Path) -> None:
     path.write_bytes(gzip.compress(text.encode(), compresslevel=4, mtime=0))  # no time: repeats to the byte
 
 
-def _truth(case: Case, est: Measured) -> str:
+def _format_truth(case: Case, est: Measured) -> str:
     """What is hidden, as TOML."""
     names = [effect.name for effect in case.effects]
     lines = [f"seed = {case.seed}", f"kind = {json.dumps(case.kind)}", f"effects = {json.dumps(names)}",
              f"signals = {json.dumps(case.signals)}", f"known_load = {case.load:.6g}", "", "[level]",
              *(f"{key} = {value:.6g}" for key, value in case.level._asdict().items()), "", "[base_ratio]",
-             *_table(ratios(case, est, names))]
+             *_format_table(measure_effect_ratios(case, est, names))]
     for effect in case.effects:
         lines += ["", "[[hidden]]", f"effect = {json.dumps(effect.name)}", f"size = {effect.size:.6g}",
-                  f"value = {effect.value:.8g}", "[hidden.changes]", *_table(effect.changes)]
+                  f"value = {effect.value:.8g}", "[hidden.changes]", *_format_table(effect.changes)]
         if len(case.effects) > 1:
-            lines += ["[hidden.ratio]", *_table(ratios(case, est, [effect.name]))]
-    return "\n".join([*lines, "", "[plant]", *_table(case.plant), ""])
+            lines += ["[hidden.ratio]", *_format_table(measure_effect_ratios(case, est, [effect.name]))]
+    return "\n".join([*lines, "", "[plant]", *_format_table(case.plant), ""])
 
 
-def _table(values: dict[str, float]) -> list[str]:
+def _format_table(values: dict[str, float]) -> list[str]:
     return [f"{key} = {value:.8g}" for key, value in values.items()]
 
 
@@ -207,8 +209,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     for seed in range(args.seed, args.seed + args.count):
         kind = args.kind or ("two" if len(args.effect) > 1 else None)
-        case = draw(seed, kind, args.effect, args.level, tuple(args.sizes))
-        write(case, args.out / f"{seed:04d}")
+        case = draw_case(seed, kind, args.effect, args.level, tuple(args.sizes))
+        write_case(case, args.out / f"{seed:04d}")
         print(f"{seed:04d} {case.kind}: {', '.join(f'{e.name} {e.size:.4g}' for e in case.effects)}", flush=True)
     return 0
 

@@ -15,7 +15,7 @@ CHAMBERS = 1.5e-4  # m3, V of compressibility
 KNOWN_LOAD = 6000.0  # N, without which a leak across the piston cannot be seen
 
 
-class Law(NamedTuple):
+class HiddenLaw(NamedTuple):
     """An effect to hide: sizes from `low` to `high`, and what a size does to the plant's symbols.
 
     `shown` is the symbol, among what `apply` gives, that has the meaning of the first parameter that a fit frees.
@@ -41,8 +41,9 @@ class Hidden(NamedTuple):
     known_load: float
 
 
-def draw(name: str, plant: Symbols, rng: np.random.Generator, low: float = 0.0, high: float = 1.0) -> Hidden:
-    """Effect `name` on the plant, its size between the fractions `low` and `high` of the (logarithmic) range."""
+def draw_hidden_effect(name: str, plant: Symbols, rng: np.random.Generator, low: float = 0.0, high: float = 1.0
+                       ) -> Hidden:
+    """Effect `name` on the plant; its random size is between the fractions `low` and `high` of a logarithmic range."""
     law = (CATALOGUE | OUTSIDE)[name]
     size = law.low * (law.high / law.low) ** float(rng.uniform(low, high))
     if law.signed and rng.random() < 0.5:
@@ -56,77 +57,78 @@ def draw(name: str, plant: Symbols, rng: np.random.Generator, low: float = 0.0, 
     return Hidden(name, size, changes, value, law.known_load)
 
 
-def _set(symbol: str, factor: float = 1.0) -> Callable[[float, Symbols], dict[str, float]]:
+def _set_symbol(symbol: str, factor: float = 1.0) -> Callable[[float, Symbols], dict[str, float]]:
     return lambda x, p: {symbol: factor * x}
 
 
-def _more(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
+def _grow_symbols(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
     """The symbols grown by the fraction x."""
     return lambda x, p: {symbol: p[symbol] * (1.0 + x) for symbol in symbols}
 
 
-def _times(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
+def _scale_symbols(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
     """The symbols times exp(x): as far down as up."""
     return lambda x, p: {symbol: p[symbol] * float(np.exp(x)) for symbol in symbols}
 
 
 IMAX = 8e-3  # A
 
-CATALOGUE: dict[str, Law] = {
-    "filter_clogging": Law(0.02, 0.5, _set("Kintas"), "Kintas"),
-    "spool_friction": Law(5.2, 100, lambda x, p: {"FSS": x, "FDS": x / 1.5}, "FSS"),
-    "jack_friction": Law(0.08, 2, _more("FSJ", "FDJ"), "FSJ"),
-    "viscous_drag": Law(0.2, 9, _more("CJ"), "CJ"),
-    "moving_mass": Law(0.05, 0.7, _times("MJ"), "MJ", signed=True),
-    "internal_leakage": Law(1.3e-12, 5e-11, _set("CLK"), "CLK", known_load=KNOWN_LOAD),
-    "null_bias": Law(0.0001 * IMAX, 0.04 * IMAX, _set("bias"), "bias", signed=True),
-    "torque_motor_hysteresis": Law(0.001 * IMAX, 0.05 * IMAX, _set("motor_play"), "motor_play"),
-    "coil_lag": Law(0.07e-3, 3e-3, _set("coil_tau"), "coil_tau"),
-    "current_limit": Law(0.02, 0.4, _set("driver_cut"), "driver_cut"),
-    "nozzle_asymmetry": Law(0.01, 0.3, _set("nozzle"), "nozzle", signed=True),
-    "feedback_gap": Law(0.5e-6, 50e-6, _set("gap"), "gap"),
-    "spool_overlap": Law(0.4e-6, 60e-6, _set("overlap"), "overlap"),
-    "spool_underlap": Law(0.3e-6, 30e-6, _set("underlap"), "underlap"),
-    "orifice_root": Law(1, 1, _set("orifice"), "orifice"),
-    "flow_force": Law(1e-4, 5e-3, _set("flow_force"), "flow_force"),
-    "supply_droop": Law(2e9, 2.5e10, _set("droop"), "droop"),
-    "supply_ripple": Law(0.01, 0.15, _set("ripple"), "ripple", extra={"ripple_hz": (10, 150)}),
-    "compressibility": Law(0.5e9, 1.5e9, lambda x, p: {"volume": CHAMBERS / (4 * x), "soft": 1 / x}, "soft"),
-    "viscosity_drift": Law(0.15, 1.0, lambda x, p: {"CJ": p["CJ"] * float(np.exp(x)), "BF": p["BF"] * float(np.exp(x)),
-                                                   "CLK": p["CLK"] * float(np.exp(-x)), "mu": float(np.exp(x))},
-                           "mu", signed=True),
-    "stribeck": Law(0.08, 1, _set("stribeck"), "stribeck", extra={"stribeck_v": (1e-3, 50e-3)}),
-    "presliding": Law(5e-6, 100e-6, lambda x, p: {"bristle": p["FSJ"] / x, "deflection": x}, "deflection",
-                      choices={"bristle_v": (0.0, 1e-3)}),
-    "friction_asymmetry": Law(0.03, 0.5, _set("asymmetry"), "asymmetry", signed=True),
-    "mount_compliance": Law(1e7, 3e8, lambda x, p: {"recoil": 1 / x}, "recoil"),
-    "rod_backlash": Law(4e-6, 200e-6, _set("backlash"), "backlash"),
-    "aero_stiffness": Law(1e4, 1e6, _set("aero"), "aero"),
-    "constant_load": Law(30, 5000, _set("force"), "force", signed=True),
-    "sensor_lag": Law(0.07e-3, 3e-3, _set("sensor_tau"), "sensor_tau"),
-    "sensor_gain": Law(0.0005, 0.02, _set("sensor_gain"), "sensor_gain", signed=True),
-    "sensor_offset": Law(2e-6, 200e-6, _set("sensor_offset"), "sensor_offset", signed=True),
-    "quantisation": Law(1e-6, 20e-6, _set("lsb"), "lsb"),
-    "transport_delay": Law(0.07, 3, _set("delay"), "delay"),
-    "command_rate_limit": Law(0.05, 0.3, _set("rate"), "rate"),
+CATALOGUE: dict[str, HiddenLaw] = {
+    "filter_clogging": HiddenLaw(0.02, 0.5, _set_symbol("Kintas"), "Kintas"),
+    "spool_friction": HiddenLaw(5.2, 100, lambda x, p: {"FSS": x, "FDS": x / 1.5}, "FSS"),
+    "jack_friction": HiddenLaw(0.08, 2, _grow_symbols("FSJ", "FDJ"), "FSJ"),
+    "viscous_drag": HiddenLaw(0.2, 9, _grow_symbols("CJ"), "CJ"),
+    "moving_mass": HiddenLaw(0.05, 0.7, _scale_symbols("MJ"), "MJ", signed=True),
+    "internal_leakage": HiddenLaw(1.3e-12, 5e-11, _set_symbol("CLK"), "CLK", known_load=KNOWN_LOAD),
+    "null_bias": HiddenLaw(0.0001 * IMAX, 0.04 * IMAX, _set_symbol("bias"), "bias", signed=True),
+    "torque_motor_hysteresis": HiddenLaw(0.001 * IMAX, 0.05 * IMAX, _set_symbol("motor_play"), "motor_play"),
+    "coil_lag": HiddenLaw(0.07e-3, 3e-3, _set_symbol("coil_tau"), "coil_tau"),
+    "current_limit": HiddenLaw(0.02, 0.4, _set_symbol("driver_cut"), "driver_cut"),
+    "nozzle_asymmetry": HiddenLaw(0.01, 0.3, _set_symbol("nozzle"), "nozzle", signed=True),
+    "feedback_gap": HiddenLaw(0.5e-6, 50e-6, _set_symbol("gap"), "gap"),
+    "spool_overlap": HiddenLaw(0.4e-6, 60e-6, _set_symbol("overlap"), "overlap"),
+    "spool_underlap": HiddenLaw(0.3e-6, 30e-6, _set_symbol("underlap"), "underlap"),
+    "orifice_root": HiddenLaw(1, 1, _set_symbol("orifice"), "orifice"),
+    "flow_force": HiddenLaw(1e-4, 5e-3, _set_symbol("flow_force"), "flow_force"),
+    "supply_droop": HiddenLaw(2e9, 2.5e10, _set_symbol("droop"), "droop"),
+    "supply_ripple": HiddenLaw(0.01, 0.15, _set_symbol("ripple"), "ripple", extra={"ripple_hz": (10, 150)}),
+    "compressibility": HiddenLaw(0.5e9, 1.5e9, lambda x, p: {"volume": CHAMBERS / (4 * x), "soft": 1 / x}, "soft"),
+    "viscosity_drift": HiddenLaw(
+        0.15, 1.0, lambda x, p: {"CJ": p["CJ"] * float(np.exp(x)), "BF": p["BF"] * float(np.exp(x)),
+                                 "CLK": p["CLK"] * float(np.exp(-x)), "mu": float(np.exp(x))}, "mu", signed=True),
+    "stribeck": HiddenLaw(0.08, 1, _set_symbol("stribeck"), "stribeck", extra={"stribeck_v": (1e-3, 50e-3)}),
+    "presliding": HiddenLaw(5e-6, 100e-6, lambda x, p: {"bristle": p["FSJ"] / x, "deflection": x}, "deflection",
+                            choices={"bristle_v": (0.0, 1e-3)}),
+    "friction_asymmetry": HiddenLaw(0.03, 0.5, _set_symbol("asymmetry"), "asymmetry", signed=True),
+    "mount_compliance": HiddenLaw(1e7, 3e8, lambda x, p: {"recoil": 1 / x}, "recoil"),
+    "rod_backlash": HiddenLaw(4e-6, 200e-6, _set_symbol("backlash"), "backlash"),
+    "aero_stiffness": HiddenLaw(1e4, 1e6, _set_symbol("aero"), "aero"),
+    "constant_load": HiddenLaw(30, 5000, _set_symbol("force"), "force", signed=True),
+    "sensor_lag": HiddenLaw(0.07e-3, 3e-3, _set_symbol("sensor_tau"), "sensor_tau"),
+    "sensor_gain": HiddenLaw(0.0005, 0.02, _set_symbol("sensor_gain"), "sensor_gain", signed=True),
+    "sensor_offset": HiddenLaw(2e-6, 200e-6, _set_symbol("sensor_offset"), "sensor_offset", signed=True),
+    "quantisation": HiddenLaw(1e-6, 20e-6, _set_symbol("lsb"), "lsb"),
+    "transport_delay": HiddenLaw(0.07, 3, _set_symbol("delay"), "delay"),
+    "command_rate_limit": HiddenLaw(0.05, 0.3, _set_symbol("rate"), "rate"),
 }
 """The 33 effects of the catalogue (docs/physics.md)."""
 
-OUTSIDE: dict[str, Law] = {
-    "force periodic in position": Law(300, 3000, _set("cog"), extra={"cog_l": (0.8e-3, 4e-3)}),
-    "Coulomb friction that depends on position": Law(0.3, 0.9, _set("rough"), extra={"rough_l": (1e-3, 6e-3)}),
-    "pilot pressure lag": Law(0.3e-3, 3e-3, _set("pilot_tau")),
-    "second mass on a spring": Law(15, 60, lambda x, p: {"mass2": x, "spring2": x * (2 * np.pi * 35) ** 2,
-                                                         "damp2": 0.04 * x * 2 * np.pi * 35}),
-    "square-law leakage": Law(2e-9, 5e-8, _set("leak_root"), known_load=KNOWN_LOAD),
-    "torque-motor gain that drifts": Law(0.002, 0.02, _set("motor_drift"), signed=True),
-    "cubic feedback spring": Law(2e4, 1e6, _set("spring_cubic")),
-    "jack area that depends on position": Law(5, 30, _set("area_slope"), signed=True),
-    "dead time that depends on the answer": Law(0.5, 4, _set("jitter")),
-    "periodic torque": Law(4e-5, 1e-3, _set("torque"), extra={"torque_hz": (5, 90)}),
-    "leakage one way": Law(3e-12, 5e-11, _set("leak_sign"), known_load=KNOWN_LOAD),
-    "drag quadratic in speed": Law(1e5, 2e6, _set("drag2")),
-    "transducer quadratic in position": Law(3, 20, _set("sensor_square"), signed=True),
+OUTSIDE: dict[str, HiddenLaw] = {
+    "force periodic in position": HiddenLaw(300, 3000, _set_symbol("cog"), extra={"cog_l": (0.8e-3, 4e-3)}),
+    "Coulomb friction that depends on position": HiddenLaw(0.3, 0.9, _set_symbol("rough"),
+                                                           extra={"rough_l": (1e-3, 6e-3)}),
+    "pilot pressure lag": HiddenLaw(0.3e-3, 3e-3, _set_symbol("pilot_tau")),
+    "second mass on a spring": HiddenLaw(
+        15, 60, lambda x, p: {"mass2": x, "spring2": x * (2 * np.pi * 35) ** 2, "damp2": 0.04 * x * 2 * np.pi * 35}),
+    "square-law leakage": HiddenLaw(2e-9, 5e-8, _set_symbol("leak_root"), known_load=KNOWN_LOAD),
+    "torque-motor gain that drifts": HiddenLaw(0.002, 0.02, _set_symbol("motor_drift"), signed=True),
+    "cubic feedback spring": HiddenLaw(2e4, 1e6, _set_symbol("spring_cubic")),
+    "jack area that depends on position": HiddenLaw(5, 30, _set_symbol("area_slope"), signed=True),
+    "dead time that depends on the answer": HiddenLaw(0.5, 4, _set_symbol("jitter")),
+    "periodic torque": HiddenLaw(4e-5, 1e-3, _set_symbol("torque"), extra={"torque_hz": (5, 90)}),
+    "leakage one way": HiddenLaw(3e-12, 5e-11, _set_symbol("leak_sign"), known_load=KNOWN_LOAD),
+    "drag quadratic in speed": HiddenLaw(1e5, 2e6, _set_symbol("drag2")),
+    "transducer quadratic in position": HiddenLaw(3, 20, _set_symbol("sensor_square"), signed=True),
 }
 """Effects that the catalogue does not have. Some need a size at which no catalogue effect can take their place."""
 NOT_SIMULATED = ("soft", "mu", "deflection")

@@ -1,146 +1,123 @@
-"""The blind trial's cases through an explanation, in several processes, to be taken up again where it was left.
+"""The blind trial's cases through an explanation, on the resumable runner.
 
-Each finished case is one line of results.jsonl. A line counts only for the sources it was made with.
+The folder holds results.jsonl, one row per finished case, and the cases' traces. A row counts only for the sources it
+was made with; the folder of the traces is named after a hash of the code that makes them.
 """
 from __future__ import annotations
 
-import contextlib
-import json
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fdi.sources import digest, named
-from plant.errors import InputError
 from rig.network.clock import WallClock
+from rig.studies.resumable.batch import Batch, BatchProgress, Workers, run_batch
+from rig.studies.resumable.row_file import Row, RowFile
 from rig.studies.trial import cases, truth
 
 Explain = Callable[[Path, Path, Sequence[Path], Sequence[str]], dict[str, Any]]
-"""est, holdout, repeats, signals -> the JSON of `rig explain`."""
+"""From est, holdout, repeats and signals to the JSON of `rig explain`."""
 
 RESULTS = "results.jsonl"
-# what makes a case
-TRIAL = tuple(f"rig/studies/trial/{name}" for name in ("truth.c", "truth.py", "command.py", "hidden.py", "cases.py"))
-KEPT = 5  # candidates kept of an answer
+CASE_SOURCES = tuple(f"rig/studies/trial/{name}" for name in ("truth.c", "truth.py", "command.py", "hidden.py",
+                                                              "cases.py"))
 
 
-class Progress(NamedTuple):
-    """How far a trial is."""
+def run_trial(explain: str, seeds: Sequence[int], folder: Path, processes: int = 2,
+              report_progress: Callable[[BatchProgress], None] = lambda _: None) -> list[Row]:
+    """The rows of the cases of `seeds`, in their order; cases with a row in `folder` are not done again.
 
-    done: int
-    total: int
-    left: float  # s, about
-    record: dict[str, Any]  # of the case just done
+    `explain` names the explanation as "module:function", because other processes have to import it.
+
+    Raises:
+        InputError: there is no such function, no C compiler, or the folder cannot be made.
+    """
+    load_explain(explain)
+    truth.parameter_names()  # compile the simulator before several processes need it
+    with RowFile(folder / RESULTS) as file:
+        rows = run_batch(plan_batch(explain, seeds, folder), file, Workers(processes), report_progress)
+    return list(rows.values())
+
+
+def plan_batch(explain: str, seeds: Sequence[int], folder: Path) -> Batch:
+    """The cases of `seeds` as a batch."""
+    sources = hash_trial_sources()
+
+    def describe_failure(seed: int, reason: str) -> Row:
+        return make_row(explain, seed, read_truth(prepare_case(seed, folder)), describe_crash(reason), 0.0)
+
+    def is_valid(row: Row) -> bool:
+        return bool(row["sources"] == sources and row["by"] == explain)
+
+    def is_failed(row: Row) -> bool:
+        return bool(row["answer"]["verdict"] == "CRASHED")
+
+    return Batch(jobs={seed: seed for seed in seeds}, work=partial(explain_case, explain=explain, folder=folder),
+                 key="seed", describe_failure=describe_failure, is_valid=is_valid, is_failed=is_failed)
+
+
+def explain_case(seed: int, explain: str, folder: Path) -> Row:
+    """Explain one case: its truth, the shortened answer and the time it took. A crash is an answer as well."""
+    case = prepare_case(seed, folder)
+    hidden = read_truth(case)
+    clock = WallClock()
+    start = clock.now()
+    try:
+        answer = shorten_answer(load_explain(explain)(case / "est.csv.gz", case / "holdout.csv.gz",
+                                                      [case / "repeat.csv.gz"], hidden["signals"].split(",")))
+    except Exception as error:
+        answer = describe_crash(f"{type(error).__name__}: {error}")
+    return make_row(explain, seed, hidden, answer, (clock.now() - start) * 1e-9)
+
+
+def make_row(explain: str, seed: int, hidden: Mapping[str, Any], answer: Mapping[str, Any], seconds: float) -> Row:
+    """One line of results.jsonl."""
+    return {"seed": seed, "by": explain, "sources": hash_trial_sources(), "truth": hidden, "answer": answer,
+            "seconds": seconds}
+
+
+def describe_crash(reason: str) -> dict[str, Any]:
+    """The answer of a case that gave none."""
+    return {"verdict": "CRASHED", "effects": [], "error": reason}
+
+
+def prepare_case(seed: int, folder: Path) -> Path:
+    """The folder with the traces of a seed; they are made if they are missing."""
+    target = folder / f"cases-{digest(*CASE_SOURCES)[:8]}" / f"{seed:05d}"
+    if not target.exists():
+        part = target.with_name(target.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        cases.write_case(cases.draw_case(seed), part)
+        part.rename(target)
+    return target
+
+
+def read_truth(case: Path) -> dict[str, Any]:
+    """What is hidden in a case."""
+    return tomllib.loads((case / "truth.toml").read_text(encoding="utf-8"))
+
+
+def shorten_answer(answer: Mapping[str, Any], candidates: int = 5) -> dict[str, Any]:
+    """The part of an answer that scoring needs: of the candidates the first ones and those it names."""
+    short = {key: answer.get(key) for key in ("verdict", "effects", "baseline", "pattern")}
+    named_effects = set(answer["effects"])
+    short["candidates"] = [candidate for rank, candidate in enumerate(answer.get("candidates", []))
+                           if rank < candidates or candidate["effect"] in named_effects]
+    return short
 
 
 def load_explain(name: str) -> Explain:
-    """The callable that "module:function" names.
+    """The explanation "module:function".
 
     Raises:
-        InputError: there is no such thing.
+        InputError: there is no such function.
     """
     return named(name, "the blind trial", "an explanation")
 
 
-def run(explain: str, seeds: Sequence[int], folder: Path, jobs: int = 2,
-        progress: Callable[[Progress], None] = lambda _: None) -> list[dict[str, Any]]:
-    """The records of the cases of `seeds`, in their order; what `folder` has already is not done again.
-
-    `explain` names the callable as "module:function", for the processes to import.
-
-    Raises:
-        InputError: no such callable, no C compiler, or no such folder can be made.
-    """
-    load_explain(explain)
-    truth.fields()  # built once, before the processes need it
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(folder, "", f"a folder that can be made ({error.strerror})") from error
-    known = {r["seed"]: r for r in _lines(folder / RESULTS) if r["sources"] == sources() and r["by"] == explain}
-    found = {seed: known[seed] for seed in seeds if seed in known}
-    missing = [seed for seed in seeds if seed not in found]
-    clock = WallClock()
-    start = clock.now()
-    with (folder / RESULTS).open("a", encoding="utf-8") as out:
-        for record in _each(explain, missing, folder, jobs):
-            found[record["seed"]] = record
-            out.write(json.dumps(record) + "\n")
-            out.flush()
-            fresh = len(found) - (len(seeds) - len(missing))
-            left = (clock.now() - start) * 1e-9 / fresh * (len(missing) - fresh)
-            progress(Progress(len(found), len(seeds), left, record))
-    return [found[seed] for seed in seeds]
-
-
-def _each(explain: str, seeds: Sequence[int], folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
-    """Records as they come. Processes are spawned, because a fork of a process with threads may hang."""
-    if jobs < 2 or len(seeds) < 2:
-        yield from (one(explain, seed, folder) for seed in seeds)
-        return
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        waiting: set[Future[dict[str, Any]]] = {pool.submit(one, explain, seed, folder) for seed in seeds}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in done)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def one(explain: str, seed: int, folder: Path) -> dict[str, Any]:
-    """One case explained: its truth, the answer in short, and how long it took. A crash is an answer, too."""
-    case = prepared(seed, folder)
-    hidden = tomllib.loads((case / "truth.toml").read_text(encoding="utf-8"))
-    clock = WallClock()
-    start = clock.now()
-    try:
-        answer = _short(load_explain(explain)(case / "est.csv.gz", case / "holdout.csv.gz", [case / "repeat.csv.gz"],
-                                              hidden["signals"].split(",")))
-    except Exception as error:
-        answer = {"verdict": "CRASHED", "effects": [], "error": f"{type(error).__name__}: {error}"}
-    return {"seed": seed, "by": explain, "sources": sources(), "truth": hidden, "answer": answer,
-            "seconds": (clock.now() - start) * 1e-9}
-
-
-def prepared(seed: int, folder: Path) -> Path:
-    """The folder with the case of a seed, made if it is not there."""
-    target = folder / f"cases-{digest(*TRIAL)[:8]}" / f"{seed:05d}"
-    if not target.exists():
-        part = target.with_name(target.name + ".part")
-        shutil.rmtree(part, ignore_errors=True)
-        cases.write(cases.draw(seed), part)
-        part.rename(target)  # whole or not at all
-    return target
-
-
-def _short(answer: dict[str, Any]) -> dict[str, Any]:
-    """What scoring needs of an answer."""
-    kept = {key: answer.get(key) for key in ("verdict", "effects", "baseline", "pattern")}
-    candidates = answer.get("candidates", [])
-    named = set(answer["effects"])
-    return kept | {"candidates": [c for i, c in enumerate(candidates) if i < KEPT or c["effect"] in named]}
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    """The records in a file; a line that was cut is left out, and ended."""
-    if not path.exists():
-        return []
-    text = path.read_text(encoding="utf-8")
-    if text and not text.endswith("\n"):
-        with path.open("a", encoding="utf-8") as out:
-            out.write("\n")
-    found = []
-    for line in text.splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
-            found.append(json.loads(line))
-    return found
-
-
-def sources() -> str:
-    """A hash of all that an answer depends on."""
-    return digest("plant", "fdi", *TRIAL)
+def hash_trial_sources() -> str:
+    """A hash of all code and data that an answer depends on."""
+    return digest("plant", "fdi", *CASE_SOURCES)

@@ -1,4 +1,4 @@
-"""How often an explanation was right: the trial's records counted against the rates that are asked for."""
+"""How often an explanation was right: the trial's rows counted against the required rates."""
 from __future__ import annotations
 
 import math
@@ -6,20 +6,21 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fdi.estimation.binomial import clopper_pearson_interval
 from plant.effects import CATALOGUE
 
 Record = Mapping[str, Any]
+"""A row of results.jsonl."""
 
-VISIBLE = 2.0  # floors, from where on an effect has to be found
-ADDED = 1.15  # floors, most that may be left on the hold-out with the right effect
-TIME = 20.0  # s
-CONFIDENCE = 0.95
-JUDGED = "xj,p12,xs"
-"""The signals of the cases that the rates are asked of; with fewer, more effects look alike."""
+VISIBLE = 2.0  # noise floors; a hidden effect of this size or more has to be found
+HOLDOUT = 1.15  # noise floors; largest error on the held-out run with the right effect added
+TIME = 20.0  # s, for an answer
+ALL_SIGNALS = "xj,p12,xs"
+"""The signals of the cases that the rates are required of; with fewer signals more effects look alike."""
 
 
 class Rate(NamedTuple):
-    """A share that is asked for, and what was found."""
+    """A required share of right answers, and the share that was counted."""
 
     name: str
     good: int
@@ -31,173 +32,173 @@ class Rate(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Good ones of all; NaN where there was none."""
+        """The share of right answers; NaN if there was no case."""
         return self.good / self.of if self.of else math.nan
 
     @property
     def met(self) -> bool:
-        """Whether the share reaches what was asked for."""
+        """Whether the share reaches what is required; False if there was no case."""
         return self.of > 0 and self.share >= self.asked
 
 
-def visible(record: Record, ratio: Mapping[str, float] | None = None) -> float:
-    """What the hidden effects do, in floors, in the signal that shows them most of those the case has.
+def measure_visibility(record: Record, ratio: Mapping[str, float] | None = None) -> float:
+    """The largest size of the hidden effects in noise floors, over the signals of the case and the controller's answer.
 
-    The position counts by its differences over 20 cycles, because a replay drifts on anything; the answer always.
+    `ratio` is that of one effect; default: of all together. The position counts by its differences over 20 cycles,
+    because the position of a replay drifts with any difference.
     """
     ratios = record["truth"]["base_ratio"] if ratio is None else ratio
     return max(ratios[name] for name in [*record["truth"]["signals"].split(","), "cor"])
 
 
-def named(record: Record) -> bool:
-    """Whether all that is hidden is among what is named."""
+def is_truth_named(record: Record) -> bool:
+    """Whether the answer names all hidden effects."""
     return set(record["truth"]["effects"]) <= set(record["answer"]["effects"])
 
 
-def covered(record: Record) -> bool | None:
-    """Whether the interval of the hidden effect's first parameter holds the truth; None where there is no interval."""
+def is_truth_covered(record: Record) -> bool | None:
+    """Whether the interval of the hidden effect's first parameter contains the truth; None without an interval."""
     hidden = record["truth"]["hidden"][0]
     parameter = CATALOGUE[hidden["effect"]].fitted[0]
-    found = _candidate(record, hidden["effect"]).get("parameters", {}).get(parameter)
-    if found is None or found.get("low") is None or math.isnan(hidden["value"]):
+    estimate = _find_candidate(record, hidden["effect"]).get("parameters", {}).get(parameter)
+    if estimate is None or estimate.get("low") is None or math.isnan(hidden["value"]):
         return None
-    return bool(found["low"] <= hidden["value"] <= found["high"])
+    return bool(estimate["low"] <= hidden["value"] <= estimate["high"])
 
 
-def held_out(record: Record) -> float | None:
-    """Error on the hold-out with the right effect added, in floors, in the worst signal; None if not told."""
+def measure_holdout_error(record: Record) -> float | None:
+    """The error on the held-out run with the right effect added, in noise floors: worst signal; None if unknown."""
     floors = (record["answer"].get("baseline") or {}).get("floor") or {}
-    errors = _candidate(record, record["truth"]["effects"][0]).get("holdout") or {}
-    known = [errors[name] / floors[name] for name in errors if floors.get(name)]
-    return max(known) if known else None
+    errors = _find_candidate(record, record["truth"]["effects"][0]).get("holdout") or {}
+    ratios = [errors[name] / floors[name] for name in errors if floors.get(name)]
+    return max(ratios) if ratios else None
 
 
-def _candidate(record: Record, effect: str) -> Mapping[str, Any]:
-    found = [c for c in record["answer"].get("candidates", []) if c["effect"] == effect]
-    return found[0] if found else {}
+def _find_candidate(record: Record, effect: str) -> Mapping[str, Any]:
+    """The answer's candidate with this effect; empty if it has none."""
+    for candidate in record["answer"].get("candidates", []):
+        if candidate["effect"] == effect:
+            return candidate  # type: ignore[no-any-return]
+    return {}
 
 
-def _of(records: Iterable[Record], kind: str) -> list[Record]:
-    return [r for r in records if r["truth"]["kind"] == kind]
+def _select_kind(records: Iterable[Record], kind: str) -> list[Record]:
+    return [record for record in records if record["truth"]["kind"] == kind]
 
 
-def clear(records: Iterable[Record], kind: str) -> list[Record]:
-    """Cases of a kind whose hidden effects, each of them, have to be found."""
-    return [r for r in _of(records, kind) if visible(r) >= VISIBLE
-            and all(visible(r, h["ratio"]) >= VISIBLE for h in r["truth"]["hidden"] if "ratio" in h)]
+def is_visible(record: Record) -> bool:
+    """Whether every hidden effect is large enough that it has to be found."""
+    each = [hidden["ratio"] for hidden in record["truth"]["hidden"] if "ratio" in hidden]
+    return all(measure_visibility(record, ratio) >= VISIBLE for ratio in (None, *each))
 
 
-def rates(records: Sequence[Record]) -> list[Rate]:
-    """The rates that are asked for, each with its count."""
-    one, outside = clear(records, "one"), clear(records, "outside")
-    right = [r for r in one if named(r)]
+def select_visible(records: Iterable[Record], kind: str) -> list[Record]:
+    """The cases of a kind whose hidden effects have to be found."""
+    return [record for record in _select_kind(records, kind) if is_visible(record)]
+
+
+def count_rates(records: Sequence[Record]) -> list[Rate]:
+    """The required rates, each with its count."""
+    one, outside = select_visible(records, "one"), select_visible(records, "outside")
+    right = [record for record in one if is_truth_named(record)]
+
+    def has_verdict(*verdicts: str) -> Callable[[Record], bool]:
+        return lambda record: record["answer"]["verdict"] in verdicts
+
+    def is_holdout_explained(record: Record) -> bool | None:
+        error = measure_holdout_error(record)
+        return None if error is None else error <= HOLDOUT
+
+    def is_not_explained(record: Record) -> bool:
+        return bool(record["answer"]["verdict"] != "EXPLAINED")
+
+    def is_in_time(record: Record) -> bool:
+        return bool(record["seconds"] <= TIME)
+
     return [
-        _rate("nothing missing: NOTHING_MISSING", _of(records, "nothing"), 0.99, _verdict("NOTHING_MISSING")),
-        _rate("one effect: the truth is named", one, 0.97, named),
-        _rate("  its 95 % interval holds the truth", right, 0.90, covered),
-        _rate("  hold-out at most 1.15 floors with it", right, 0.90, _within(held_out, ADDED)),
-        _rate("outside the catalogue: UNEXPLAINED or PARTLY", outside, 0.95, _verdict("UNEXPLAINED", "PARTLY")),
-        _rate("outside the catalogue: never EXPLAINED", _of(records, "outside"), 1.0,
-              lambda r: r["answer"]["verdict"] != "EXPLAINED"),
-        _rate("two effects: both named", clear(records, "two"), 0.80, named),
-        _rate("answer within 20 s", list(records), 1.0, lambda r: r["seconds"] <= TIME),
+        count_rate("nothing missing: NOTHING_MISSING", _select_kind(records, "nothing"), 0.99,
+                   has_verdict("NOTHING_MISSING")),
+        count_rate("one effect: the truth is named", one, 0.97, is_truth_named),
+        count_rate("  its 95 % interval holds the truth", right, 0.90, is_truth_covered),
+        count_rate("  hold-out at most 1.15 floors with it", right, 0.90, is_holdout_explained),
+        count_rate("outside the catalogue: UNEXPLAINED or PARTLY", outside, 0.95,
+                   has_verdict("UNEXPLAINED", "PARTLY")),
+        count_rate("outside the catalogue: never EXPLAINED", _select_kind(records, "outside"), 1.0, is_not_explained),
+        count_rate("two effects: both named", select_visible(records, "two"), 0.80, is_truth_named),
+        count_rate("answer within 20 s", records, 1.0, is_in_time),
     ]
 
 
-def names_on_average(records: Sequence[Record]) -> float:
-    """Size of the named set where the one hidden effect is in it."""
-    sizes = [len(r["answer"]["effects"]) for r in clear(records, "one") if named(r)]
-    return sum(sizes) / len(sizes) if sizes else math.nan
-
-
-def _verdict(*good: str) -> Callable[[Record], bool]:
-    return lambda r: r["answer"]["verdict"] in good
-
-
-def _within(figure: Callable[[Record], float | None], most: float) -> Callable[[Record], bool | None]:
-    def judge(record: Record) -> bool | None:
-        value = figure(record)
-        return None if value is None else value <= most
-    return judge
-
-
-def _rate(name: str, records: Iterable[Record], asked: float, good: Callable[[Record], bool | None]) -> Rate:
-    judged = {int(r["seed"]): good(r) for r in records}
-    counted = {seed: verdict for seed, verdict in judged.items() if verdict is not None}
-    low, high = interval(sum(counted.values()), len(counted))
-    bad = tuple(seed for seed, verdict in counted.items() if not verdict)
+def count_rate(name: str, records: Iterable[Record], asked: float, is_good: Callable[[Record], bool | None]) -> Rate:
+    """How many cases are good; those for which `is_good` gives None do not count."""
+    judged = {int(record["seed"]): is_good(record) for record in records}
+    counted = {seed: good for seed, good in judged.items() if good is not None}
+    low, high = clopper_pearson_interval(sum(counted.values()), len(counted))
+    bad = tuple(seed for seed, good in counted.items() if not good)
     return Rate(name, sum(counted.values()), len(counted), asked, low, high, bad)
 
 
-def interval(good: int, of: int) -> tuple[float, float]:
-    """The exact binomial interval of a share (Clopper and Pearson 1934)."""
-    tail = (1.0 - CONFIDENCE) / 2
-    low = _bisect(lambda p: _at_most(of - good, of, 1.0 - p) < tail) if good > 0 else 0.0
-    high = _bisect(lambda p: _at_most(good, of, p) > tail) if good < of else 1.0
-    return low, high
+def average_named_effects(records: Sequence[Record]) -> float:
+    """The mean number of named effects over the cases whose single hidden effect is among them; NaN without cases."""
+    sizes = [len(record["answer"]["effects"]) for record in select_visible(records, "one") if is_truth_named(record)]
+    return sum(sizes) / len(sizes) if sizes else math.nan
 
 
-def _at_most(k: int, n: int, p: float) -> float:
-    """Probability of k or fewer of n."""
-    return sum(math.comb(n, i) * p**i * (1.0 - p) ** (n - i) for i in range(k + 1))
-
-
-def _bisect(below: Callable[[float], bool]) -> float:
-    """Where `below` turns false between 0 and 1."""
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if below(middle) else (low, middle)
-    return low
-
-
-def confusion(records: Iterable[Record]) -> dict[str, Counter[str]]:
-    """Truth (its kind; of one effect its name, and whether it is large enough) by verdict and whether it is named."""
+def count_confusion(records: Iterable[Record]) -> dict[str, Counter[str]]:
+    """Truth to answer to number of cases."""
     table: dict[str, Counter[str]] = {}
-    for r in records:
-        table.setdefault(_row(r), Counter())[_column(r)] += 1
+    for record in records:
+        table.setdefault(_classify_truth(record), Counter())[_classify_answer(record)] += 1
     return {row: table[row] for row in sorted(table)}
 
 
-def _row(record: Record) -> str:
+def _classify_truth(record: Record) -> str:
+    """The kind of a case; of one effect its name as well, and whether the effect is too small to be required."""
     kind, effects = str(record["truth"]["kind"]), record["truth"]["effects"]
     if kind == "nothing":
         return kind
-    size = "" if record in clear([record], kind) else " (small)"
-    return f"{kind}{size}" if kind == "two" else f"{kind}: {effects[0]}{size}"
+    size = "" if is_visible(record) else " (small)"
+    return f"two{size}" if kind == "two" else f"{kind}: {effects[0]}{size}"
 
 
-def _column(record: Record) -> str:
-    verdict, effects = record["answer"]["verdict"], record["answer"]["effects"]
+def _classify_answer(record: Record) -> str:
+    """The verdict; where an effect of the catalogue is hidden and one is named, whether the naming is right."""
+    verdict, effects = str(record["answer"]["verdict"]), record["answer"]["effects"]
     if not effects or record["truth"]["kind"] in ("nothing", "outside"):
-        return str(verdict)
-    return f"{verdict} {'right' if named(record) else 'wrong'}"
+        return verdict
+    return f"{verdict} right" if is_truth_named(record) else f"{verdict} wrong"
 
 
-def failures(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Every case that counts against one of the rates: which, what is hidden, what was answered."""
-    by_seed = {r["seed"]: r for r in records}
-    found: dict[int, list[str]] = {}
-    for rate in rates(records):
+def list_failures(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Every case that counts against a rate: what is hidden, and what the answer was."""
+    missed: dict[int, list[str]] = {}
+    for rate in count_rates(records):
         for seed in rate.bad:
-            found.setdefault(seed, []).append(rate.name.strip())
-    return [{"seed": seed, "against": against, "signals": by_seed[seed]["truth"]["signals"],
-             "hidden": {h["effect"]: h["size"] for h in by_seed[seed]["truth"].get("hidden", [])},
-             "floors": visible(by_seed[seed]), "verdict": by_seed[seed]["answer"]["verdict"],
-             "named": by_seed[seed]["answer"]["effects"], "error": by_seed[seed]["answer"].get("error")}
-            for seed, against in sorted(found.items())]
+            missed.setdefault(seed, []).append(rate.name.strip())
+    by_seed = {record["seed"]: record for record in records}
+    return [_describe_failure(by_seed[seed], against) for seed, against in sorted(missed.items())]
 
 
-def summary(records: Sequence[Record]) -> dict[str, Any]:
-    """All figures as JSON values: the rates where everything is measured, and their counts by what is measured."""
-    by_signals = {s: [r for r in records if r["truth"]["signals"] == s] for s in (JUDGED, "xj,p12", "xj")}
-    names = names_on_average(by_signals[JUDGED])
-    seconds = sorted(r["seconds"] for r in records)
+def _describe_failure(record: Record, against: Sequence[str]) -> dict[str, Any]:
+    truth, answer = record["truth"], record["answer"]
+    return {"seed": record["seed"], "against": against, "signals": truth["signals"],
+            "hidden": {hidden["effect"]: hidden["size"] for hidden in truth.get("hidden", [])},
+            "floors": measure_visibility(record), "verdict": answer["verdict"], "named": answer["effects"],
+            "error": answer.get("error")}
+
+
+def summarise_trial(records: Sequence[Record]) -> dict[str, Any]:
+    """All figures as JSON values: the rates over cases with all signals, and their counts by the measured signals."""
+    by_signals = {signals: [record for record in records if record["truth"]["signals"] == signals]
+                  for signals in (ALL_SIGNALS, "xj,p12", "xj")}
+    names = average_named_effects(by_signals[ALL_SIGNALS])
+    seconds = sorted(record["seconds"] for record in records)
     return {"cases": len(records),
-            "rates": [rate._asdict() | {"share": None if not rate.of else rate.share, "met": rate.met}
-                      for rate in rates(by_signals[JUDGED])],
-            "by_signals": {s: {rate.name: [rate.good, rate.of] for rate in rates(of)} for s, of in by_signals.items()},
+            "rates": [rate._asdict() | {"share": rate.share if rate.of else None, "met": rate.met}
+                      for rate in count_rates(by_signals[ALL_SIGNALS])],
+            "by_signals": {signals: {rate.name: [rate.good, rate.of] for rate in count_rates(group)}
+                           for signals, group in by_signals.items()},
             "names_on_average": None if math.isnan(names) else names,
-            "confusion": {row: dict(count) for row, count in confusion(records).items()},
+            "confusion": {row: dict(counts) for row, counts in count_confusion(records).items()},
             "seconds": {"median": seconds[len(seconds) // 2], "most": seconds[-1]} if seconds else {},
-            "failures": failures(records)}
+            "failures": list_failures(records)}

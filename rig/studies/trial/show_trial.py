@@ -7,16 +7,16 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from rig.studies.trial.run_trial import Progress
+from rig.studies.resumable.batch import BatchProgress
 
 
-def line(progress: Progress) -> str:
+def line(progress: BatchProgress) -> str:
     """One finished case, in one line with the time left."""
-    truth, answer = progress.record["truth"], progress.record["answer"]
+    truth, answer = progress.row["truth"], progress.row["answer"]
     hidden = ", ".join(f"{h['effect']} {h['size']:.3g}" for h in truth.get("hidden", [])) or "nothing"
     named = ", ".join(answer["effects"] or []) or "-"
-    return (f"{progress.done}/{progress.total}, {_time(progress.left)} left: seed {progress.record['seed']}, {hidden}"
-            f" -> {answer['verdict']} {named}, {progress.record['seconds']:.1f} s")
+    return (f"{progress.done}/{progress.total}, {_time(progress.left)} left: seed {progress.row['seed']}, {hidden}"
+            f" -> {answer['verdict']} {named}, {progress.row['seconds']:.1f} s")
 
 
 def _time(seconds: float) -> str:

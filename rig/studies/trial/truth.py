@@ -55,13 +55,13 @@ def nominal_symbols() -> dict[str, float]:
     return {symbol: values[name] for symbol, name in SYMBOLS.items()}
 
 
-def available() -> bool:
+def has_compiler() -> bool:
     """Whether there is a compiler to build the simulator with."""
     return shutil.which("gcc") is not None
 
 
 @cache
-def _library() -> ctypes.CDLL:
+def _load_library() -> ctypes.CDLL:
     """The compiled simulator, kept under a hash of its source.
 
     Raises:
@@ -84,12 +84,12 @@ def _library() -> ctypes.CDLL:
 
 
 @cache
-def fields() -> tuple[str, ...]:
+def parameter_names() -> tuple[str, ...]:
     """Names of the simulator's parameters, in its order."""
-    return tuple(_library().trial_fields().decode().split())
+    return tuple(_load_library().trial_fields().decode().split())
 
 
-def simulate(com: Array, changes: Mapping[str, float], noise: Array | None = None, load: Array | None = None,
+def simulate_truth(com: Array, changes: Mapping[str, float], noise: Array | None = None, load: Array | None = None,
              cor: Array | None = None, steps: int = STEPS) -> Run:
     """The plant over `com` (n,) m, at rest at first.
 
@@ -101,27 +101,27 @@ def simulate(com: Array, changes: Mapping[str, float], noise: Array | None = Non
         ValueError: columns of different lengths.
     """
     n = len(com)
-    values = dict.fromkeys(fields(), 0.0) | nominal_symbols()
+    values = dict.fromkeys(parameter_names(), 0.0) | nominal_symbols()
     unknown = changes.keys() - values.keys()
     if unknown:
         raise InputError("the trial's simulator", min(unknown), "one of its parameters: " + ", ".join(values))
-    columns = [_column(column, n) for column in (com, load, noise)]
-    record = np.array([(values | dict(changes))[name] for name in fields()])
-    answer = np.zeros(n) if cor is None else _column(cor, n).copy()
+    columns = [_make_column(column, n) for column in (com, load, noise)]
+    record = np.array([(values | dict(changes))[name] for name in parameter_names()])
+    answer = np.zeros(n) if cor is None else _make_column(cor, n).copy()
     out = np.empty((n, 3))
-    _library().trial_run(
-        _pointer(record), ctypes.c_long(n), ctypes.c_long(steps), ctypes.c_int(cor is not None),
-        *map(_pointer, columns), ctypes.c_double(PERIOD), _pointer(answer), _pointer(out))
+    _load_library().trial_run(
+        _point_to(record), ctypes.c_long(n), ctypes.c_long(steps), ctypes.c_int(cor is not None),
+        *map(_point_to, columns), ctypes.c_double(PERIOD), _point_to(answer), _point_to(out))
     xj, p12, xs = np.ascontiguousarray(out.T)
     return Run(columns[0], xj, answer, p12, xs, columns[1])
 
 
-def _column(column: Array | None, n: int) -> Array:
+def _make_column(column: Array | None, n: int) -> Array:
     wide = np.zeros(n) if column is None else np.ascontiguousarray(column, dtype=float)
     if wide.shape != (n,):
         raise ValueError(f"a column of {wide.shape} beside {n} cycles")
     return wide
 
 
-def _pointer(array: Array) -> ctypes._Pointer[ctypes.c_double]:
+def _point_to(array: Array) -> ctypes._Pointer[ctypes.c_double]:
     return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))

@@ -13,8 +13,8 @@ from fdi.diagnosis.refine import Refined, problem_of, refine
 from fdi.estimation.valley import flats, relaxed, sloped
 from fdi.trace.record import record
 from plant import Model, load_model
-from rig.studies.campaign.case import run
-from rig.studies.campaign.matrix import matrix
+from rig.studies.campaign.case import simulate_case
+from rig.studies.campaign.matrix import build_matrix
 from rig.studies.trial import cases, truth
 
 MODEL = load_model()
@@ -46,10 +46,10 @@ def test_tolerances_decide_how_wide_an_interval_is(off_grid: Refined) -> None:
 
 def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     """A bench-level case of the blind trial, FSS 30 N: no tolerance of ours is at its centre."""
-    if not truth.available():
+    if not truth.has_compiler():
         pytest.skip("needs gcc")
-    case = cases.draw(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
-    run = cases.measure(case, "est").trace
+    case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
+    run = cases.measure_case(case, "est").trace
     trace = recorded({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
     found = refine(MODEL, record(trace))
     true = case.effects[0].value
@@ -125,8 +125,8 @@ def test_a_model_with_a_known_effect_keeps_it() -> None:
 @pytest.mark.parametrize("seed", [8, 10])
 def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side(seed: int) -> None:
     """Strongly clogged units with scatter, which a first descent leaves at up to 3.5 times the noise."""
-    drawn = matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": seed}, MODEL, "", "test")
-    found = diagnose(run(drawn.cases[0], drawn.spec, MODEL))
+    drawn = build_matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": seed}, MODEL, "", "test")
+    found = diagnose(simulate_case(drawn.cases[0], drawn.spec, MODEL))
     assert found.refined.reached and found.levels[CLOGGING.name] == Level.NON_NOMINAL
     assert found.refined.kintas.low < 0.35 < found.refined.kintas.high
     assert found.levels[FRICTION.name] == Level.ACCEPTABLE

@@ -23,7 +23,7 @@ from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.provenance import provenance
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import Prediction, score, told_without_reason
+from rig.studies.prognosis.score import Prediction, find_false_trends, score_unit
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)
@@ -172,8 +172,8 @@ def test_estimates_at_their_bound_only_say_not_more_than() -> None:
 
 
 def test_the_metrics_on_predictors_that_are_known() -> None:
-    unit = degrading_units.unit("linear", 4)
-    end, middle = unit.reached(unit.fault.most), unit.reached(unit.fault.middle)
+    unit = degrading_units.simulate_unit("linear", 4)
+    end, middle = unit.time_of_size(unit.fault.most), unit.time_of_size(unit.fault.middle)
 
     def by(factor: float) -> Any:
         def predict(u: degrading_units.Unit, n: int) -> Prediction:
@@ -181,7 +181,7 @@ def test_the_metrics_on_predictors_that_are_known() -> None:
             return Prediction(True, spread * (middle - u.t[n - 1]), spread * (end - u.t[n - 1]))
         return predict
 
-    right, wrong = score(unit, by(1.0)), score(unit, by(1.5))
+    right, wrong = score_unit(unit, by(1.0)), score_unit(unit, by(1.5))
     assert right.alpha_lambda == (1.0,) * 4 and wrong.alpha_lambda == (0.0,) * 4
     assert set(right.held_most) == {1.0} and set(wrong.held_most) == {0.0} and set(wrong.below) == {1.0}
     assert right.relative == pytest.approx([1.0] * 4) and wrong.relative == pytest.approx([0.5] * 4)
@@ -191,8 +191,8 @@ def test_the_metrics_on_predictors_that_are_known() -> None:
 
 def test_a_fleet_reaches_maxband_at_the_end_of_its_life() -> None:
     for i, law in enumerate(degrading_units.LAWS):
-        unit = degrading_units.unit(law, i)
-        assert np.all(np.diff(unit.course) >= -1e-12) and unit.reached(unit.fault.most) == pytest.approx(
+        unit = degrading_units.simulate_unit(law, i)
+        assert np.all(np.diff(unit.course) >= -1e-12) and unit.time_of_size(unit.fault.most) == pytest.approx(
             unit.course_t[-1], rel=0.02)
 
 
@@ -201,13 +201,13 @@ def test_intervals_hold_the_truth() -> None:
     held = []
     for i, law in enumerate(degrading_units.LAWS):
         for k in range(2):
-            u = degrading_units.unit(law, 100 * i + k)
-            end = u.reached(u.fault.most)
+            u = degrading_units.simulate_unit(law, 100 * i + k)
+            end = u.time_of_size(u.fault.most)
             n = int(np.searchsorted(u.t, (u.onset + end) / 2))
             left = follow(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
             held.append(left.low <= end - u.t[n - 1] <= left.high)
     assert sum(held) >= 0.8 * len(held)
-    assert len(told_without_reason(degrading_units.healthy(seed) for seed in range(6))) <= 1
+    assert len(find_false_trends(degrading_units.simulate_healthy_unit(seed) for seed in range(6))) <= 1
 
 
 def points(path: Path, sizes: Sequence[float]) -> Path:

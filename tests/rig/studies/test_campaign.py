@@ -3,12 +3,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,11 @@ from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 from rig.studies.campaign import case as cases
-from rig.studies.campaign import folder, matrix, summary, workers
-from rig.studies.campaign.run_campaign import Hands, Progress
-from rig.studies.campaign.run_campaign import run as campaign
-from rig.studies.trial.truth import SYMBOLS, available
+from rig.studies.campaign import folder, matrix, summary
+from rig.studies.campaign.run_campaign import plan_batch, run_campaign
+from rig.studies.resumable import batch, dask_cluster
+from rig.studies.resumable.batch import BatchProgress, Workers, run_jobs
+from rig.studies.trial.truth import SYMBOLS, has_compiler
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 pytest.importorskip("pyarrow", reason="the extra fleet is not installed")
@@ -34,7 +37,7 @@ TAKES = ("seconds",)  # what may differ between two runs
 
 
 def rows(where: Path) -> list[dict[str, Any]]:
-    return [{key: value for key, value in row.items() if key not in TAKES} for row in folder.read_rows(where)]
+    return [{key: value for key, value in row.items() if key not in TAKES} for row in folder.read_campaign_rows(where)]
 
 
 def calls(path: Path) -> list[tuple[int, str]]:
@@ -56,12 +59,8 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished campaign of eight cases, by this process."""
     where = tmp_path_factory.mktemp("campaign") / "local"
     model = Model()
-    whole = matrix.matrix({"seeds": 2, "case": matrix.parsed(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
-    code = cases.sources()
-    with folder.Folder(where, whole, code) as results:
-        for c in whole.cases:
-            results.add(cases.one(c, whole.spec, code))
-        results.finish()
+    whole = matrix.build_matrix({"seeds": 2, "case": matrix.parse_faults(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
+    run_campaign(whole, where, Workers())
     return where
 
 
@@ -104,12 +103,12 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
 def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(environment: Path, local: Path, tmp_path: Path) -> None:
     there, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
     process = started("campaign", *MATRIX, *few, "--out", there)
-    grown(there / folder.JOURNAL, 500)
+    grown(there / folder.ROWS, 500)
     process.kill()
     process.wait()
     done = rows(there)
     assert 0 < len(done) < 6
-    with (there / folder.JOURNAL).open("a") as out:
+    with (there / folder.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
     said = rig("campaign", there, *few, "--json")
     assert (said.status, said.json["cases"]) == (0, 6)
@@ -136,55 +135,66 @@ class Dead:
         return False
 
 
-def test_own_workers_listen_on_this_machine_alone_and_give_the_same_rows(environment: Path, local: Path) -> None:
+def test_processes_listen_to_no_port_and_give_the_same_rows(environment: Path, local: Path) -> None:
     import psutil
 
-    whole, code = folder.matrix_of(local), cases.sources()
-    with workers.own(2) as client:
+    whole = folder.read_matrix_of_folder(local)
+    plan, sockets = plan_batch(whole, cases.hash_campaign_sources(), 4), []
+    found: dict[int, dict[str, Any]] = {}
+    workers = Workers(2, single_threaded=True)
+    for case, row in run_jobs(plan.work, list(plan.jobs.values()), workers, plan.describe_failure):
+        assert row["case"] == case.number
+        found[case.number] = row
         me = psutil.Process()
-        sockets = [s for p in (me, *me.children(recursive=True)) for s in p.net_connections("inet")]
-        assert {s.laddr.ip for s in sockets if s.status == psutil.CONN_LISTEN} <= {"127.0.0.1"}
-        found = {row["case"]: row for row in workers.by(client, whole.cases[:4], whole.spec, code)}
-        assert set(client.run(lambda: os.environ["OPENBLAS_NUM_THREADS"]).values()) == {"1"}
-        lost = workers._row(Dead(), whole.cases[3], whole.spec)
-    assert lost["reason"] == "KilledWorker: every worker that tried it died" and lost["true_fss"] == 30.0
+        sockets += [s for p in (me, *me.children(recursive=True)) for s in p.net_connections("inet")]
+    assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
     kept = [{key: value for key, value in found[i].items() if key not in TAKES} for i in range(4)]
     assert kept == rows(local)[:4]
-    assert len({pid for pid, _ in calls(environment)}) == 2
+    assert len({pid for pid, _ in calls(environment)} - {os.getpid()}) == 2
 
 
-def test_it_tells_how_far_it_is_and_how_long_the_rest_takes(local: Path, tmp_path: Path) -> None:
-    told: list[Progress] = []
-    found = campaign(folder.matrix_of(local), tmp_path / "there", Hands(), told.append, most=8)
-    assert [(p.done, p.total) for p in told] == [(i + 1, 8) for i in range(8)]
-    assert told[-1].left == 0.0 < told[0].left and told[-1].failed == 1
+def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:
+    whole = folder.read_matrix_of_folder(local)
+    plan = plan_batch(whole, cases.hash_campaign_sources())
+    row = dask_cluster.take_result(Dead(), whole.cases[3], plan.describe_failure)
+    assert row["reason"] == "KilledWorker: every worker that tried it died" and row["true_fss"] == 30.0
+    assert plan.is_failed(row) and plan.is_valid(row)
+    assert not plan_batch(whole, "", redo_failed=True).is_valid(row)
+
+
+def test_progress_counts_the_cases_and_estimates_the_time_left(local: Path, tmp_path: Path) -> None:
+    seen: list[BatchProgress] = []
+    found = run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append, count=8)
+    assert [(p.done, p.total) for p in seen] == [(i + 1, 8) for i in range(8)]
+    assert seen[-1].left == 0.0 < seen[0].left and seen[-1].failed == 1
     assert [row["case"] for row in found] == list(range(8))
-    campaign(folder.matrix_of(local), tmp_path / "there", Hands(), told.append)
-    assert len(told) == 8  # nothing was left to do
+    run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append)
+    assert len(seen) == 8  # nothing was left to do
 
 
-def test_a_failed_case_is_kept_with_its_reason_and_done_again_on_demand(local: Path) -> None:
+def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
     failed = [row for row in rows(local) if row["status"] == "failed"]
     assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
         ("filter_clogging=0.9", 1, "ZeroDivisionError: nothing left to divide")]
-    whole, code = folder.matrix_of(local), cases.sources()
-    with folder.Folder(local, whole, code) as results:
-        assert len(results.rows) == 8
-    with folder.Folder(local, whole, code, again=True) as results:
-        assert len(results.rows) == 7
     assert "rms" not in failed[0] and "rms" in rows(local)[0]
+    copy, seen = shutil.copytree(local, tmp_path / "copy"), list[BatchProgress]()
+    whole = folder.read_matrix_of_folder(copy)
+    assert len(run_campaign(whole, copy, Workers(), seen.append)) == 8 and seen == []
+    again = run_campaign(whole, copy, Workers(), seen.append, redo_failed=True)
+    assert [p.row["label"] for p in seen] == ["filter_clogging=0.9"] and seen[0].done == 8
+    assert [row["case"] for row in again] == list(range(8)) and rows(copy) == rows(local)
 
 
 def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tmp_path: Path) -> None:
     said = rig("campaign", *MATRIX, "--seeds", 4, "--out", local)
-    assert said.status == 2 and "a folder of this matrix or a new one; there, seeds, case differs" in said.err
+    assert said.status == 2 and "a folder of this matrix, or a new one; it differs in seeds, case" in said.err
     (tmp_path / "notes.txt").write_text("mine")
     assert "an empty folder" in rig("campaign", *MATRIX, "--out", tmp_path).err
-    whole, code = folder.matrix_of(local), cases.sources()
+    whole, sources = folder.read_matrix_of_folder(local), cases.hash_campaign_sources()
     with pytest.raises(InputError, match="the code has changed"):
-        folder.Folder(local, whole, "another")
-    with folder.Folder(local, whole, code), pytest.raises(InputError, match="no other rig campaign is at work"):
-        folder.Folder(local, whole, code)
+        folder.CampaignFolder(local, whole, "another")
+    with folder.CampaignFolder(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
+        folder.CampaignFolder(local, whole, sources)
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
@@ -206,7 +216,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
 ])
 def test_bad_input_is_one_line(words: tuple[str, ...], complaint: str, tmp_path: Path,
                                monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "ANSWER", 0.5)
+    monkeypatch.setattr(batch, "connect_to_cluster", partial(dask_cluster.connect_to_cluster, timeout=0.5))
     said = rig("campaign", *words, "--out", tmp_path / "x", *(() if "--work" in words else MATRIX[-2:]))
     assert (said.status, said.err.count("\n")) == (2, 1) and complaint in said.err
 
@@ -221,47 +231,47 @@ def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_samp
         spool_friction = 45.0
         tolerance = [0.0, 0.02]'''
     (tmp_path / "m.toml").write_text(text)
-    found = matrix.matrix(matrix.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
+    found = matrix.build_matrix(matrix.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
     assert Counter(c.label for c in found.cases) == {
         "healthy": 8, "filter_clogging=0.1 spool_friction=45": 4, "filter_clogging=0.2 spool_friction=45": 4}
     assert [c.number for c in found.cases] == list(range(16)) and len(set(map(str, found.cases))) == 16
     assert {c.tolerance for c in found.cases if c.sizes} == {0.0, 0.02}
     assert Counter(c.label for c in found.cases[:8]).most_common()[-1][1] == 2  # half of all: half of each
-    assert matrix.of_spec(json.loads(json.dumps(found.spec))).cases == found.cases
-    shipped = matrix.matrix(matrix.read_matrix("statistics"), Model(), "fdi", "statistics")
+    assert matrix.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
+    shipped = matrix.build_matrix(matrix.read_matrix("statistics"), Model(), "fdi", "statistics")
     labels = Counter(c.label for c in shipped.cases)
     assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[summary.OFF_GRID] >= 200
 
 
 def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
-    spec = matrix.matrix({"case": [{}]}, Model(), "", "x").spec
+    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
     case = matrix.Case(5, "spool_friction=45", {"spool_friction": 45.0}, 0.015, 3)
-    first, second = (cases.run(case._replace(number=n), spec, Model()) for n in (5, 99))
-    other = cases.run(case._replace(seed=4), spec, Model())
+    first, second = (cases.simulate_case(case._replace(number=n), spec, Model()) for n in (5, 99))
+    other = cases.simulate_case(case._replace(seed=4), spec, Model())
     for name in ("xj", "cor", "p12", "xs"):
         assert (first.column(name) == second.column(name)).all() and (first.column(name) != other.column(name)).any()
-    broken = cases.faulty(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
+    broken = cases.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
     assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
     assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
-    chance = [cases.draw(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
+    chance = [cases.draw_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
     assert np.std([x.scatter[SYMBOLS["GQ"]] for x in chance]) == pytest.approx(0.015, rel=0.3)
     noise = chance[0].noise
     assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)
     assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.8, abs=0.05)
-    alone = cases.run(case, {**spec, "signals": "xj"}, Model())
+    alone = cases.simulate_case(case, {**spec, "signals": "xj"}, Model())
     assert set(alone.signals) == {"com", "xj", "cor", "load"}
 
 
-@pytest.mark.skipif(not available(), reason="no gcc: the independent simulator cannot be built")
+@pytest.mark.skipif(not has_compiler(), reason="no gcc: the independent simulator cannot be built")
 def test_the_independent_simulator_makes_the_same_unit() -> None:
-    spec = matrix.matrix({"case": [{}]}, Model(), "", "x").spec
+    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
     case = matrix.Case(0, "filter_clogging=0.3", {"filter_clogging": 0.3}, 0.015, 3)
-    ours, its = (cases.run(case, {**spec, "simulator": name}, Model()) for name in matrix.SIMULATORS)
-    healthy = cases.run(case._replace(sizes={}), spec, Model())
+    ours, its = (cases.simulate_case(case, {**spec, "simulator": name}, Model()) for name in matrix.SIMULATORS)
+    healthy = cases.simulate_case(case._replace(sizes={}), spec, Model())
     apart = [float(np.sqrt(((x.xj - its.xj) ** 2).mean())) for x in (ours, healthy)]
     assert apart[0] < 15e-6 and apart[1] > 2 * apart[0]
-    with pytest.raises(InputError, match="an effect of one size"):
-        cases.run(case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": "independent"}, Model())
+    with pytest.raises(InputError, match="an effect with a single size"):
+        cases.simulate_case(case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": "independent"}, Model())
 
 
 def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tmp_path: Path) -> None:
@@ -276,13 +286,13 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
     assert [row["label"] for row in rows(tmp_path / "out")] == ["a.csv.gz", "b.csv", "c.csv"]
     assert rows(tmp_path / "out")[2]["reason"].startswith(str(tmp_path / "c.csv"))
     Trace.of(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
-    assert "there, files differs" in rig(*words).err
+    assert "it differs in files" in rig(*words).err
 
 
 def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(tmp_path: Path) -> None:
     said = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
                "--out", tmp_path, "--json", "--jobs", 1)
-    row, = folder.read_rows(tmp_path)
+    row, = folder.read_campaign_rows(tmp_path)
     assert row["status"] == "ok" and said.json["cases"] == 1, row["reason"]
     assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)
     assert row["kintas_low"] < 0.17 < row["kintas_high"] and row["fss_low"] < 45.0 < row["fss_high"]

@@ -9,14 +9,14 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION
-from fdi.estimation.binomial import share
+from fdi.estimation.binomial import measure_share
 from rig.studies.campaign import detection_figure, show_campaign, summary
 
 
 @pytest.mark.parametrize(("good", "of"), [(0, 20), (1, 7), (137, 500), (3000, 3000)])
 def test_a_share_has_its_exact_interval(good: int, of: int) -> None:
     exact = binomtest(good, of).proportion_ci(0.95, "exact")
-    assert share(good, of)[2:] == pytest.approx((exact.low, exact.high), abs=1e-9)
+    assert measure_share(good, of)[2:] == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 def judged(label: str, kintas: float, fss: float, said: tuple[str, str], n: int, **more: Any) -> list[dict[str, Any]]:
@@ -39,7 +39,7 @@ def test_statistics_count_what_was_said() -> None:
              *judged("spool_friction=70", 0.0, 70.0, (bad, fine), 1),
              *judged("spool_friction=70", 0.0, 70.0, (fine, fine), 1, status="refused"),
              *judged(summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
-    rates = {rate.name: rate for rate in summary.rates(found)}
+    rates = {rate.name: rate for rate in summary.count_rates(found)}
 
     def count(name: str) -> tuple[int, int, bool | None]:
         return rates[name].share.good, rates[name].share.of, rates[name].met
@@ -50,16 +50,16 @@ def test_statistics_count_what_was_said() -> None:
     assert count("Kintas at MaxBand detected") == (0, 0, None)
     assert count("ruling fault, MidBand on") == (68, 72, False)
     assert count("off-grid Kintas covered") == (25, 25, False) and count("off-grid FSS within 2 %") == (25, 25, None)
-    points = [(p.size, p.detected.good, p.most.good) for p in summary.curve(found, FRICTION)]
-    assert [p.bands.good for p in summary.curve(found, FRICTION)] == [0, 30]
+    points = [(p.size, p.detected.good, p.most.good) for p in summary.count_detections(found, FRICTION)]
+    assert [p.bands.good for p in summary.count_detections(found, FRICTION)] == [0, 30]
     assert points == [(5.0, 3, 0), (70.0, 30, 30)]
-    assert summary.levels(found, CLOGGING)["acceptable"] == {
+    assert summary.count_levels(found, CLOGGING)["acceptable"] == {
         fine: 402 + 30 + 25, bad: 1, worst: 0, "cannot_tell": 0, "refused": 1, "failed": 0}
-    assert summary.ruling(found)["spool_friction, non_nominal"] == {"spool_friction": 30, "filter_clogging": 1,
-                                                                   "refused": 1}
-    error = next(e for e in summary.errors(found) if (e.label, e.fault) == (summary.OFF_GRID, "spool_friction"))
+    assert summary.count_ruling_faults(found)["spool_friction, non_nominal"] == {
+        "spool_friction": 30, "filter_clogging": 1, "refused": 1}
+    error = next(e for e in summary.measure_errors(found) if (e.label, e.fault) == (summary.OFF_GRID, "spool_friction"))
     assert (error.bias, error.rms, error.covered.good) == (pytest.approx(0.45), pytest.approx(0.45), 25)
-    figures = summary.summary(found)
+    figures = summary.summarise_campaign(found)
     json.dumps(figures, allow_nan=False)
     out = Console(width=100, record=True, quiet=False)
     show_campaign.summary(figures, out)
@@ -74,4 +74,4 @@ def test_statistics_count_what_was_said() -> None:
     (99, 100, 0.93, 0.97, False), (3, 9, 0.0, 1.0, None), (0, 0, 0.95, 1.0, None)])
 def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, met: bool | None
                                                   ) -> None:
-    assert summary.Rate("", share(good, of), least, most).met is met
+    assert summary.Rate("", measure_share(good, of), least, most).met is met

@@ -15,23 +15,22 @@ import pytest
 from places import SHARED
 from rich.console import Console
 from rig_command import rig
-from scipy.stats import binomtest
 
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
 from rig.studies.trial import cases, command, hidden, score, show_trial
-from rig.studies.trial.blackbox import NAME
-from rig.studies.trial.run_trial import load_explain, run
-from rig.studies.trial.truth import SYMBOLS, available, fields, nominal_symbols, simulate
+from rig.studies.trial.blackbox import RIG_EXPLAIN
+from rig.studies.trial.run_trial import load_explain, run_trial
+from rig.studies.trial.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
 
 PRACTICE = SHARED / "practice"
 EXACT: dict[str, dict[str, float]] = {
     "00": {"FSS": 45.0, "FDS": 30.0}, "01": {"Kintas": 0.3}, "02": {"bias": 0.03 * 8e-3}, "06": {"aero": 5.4e5},
     "09": {"cog": 2750.0, "cog_l": 2.5e-3}, "10": {"FSS": 33.0, "FDS": 22.0, "Kintas": 0.21},
 }
-pytestmark = pytest.mark.skipif(not available(), reason="no gcc: the trial's simulator cannot be built")
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="no gcc: the trial's simulator cannot be built")
 shared = pytest.mark.skipif(not PRACTICE.exists(), reason="no ../shared: no traces of an independent simulator")
 
 
@@ -49,7 +48,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(("case", "name"), [*((case, "est") for case in EXACT), ("02", "holdout"), ("09", "holdout")])
 def test_the_simulator_leaves_sensor_noise_of_an_independent_trace(case: str, name: str) -> None:
     trace = read(PRACTICE / case / f"{name}.csv.gz")
-    run = simulate(trace["com"], EXACT[case], load=trace["load"], cor=trace["cor"])
+    run = simulate_truth(trace["com"], EXACT[case], load=trace["load"], cor=trace["cor"])
     assert rms(run.xj - trace["xj"]) == pytest.approx(2e-6, rel=0.05)
     assert rms(run.p12 - trace["p12"]) == pytest.approx(2e4, rel=0.03)
     assert rms(run.xs - trace["xs"]) == pytest.approx(1e-6, rel=0.03)
@@ -58,15 +57,15 @@ def test_the_simulator_leaves_sensor_noise_of_an_independent_trace(case: str, na
 @shared
 def test_commands_and_loads_are_those_of_the_practice_traces() -> None:
     trace = read(PRACTICE / "04/est.csv.gz")
-    assert np.abs(command.preflight() - trace["com"]).max() < 1e-10
+    assert np.abs(command.preflight_command() - trace["com"]).max() < 1e-10
     for name in ("est", "holdout"):
         load = read(PRACTICE / f"04/{name}.csv.gz")["load"]
-        assert (command.known_load(len(load), 6000.0) == load).all()
+        assert (command.known_load_profile(len(load), 6000.0) == load).all()
 
 
 def test_hold_outs_are_random_commands_within_the_stroke() -> None:
     rng = np.random.default_rng(1)
-    made = [command.holdout(rng) for _ in range(50)]
+    made = [command.draw_holdout_command(rng) for _ in range(50)]
     assert all(5000 < len(com) < 40_000 and np.abs(com).max() < 10e-3 and com[-1] == 0 for com in made)
     assert len({len(com) for com in made}) > 40
 
@@ -79,15 +78,15 @@ def test_every_effect_of_the_catalogue_is_hidden_in_some_case() -> None:
 @pytest.mark.parametrize("name", [*hidden.CATALOGUE, *hidden.OUTSIDE])
 def test_a_hidden_effect_shows_and_grows(name: str) -> None:
     """Coarse steps: only that it does something, more of it more, and that all stays finite."""
-    whole = command.preflight()
+    whole = command.preflight_command()
     com = np.concatenate([whole[400:1700], whole[9000:9600], whole[11_000:13_000]])  # a large step, a sine, the chirp
-    load = command.known_load(len(com), 6000.0)
-    bare, shown = simulate(com, {}, load=load, steps=200), []
+    load = command.known_load_profile(len(com), 6000.0)
+    bare, shown = simulate_truth(com, {}, load=load, steps=200), []
     for part in (0.3, 1.0):
-        effect = hidden.draw(name, nominal_symbols(), np.random.default_rng(2), part, part)
-        changes = {key: value for key, value in effect.changes.items() if key in fields()}
+        effect = hidden.draw_hidden_effect(name, nominal_symbols(), np.random.default_rng(2), part, part)
+        changes = {key: value for key, value in effect.changes.items() if key in parameter_names()}
         assert changes.keys() | set(hidden.NOT_SIMULATED) >= effect.changes.keys()
-        run = simulate(com, changes, load=load, steps=200)
+        run = simulate_truth(com, changes, load=load, steps=200)
         columns = [run.xj - bare.xj, run.cor - bare.cor, run.p12 - bare.p12, run.xs - bare.xs]
         assert np.isfinite(columns).all()
         shown.append(max(rms(x) / floor for x, floor in zip(columns, (2e-6, 7.6e-6, 2e4, 1e-6), strict=True)))
@@ -108,10 +107,11 @@ def plants(effect: hidden.Hidden) -> dict[str, float]:
 
 def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     """Both replay the same current with the same size hidden; what is left is far below the sensors' noise."""
-    com = np.concatenate([command.preflight()[500:1700], command.preflight()[11_000:13_000]])
-    load = command.known_load(len(com), 6000.0)
-    drive = simulate(com, {}, load=load).cor
-    drawn = [hidden.draw(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)  # one has the sign -, one +
+    com = np.concatenate([command.preflight_command()[500:1700], command.preflight_command()[11_000:13_000]])
+    load = command.known_load_profile(len(com), 6000.0)
+    drive = simulate_truth(com, {}, load=load).cor
+    # of a signed effect one seed gives the sign -, one +
+    drawn = [hidden.draw_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
              for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
     drawn = [effect for effect in drawn if effect.name != "command_rate_limit"]  # not in the plant
     model = Model().having(effect.name for effect in drawn)
@@ -119,18 +119,19 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     rows = [[plants(effect).get(name, model[name]) for name in names] for effect in drawn]
     ours = Lanes(model, names, 100).replay(np.array(rows), drive, load)
     for effect, mine in zip(drawn, ours, strict=True):
-        changes = {key: value for key, value in effect.changes.items() if key in fields() and key != "bristle_v"}
-        truth = simulate(com, changes, load=load, cor=drive)
+        known = set(parameter_names()) - {"bristle_v"}
+        changes = {key: value for key, value in effect.changes.items() if key in known}
+        truth = simulate_truth(com, changes, load=load, cor=drive)
         columns = zip(mine.T, (truth.xj, truth.p12, truth.xs), (2e-6, 2e4, 1e-6), strict=True)
         left = [rms(x - y) / floor for x, y, floor in columns]
         assert max(left) < (1.0 if effect.name == "compressibility" else 0.5), (effect.name, effect.size, left)
 
 
 def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
-    case = cases.draw(11, level="bench")
-    assert str(case) == str(cases.draw(11, level="bench")) != str(cases.draw(12, level="bench"))
-    cases.write(case, tmp_path)
-    again, holdout = cases.measure(case, "holdout").trace, read(tmp_path / "holdout.csv.gz")
+    case = cases.draw_case(11, level="bench")
+    assert str(case) == str(cases.draw_case(11, level="bench")) != str(cases.draw_case(12, level="bench"))
+    cases.write_case(case, tmp_path)
+    again, holdout = cases.measure_case(case, "holdout").trace, read(tmp_path / "holdout.csv.gz")
     for name in ("com", "xj", "cor", "p12", "xs", "load"):
         assert holdout[name] == pytest.approx(getattr(again, name), rel=1e-8), name
     truth = tomllib.loads((tmp_path / "truth.toml").read_text())
@@ -141,7 +142,7 @@ def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
 
 
 def test_kinds_are_drawn_as_often_as_they_should() -> None:
-    drawn = [cases.draw(seed) for seed in range(600)]
+    drawn = [cases.draw_case(seed) for seed in range(600)]
     for kind, share in cases.KINDS.items():
         assert sum(case.kind == kind for case in drawn) / 600 == pytest.approx(share, abs=0.06)
     assert {len(case.effects) for case in drawn if case.kind == "two"} == {2}
@@ -150,7 +151,7 @@ def test_kinds_are_drawn_as_often_as_they_should() -> None:
 
 
 def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
-    noise = cases.measure(cases.draw(5, "nothing", level="bench"), "est").noise
+    noise = cases.measure_case(cases.draw_case(5, "nothing", level="bench"), "est").noise
     xj, t = noise["xj"], np.arange(13_500) * 1e-3
     hum = abs(2 * np.mean(xj * np.exp(-2j * np.pi * 50 * t)))
     assert hum == pytest.approx(0.7e-6, abs=0.1e-6)
@@ -160,8 +161,8 @@ def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
 
 
 def test_nothing_hidden_leaves_no_trace_of_an_effect() -> None:
-    case = cases.draw(5, "nothing", level="bench")
-    ratios = cases.ratios(case, cases.measure(case, "est"), [])
+    case = cases.draw_case(5, "nothing", level="bench")
+    ratios = cases.measure_effect_ratios(case, cases.measure_case(case, "est"), [])
     assert max(ratios.values()) < 1e-6
 
 
@@ -196,26 +197,20 @@ RECORDS = [
 
 
 def test_rates_count_what_they_say() -> None:
-    found = [(rate.good, rate.of, rate.bad) for rate in score.rates(RECORDS)]
+    found = [(rate.good, rate.of, rate.bad) for rate in score.count_rates(RECORDS)]
     assert found == [(1, 2, (1,)), (2, 3, (4,)), (1, 2, (3,)), (1, 2, (3,)), (1, 1, ()), (1, 2, (7,)), (1, 2, (9,)),
                      (9, 10, (0,))]
-    assert score.names_on_average(RECORDS) == 1.5
+    assert score.average_named_effects(RECORDS) == 1.5
 
 
 def test_the_summary_tells_every_failure_and_is_json() -> None:
-    figures = json.loads(json.dumps(score.summary(RECORDS)))
+    figures = json.loads(json.dumps(score.summarise_trial(RECORDS)))
     assert [f["seed"] for f in figures["failures"]] == [0, 1, 3, 4, 7, 9]
     assert figures["rates"][0]["bad"] == [1] and figures["by_signals"]["xj"]["two effects: both named"] == [0, 0]
     show_trial.summary(figures, Console(file=io.StringIO()))
     assert figures["confusion"]["one: spool_friction"] == {
         "EXPLAINED right": 1, "AMBIGUOUS right": 1, "EXPLAINED wrong": 1}
     assert figures["confusion"]["outside: periodic torque (small)"] == {"EXPLAINED": 1}
-
-
-@pytest.mark.parametrize(("good", "of"), [(0, 10), (10, 10), (7, 33), (198, 200)])
-def test_intervals_are_those_of_clopper_and_pearson(good: int, of: int) -> None:
-    exact = binomtest(good, of).proportion_ci(0.95, method="exact")
-    assert score.interval(good, of) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 def knowing(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence[str]) -> dict[str, Any]:
@@ -232,11 +227,11 @@ def knowing(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence
 def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
     told: list[str] = []
     by = f"{__name__}:knowing"
-    seeds = [next(s for s in range(99) if cases.draw(s).kind == kind) for kind in ("one", "outside")]
-    run(by, seeds[:1], tmp_path, jobs=1)
+    seeds = [next(s for s in range(99) if cases.draw_case(s).kind == kind) for kind in ("one", "outside")]
+    run_trial(by, seeds[:1], tmp_path, processes=1)
     with (tmp_path / "results.jsonl").open("a") as results:
         results.write('{"seed": 3, "cut')  # a process that was killed
-    records = run(by, seeds, tmp_path, jobs=1, progress=lambda p: told.append(show_trial.line(p)))
+    records = run_trial(by, seeds, tmp_path, processes=1, report_progress=lambda p: told.append(show_trial.line(p)))
     assert next(tmp_path.glob("cases-*/tally")).read_text() == ".."
     assert [r["answer"]["verdict"] for r in records] == ["EXPLAINED", "CRASHED"]
     assert "out of my depth" in records[1]["answer"]["error"]
@@ -244,7 +239,7 @@ def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
 
 
 def test_an_explanation_that_is_not_there_is_said_in_one_line() -> None:
-    assert callable(load_explain(NAME))
+    assert callable(load_explain(RIG_EXPLAIN))
     with pytest.raises(InputError, match="module:function"):
         load_explain("rig.studies.trial.nowhere:explain")
 
@@ -257,5 +252,5 @@ def test_the_command_refuses_no_cases_in_one_line() -> None:
 @pytest.mark.slow
 def test_blind_trial(tmp_path: Path) -> None:
     """200 cases through `rig explain`: an hour or two."""
-    missed = [rate for rate in score.rates(run(NAME, range(200), tmp_path)) if not rate.met]
+    missed = [rate for rate in score.count_rates(run_trial(RIG_EXPLAIN, range(200), tmp_path)) if not rate.met]
     assert missed == []

@@ -1,0 +1,81 @@
+"""Jobs for the tests of the resumable runner. A job is a word or a number; what it does is said at each branch."""
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from plant.errors import InputError
+from plant.threads import threads
+
+
+def square(job: int) -> int:
+    """A pure function of the job."""
+    return job**2
+
+
+def square_of_deadly_job(job: tuple[int, str]) -> tuple[int, int]:
+    """The square and the number of this process. The job's process dies first, if a file is named and not there yet.
+
+    The file name "always" kills every process.
+    """
+    number, marker = job
+    if marker and not Path(marker).exists():
+        if marker != "always":
+            Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2, os.getpid()
+
+
+def refuse(job: int) -> int:
+    """Refuses the job 3."""
+    if job == 3:
+        raise InputError("job", "3", "another job")
+    return job
+
+
+def count_threads(job: int) -> int:
+    """The number of threads that a computation may use here."""
+    return threads()
+
+
+def run_sleeping_process(folder: str) -> None:
+    """Start a process that sleeps, as `rig explain` in a trial, and write both process numbers to a file."""
+    command = [sys.executable, "-c", "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60)"]
+    with Path(folder, "pids").open("a") as out:
+        out.write(f"{os.getpid()}\n")
+        out.flush()
+        subprocess.run(command, stdout=out, check=False)
+
+
+def exit_at_import() -> None:
+    """Ends a process that unpickles it."""
+    raise SystemExit(3)
+
+
+class Unpicklable:
+    """A function that ends the process that unpickles it."""
+
+    def __call__(self, job: int) -> int:
+        """Never called in a worker."""
+        return job
+
+    def __reduce__(self) -> tuple[object, tuple[()]]:
+        return exit_at_import, ()
+
+
+if __name__ == "__main__":  # a user's process, to be interrupted: batch_work.py FOLDER
+    from rig.studies.resumable.batch import Workers, run_jobs
+
+    def name_failure(job: str, reason: str) -> None:
+        raise AssertionError(reason)
+
+    began = time.monotonic()
+    try:
+        for _ in run_jobs(run_sleeping_process, [sys.argv[1]] * 2, Workers(2), name_failure):
+            pass
+    except KeyboardInterrupt:
+        print("interrupted")
