@@ -1,8 +1,9 @@
 """Elementary functions without branches or calls, so that laws which use them run many to a vector register.
 
 They stand in for those of `math` and `numpy` in all linked code (`plant.compile`), compiled or interpreted, for one run
-or many: a law gives the same bits everywhere, which no two mathematical libraries promise. Methods and coefficients are
-those of fdlibm (sin, cos, log) and Cephes (tanh, atan). Errors against libm, in units of the last place (tests hold
+or many: a law gives the same bits everywhere. Mathematical libraries do not promise that. The C library and NumPy have
+several versions of exp, sin, log and pow, choose by the CPU, and the last bits differ. Methods and coefficients
+are those of fdlibm (sin, cos, log) and Cephes (tanh, atan). Errors against libm, in units of the last place (tests hold
 them): exp, log, atan 1, sin, cos, tanh 2, tan 3; angles up to 1e6 rad, beyond that a digit is lost a decade. What has
 no value is NaN or infinite instead of an exception.
 """
@@ -10,10 +11,12 @@ from __future__ import annotations
 
 import math
 from math import inf, nan, sqrt
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+Number = TypeVar("Number", float, NDArray[np.float64])
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to a whole number, found in the low bits of the sum
 
 
@@ -36,8 +39,15 @@ def exp(x: float) -> float:
     held = held if held < 710.0 else 710.0
     n = (held * 1.4426950408889634 + ROUND) - ROUND
     r = (held - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10  # ln 2 in two parts
-    y = 1.6059043836821613e-10
-    y = y * r + 2.08767569878681e-09
+    y = _exp_series(r)
+    half = (0.5 * n + ROUND) - ROUND  # in two factors: 2^n alone leaves the range before e^x does
+    y = y * _two_to(half) * _two_to(n - half)
+    return y if x == x else x
+
+
+def _exp_series(r: Number) -> Number:
+    """e^r for |r| <= ln(2)/2, by Taylor's series."""
+    y = 1.6059043836821613e-10 * r + 2.08767569878681e-09
     y = y * r + 2.505210838544172e-08
     y = y * r + 2.755731922398589e-07
     y = y * r + 2.7557319223985893e-06
@@ -48,10 +58,7 @@ def exp(x: float) -> float:
     y = y * r + 0.041666666666666664
     y = y * r + 0.16666666666666666
     y = y * r + 0.5
-    y = 1.0 + (r + r * r * y)
-    half = (0.5 * n + ROUND) - ROUND  # in two factors: 2^n alone leaves the range before e^x does
-    y = y * _two_to(half) * _two_to(n - half)
-    return y if x == x else x
+    return 1.0 + (r + r * r * y)
 
 
 def log(x: float) -> float:
@@ -83,14 +90,14 @@ def _quarters(x: float) -> tuple[float, float]:
     return n, r - n * 2.02226624879595063154e-21
 
 
-def _sine(r: float) -> float:
+def _sine(r: Number) -> Number:
     z = r * r
     y = z * (2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10))
     y = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + y))
     return r + r * z * y
 
 
-def _cosine(r: float) -> float:
+def _cosine(r: Number) -> Number:
     z = r * r
     y = z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11))
     y = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + y))
@@ -152,6 +159,25 @@ def atan(x: float) -> float:
 def hypot(x: float, y: float) -> float:
     """The length of (x, y), for numbers whose squares exist."""
     return sqrt(x * x + y * y)
+
+
+def sin_of_turns(turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sin(2 pi `turns`) of an array, in whole turns; exactly zero after every half turn."""
+    part = np.mod(turns, 1.0)
+    quarter = np.rint(4.0 * part)
+    r = (part - 0.25 * quarter) * (2.0 * np.pi)  # the difference is exact
+    y = np.where(quarter % 2.0 == 0.0, _sine(r), _cosine(r))
+    return np.where((quarter == 2.0) | (quarter == 3.0), -y, y)
+
+
+def exp_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """e^x of an array, the bits of `exp`."""
+    limited = np.clip(x, -746.0, 710.0)
+    n = np.rint(limited * 1.4426950408889634)
+    r = (limited - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10
+    half = np.rint(0.5 * n)
+    y: NDArray[np.float64] = np.ldexp(np.ldexp(_exp_series(r), half.astype(int)), (n - half).astype(int))
+    return y
 
 
 IN_PLACE_OF: dict[Any, Any] = {

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.errors import InputError
+from plant.functions import exp_of, sin_of_turns
 
 Array = npt.NDArray[np.float64]
 Level = Annotated[float, "m (N for a load)"]
@@ -106,7 +107,7 @@ class Sine(Timed):
         require_frequency("frequency", self.frequency)
 
     def demand(self, t: Array, last: float) -> Array:
-        return last + self.amplitude * _sine(self.frequency * t)
+        return last + self.amplitude * sin_of_turns(self.frequency * t)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +128,7 @@ class Chirp(Timed):
 
     def demand(self, t: Array, last: float) -> Array:
         cycles = self.f0 * t + (self.f1 - self.f0) / (2 * self.time) * t**2
-        return last + self.amplitude * _sine(cycles) * _fade_in(t, self.fade)
+        return last + self.amplitude * sin_of_turns(cycles) * _fade_in(t, self.fade)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +159,7 @@ class Multisine(Timed):
         phases = self.phases or [-np.pi * n * (n - 1) / lines for n in range(1, lines + 1)]
         wave = np.zeros_like(t)
         for frequency, phase in zip(self.frequencies, phases, strict=True):
-            wave += _sine(frequency * t + phase / (2 * np.pi))
+            wave += sin_of_turns(frequency * t + phase / (2 * np.pi))
         return last + self.amplitude * wave * _fade_in(t, self.fade)
 
 
@@ -208,13 +209,8 @@ KINDS: dict[str, type[Segment]] = {
 }
 
 
-def _sine(cycles: Array) -> Array:
-    """sin(2 pi cycles), exactly zero after whole cycles so that a wave ends where it says it does."""
-    return np.sin(2 * np.pi * np.mod(cycles, 1.0))
-
-
 def _fade_in(t: Array, fade: float) -> Array:
-    return 1 - np.exp(-fade * t) if fade else np.ones_like(t)
+    return 1 - exp_of(-fade * t) if fade else np.ones_like(t)
 
 
 def require(holds: bool, key: str, expected: str) -> None:

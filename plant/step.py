@@ -49,12 +49,21 @@ class Coefficients(NamedTuple):
     jack_coupled: float  # 1/kg
 
 
+def flow_share(left: float, law: float) -> float:
+    """`left` to the power of `law`, which is 1/2, 1 or 0 (`FILTER_LAWS`).
+
+    Exact to rounding. The last bit of `**` depends on the CPU.
+    """
+    share = sqrt(left) if law == 0.5 else left
+    return 1.0 if law == 0.0 else share
+
+
 def coefficients(p: Any, h: float) -> Coefficients:
     """Coefficients for parameters `p` and steps of `h` seconds."""
     f, v, c = p.flapper, p.spool, p.jack
     left = 1.0 - p.filter.clogging  # 1 - Kintas
     gpf1 = p.pilot.pressure_gain * left
-    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * left**p.filter.law)
+    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * flow_share(left, p.filter.law))
     gq, gp = p.valve.flow_gain, p.valve.pressure_gain
     loss = gp * c.leakage / gq
     leak = 1.0 / (1.0 + loss)  # QJ = AJ XJ' + CLK P12, solved for P12

@@ -12,31 +12,23 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from pathlib import Path
 
+import dissect
 import pytest
 from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTES
-from vcan import dissect
-from vcan_host import APT_LINE, FOLDER, REQUIRED, guest_missing, in_guest, kernel_has_vcan0
+from vcan_host import FOLDER, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
 
 CYCLIC = (0x080, 0x182, 0x183, 0x202, 0x283)
 HEARTBEATS = {0x701: "heartbeat of 1", 0x702: "heartbeat of 2", 0x703: "heartbeat of 3"}
 SERVICES = {0x000: "NMT", 0x080: "SYNC", 0x603: "SDO request", 0x583: "SDO answer", **HEARTBEATS}
 
 
-def unavailable(reason: str) -> None:
-    """Skip, or fail where CI must not skip."""
-    message = f"{reason}; {APT_LINE}"
-    if REQUIRED:
-        pytest.fail(message)
-    pytest.skip(message)
-
-
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the bus tests and the preflight run left what they found."""
     if not kernel_has_vcan0() and guest_missing():
-        unavailable(guest_missing())
+        skip_or_fail(guest_missing())
     if shutil.which("candump") is None:
-        unavailable("candump is missing")
+        skip_or_fail("candump is missing")
     folder = tmp_path_factory.mktemp("vcan")
     parts = ["preflight"] if kernel_has_vcan0() else ["bus", "preflight"]  # with a vcan0 here the bus tests ran here
     done = in_guest(sys.executable, FOLDER / "inside.py", folder, *parts)
@@ -106,7 +98,7 @@ def test_wireshark_decodes_every_frame(
 ) -> None:
     """tshark's CANopen dissector finds every service, counts the same frames, and calls none malformed."""
     if shutil.which("tshark") is None:
-        unavailable("tshark is missing")
+        skip_or_fail("tshark is missing")
     rows = dissect.tshark(out / "candump.log")
     assert [row for row in rows if row.malformed or not row.canopen] == []
     counts = Counter(row.cob_id for row in rows)
@@ -119,7 +111,7 @@ def test_wireshark_decodes_every_frame(
 def test_dissector_tells_a_broken_frame(tmp_path: Path) -> None:
     """The check above can fail: a cut SDO request is called malformed, a good heartbeat is not."""
     if shutil.which("tshark") is None:
-        unavailable("tshark is missing")
+        skip_or_fail("tshark is missing")
     log = tmp_path / "broken.log"
     log.write_text("(1.000000) vcan0 703#05\n(1.000100) vcan0 603#400010000000\n")
     good, bad = dissect.tshark(log)

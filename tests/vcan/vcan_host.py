@@ -6,14 +6,25 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from typing import NoReturn
+
+import pytest
 
 from rig.network.bus import socketcan_problem
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent.parent
 GUEST = FOLDER / "guest.sh"
-APT_LINE = "apt-get install user-mode-linux kmod iproute2 can-utils tshark"
+APT_LINE = "apt-get install user-mode-linux kmod iproute2 can-utils tshark gcc libc6-dev"
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1"  # then nothing about vcan may be skipped
+
+
+def skip_or_fail(reason: str) -> NoReturn:
+    """Skip the test, or fail it where CI must not skip, and say what to install."""
+    message = f"{reason}; {APT_LINE}"
+    if REQUIRED:
+        pytest.fail(message)
+    pytest.skip(message)
 
 
 @functools.cache
@@ -24,7 +35,7 @@ def kernel_has_vcan0() -> bool:
 
 @functools.cache
 def guest_missing() -> str:
-    """What keeps the guest from booting, in one line; empty if it can."""
+    """Why the guest does not work, in one line; empty if it does. Boots it, if it has not yet since the machine did."""
     if shutil.which("bash") is None:
         return "guest.sh: bash is missing"
     return subprocess.run(["bash", str(GUEST), "--check"], capture_output=True, text=True).stderr.strip()

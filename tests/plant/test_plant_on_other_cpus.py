@@ -1,0 +1,80 @@
+"""The plant gives the same bits on every x86-64 CPU: commands, `simulate`, `Actuator`, lanes, and interpreted code."""
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import other_cpus
+import pytest
+from places import ROOT
+
+COMPILE = """
+from plant.compile import compiled
+def double(x):
+    return x + x
+compiled(double)(1.5)
+"""
+
+
+@pytest.fixture(scope="module")
+def hashes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
+    """CPU to case to hash."""
+    answers = other_cpus.on_each_cpu("cpu_plant_cases.py", folder=tmp_path_factory.mktemp("cpus"))
+    assert len(answers) >= 2
+    return answers
+
+
+def test_every_case_has_the_same_bits_on_every_cpu(hashes: dict[str, dict[str, str]]) -> None:
+    """One hash a case, whatever vector code, fused multiply-add and library functions there are."""
+    here = hashes["this CPU"]
+    assert len(here) >= 8 and len(set(here.values())) == len(here)
+    for cpu, cases in hashes.items():
+        assert cases == here, cpu
+
+
+def test_interpreted_is_compiled(hashes: dict[str, dict[str, str]]) -> None:
+    """The first cycles of the two agree."""
+    import cpu_plant_cases as cases
+
+    model = cases.at_work(cases.SOME)
+    fast, plain = cases.actuator(model, True), cases.actuator(model, False)
+    assert (fast[:len(plain)] == plain).all()
+
+
+def test_the_settings_reach_the_libraries(tmp_path: Path) -> None:
+    """Without them nothing above would be tested: the machine code, and NumPy's and the C library's own exp, change."""
+    program = tmp_path / "seen.py"
+    program.write_text(SEEN)
+    answers = other_cpus.on_each_cpu(str(program), folder=tmp_path)
+    here, oldest = answers["this CPU"], answers["no vector code beyond SSE2, no FMA"]
+    assert oldest["cpu"] == "generic" and oldest["features"] == "" and oldest["numpy"] == []
+    if here["numpy"]:
+        assert here["cpu"] != "generic" and "fma" in here["features"]
+        assert here["exp"] != oldest["exp"], "the C library's exp does not depend on the CPU any more"
+
+
+SEEN = """
+import hashlib, json, math
+import numpy as np
+from numba.core.registry import cpu_target
+codegen = cpu_target.target_context.codegen()
+core = np._core._multiarray_umath
+print(json.dumps({
+    "cpu": codegen._get_host_cpu_name(), "features": codegen._get_host_cpu_features(),
+    "numpy": [name for name in core.__cpu_dispatch__ if core.__cpu_features__[name]],
+    "exp": hashlib.sha256(np.array([math.exp(-5.0 * x) for x in np.linspace(0.0, 1.0, 100000)])).hexdigest()}))
+"""
+
+
+def test_machine_code_of_another_cpu_is_not_taken_from_the_cache(tmp_path: Path) -> None:
+    """One folder serves all: a setting that is new compiles, one that was there loads."""
+    def compiled_functions(changes: dict[str, str]) -> int:
+        environment = {**os.environ, "EHA_RIG_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT), **changes}
+        subprocess.run([sys.executable, tmp_path / "program.py"], env=environment, check=True)
+        return len(list((tmp_path / "cache").rglob("*.nbc")))
+
+    (tmp_path / "program.py").write_text(COMPILE)
+    generic = {"NUMBA_CPU_NAME": "generic"}
+    assert [compiled_functions(changes) for changes in ({}, generic, {}, generic)] == [1, 2, 2, 2]

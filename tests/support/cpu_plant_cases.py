@@ -1,0 +1,79 @@
+"""A program: hashes of what the plant computes, one a case, as JSON. Run by test_plant_on_other_cpus.py."""
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+from physics_cases import PREFLIGHT
+
+from plant import Actuator, Model, functions, simulate
+from plant.effects import CATALOGUE
+from plant.lanes import Lanes
+from plant.profile import build
+from plant.segments import Chirp, Multisine, Points, Ramp, Sine
+
+SHORT = PREFLIGHT[3800:4400]  # a ramp: the ram sticks and slips
+SWING = 3e-3 * functions.sin_of_turns(np.arange(600) / 200.0)
+LOAD = np.linspace(0.0, 3e3, len(SHORT))
+SOME = ("filter_clogging", "null_bias", "presliding", "stribeck", "orifice_root", "current_noise")
+EVERY = tuple(name for name, effect in CATALOGUE.items() if not effect.base and name != "spool_underlap")  # or overlap
+
+
+def at_work(names: tuple[str, ...]) -> Model:
+    """The nominal plant with these effects at the sizes that a fit starts from."""
+    model = Model()
+    for name in names:
+        effect = CATALOGUE[name]
+        model = model.replace(dict(effect.starts[0]) if effect.starts else {"current_noise.hum": 2e-4})
+    return model
+
+
+def print_hashes() -> None:
+    """One object on standard output: case to hash."""
+    some, bare = at_work(SOME), Model().replace({"filter.clogging": 0.3})
+    cases = {
+        "commands": command(),
+        "simulate": np.column_stack(simulate(bare, PREFLIGHT, seed=3)),
+        "simulate, effects": np.column_stack(simulate(some, SHORT, LOAD, seed=4)),
+        "Actuator, effects": actuator(some, True),
+        "interpreted simulate, every effect": np.column_stack(
+            simulate(at_work(EVERY), SWING[:40], steps=5, fast=False)),
+        "interpreted Actuator, effects": actuator(some, False),
+        "lanes, closed loop": lanes(bare, 40).closed_loop(sizes(40), SHORT, LOAD),
+        "lanes, replay, effects": lanes(some, 20).replay(sizes(20), 5.0 * SWING, LOAD, SWING, 2.0),
+    }
+    hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}
+    print(json.dumps({name: found.hexdigest() for name, found in hashes.items()}))
+
+
+def command() -> np.ndarray:
+    """Every kind of wave."""
+    segments = [Sine(amplitude=2e-3, frequency=1.7, time=2.0), Ramp(to=1e-3, time=0.3),
+                Chirp(amplitude=1e-3, f0=1.0, f1=31.0, fade=20.0, time=3.0),
+                Multisine(amplitude=1e-4, frequencies=tuple(map(float, range(1, 40))), time=3.0),
+                Points(points=((0.3, 1e-3), (0.7, -1e-3)))]
+    return build(segments).command
+
+
+def actuator(model: Model, fast: bool) -> np.ndarray:
+    """Readings and state of a plant that is driven cycle by cycle."""
+    plant, rows = Actuator(model, seed=5, steps=10, fast=fast), []
+    for k in range(200 if fast else 20):
+        rows.append([*plant.sample(), *plant._flat.tolist()])
+        plant.advance(float(SWING[k]), float(LOAD[k]))
+    return np.array(rows)
+
+
+def lanes(model: Model, runs: int) -> Lanes:
+    """`runs` side by side."""
+    return Lanes(model, ["filter.clogging", "spool.static_friction", "jack.damping"], steps=10)
+
+
+def sizes(runs: int) -> np.ndarray:
+    """Their parameters."""
+    return np.random.default_rng(6).uniform([0.0, 5.0, 1e3], [0.6, 40.0, 9e3], (runs, 3))
+
+
+if __name__ == "__main__":
+    print_hashes()
