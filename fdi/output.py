@@ -40,7 +40,6 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
 
 def rendered(template: str, **content: Any) -> str:
     """A page of this package, `template` on top of page.html, as text; what is put in is escaped."""
-    from jinja2 import Environment, PackageLoader
+    from fdi.report.html import load_templates
 
-    pages = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return pages.get_template(template).render(**content)
+    return load_templates().get_template(template).render(**content)

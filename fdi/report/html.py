@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def render_html(report: Report) -> str:
     """The page of a report as text. Everything in the report is escaped but the figures, which are SVG."""
     sections = report.select_sections(Medium.PAGE)
-    return _templates().get_template("page.html").render(
+    return load_templates().get_template("page.html").render(
         report=report, sections=sections, page=Medium.PAGE, title=report.title, verdict=report.verdict,
         mood=report.mood, why=report.sentence, facts=report.facts, notes=report.notes)
 
@@ -32,7 +32,8 @@ def write_html(report: Report, path: str | Path, option: str = "--out") -> None:
 
 
 @cache
-def _templates() -> Environment:
+def load_templates() -> Environment:
+    """The page templates of this package with their filters; what is put in is escaped."""
     from jinja2 import Environment, PackageLoader
 
     templates = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True,
