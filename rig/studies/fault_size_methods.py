@@ -1,12 +1,14 @@
 """Other ways to the fault sizes, one table: what each finds of a trace, its error, its simulations, its time."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.progress import Progress
+from fdi.report.numbers import NO_NUMBER, format_digits
+from fdi.report.report import Column, Section, Table
 from plant.errors import InputError
 from rig.network.clock import WallClock
 
@@ -69,3 +71,25 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 def _known(x: float) -> float | None:
     return x if x == x else None
+
+
+def build_methods_section(rows: Sequence[Row]) -> Section:
+    """A table of the methods: what each finds, what it leaves, its errors on known units, and what it costs."""
+    titles = (("Kintas", ""), ("FSS", "N"), ("residual", "floors"), ("Kintas error", ""), ("FSS error", "N"),
+              ("levels right", ""), ("simulations", ""), ("time", "s"))
+    columns = [Column("method"), *(Column(title, unit, "right") for title, unit in titles)]
+    cells = []
+    for row in rows:
+        sizes = [_format_known(row.kintas), _format_known(row.fss)]
+        if row.kintas is None and row.levels:
+            sizes = list(row.levels.values())
+        shares = " ".join(f"{100 * share:.0f}%" for share in row.right.values()) if row.right else NO_NUMBER
+        cells.append([row.method, *sizes, _format_known(row.left), _format_known(row.error_kintas),
+                      _format_known(row.error_fss), shares, str(row.simulations), f"{row.seconds:.1f}"])
+    return Section("Other methods", [Table(
+        columns, cells, "Residual: RMS in units of the noise floor. Errors (RMS) and share of right levels (clogging, "
+                        "friction): on simulated units that no training used.")])
+
+
+def _format_known(x: float | None) -> str:
+    return NO_NUMBER if x is None else format_digits(x)

@@ -2,24 +2,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
+    """Add the options of `rig report`."""
     parser.add_argument("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: report.html beside the trace)."""
-    from fdi.report.run_page import write_report
+    from fdi.report.report import Report
+    from fdi.report.run_report import write_run_page
+    from rig.cli.answer import show_answer
 
     source = Path(args.trace)
     out = Path(args.out) if args.out is not None else (source if source.is_dir() else source.parent) / "report.html"
-    write_report(source, out)
-    if args.json:
-        print(json.dumps({"report": str(out)}))
-    elif not args.quiet:
-        print(out)
+    write_run_page(source, out)
+    show_answer(Report("report", str(source), sentence=str(out), data={"report": str(out)}), args)
     return 0

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,74 +12,121 @@ from rig.cli import options
 
 if TYPE_CHECKING:
     from fdi.progress import Progress
+    from fdi.report.report import Report
     from rig.run.job import Job
     from rig.run.outcome import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
+    """Add the options of `rig run`."""
     add = parser.add_argument
-    add("sequence", nargs="?", metavar="SEQUENCE", help="a .toml file, or the name of a shipped one (preflight)")
+    add("sequence", nargs="?", metavar="SEQUENCE",
+        help="test sequence: a .toml file, or the name of a shipped one (default: preflight)")
     options.add_model(parser)
-    parser.set_defaults(seed=None)  # so that one given beside --from is noticed
+    parser.set_defaults(seed=None)  # None: not given; --from takes the seed of the log
     add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
-        help="virtual: embedded in this process (default); socketcan:can0, udp_multicast, ...")
+        help="virtual: the embedded bus in this process (default); or socketcan:can0, udp_multicast, ...")
     add("--pace", choices=("lockstep", "realtime"), default=None,
-        help="lockstep: virtual time, repeatable (default); realtime: the wall clock")
+        help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time")
     add("--controller", choices=("builtin", "external"), default=None,
-        help="whose firmware is node 2 (default: builtin)")
+        help="firmware of node 2: the reference firmware (builtin, default), or your own on the bus (external)")
     add("--plant", choices=("auto", "builtin", "external"), default=None,
-        help="node 3: auto takes the one that answers on the bus, else starts one (default)")
+        help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)")
     add("--max-overruns", type=float, default=None, metavar="FRACTION",
-        help="real time: more overruns than this part of all cycles make the timing invalid (default 0.001)")
-    add("--fdi", action="store_true", help="then judge the servovalve as rig fdi does: a healthy nominal one expected")
-    add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run of this log")
+        help="largest share of overruns in a real-time run; more make its timing invalid (default 0.001)")
+    add("--fdi", action="store_true", help="also diagnose the servovalve like rig fdi, against a nominal unit")
+    add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run recorded in this log")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Run a sequence; results go to --out (default: a new folder in runs/)."""
-    from fdi.report.run_page import write_report
-    from rig.cli import show_run
+    from fdi.report.html import write_html
+    from fdi.report.run_report import build_run_report
+    from fdi.trace.trace import Trace
+    from rig.cli.answer import show_answer
+    from rig.cli.interruption import catch_signals
     from rig.network.bus import choose
     from rig.run.runner import run as do
 
-    job = repeated(args) if args.source else asked(args)
+    job = read_job(args.source, args) if args.source else build_job(args)
     bus, why = choose(job.bus if args.source and args.bus == "auto" else args.bus)
-    job = replaced(job, bus=bus)
-    folder = Path(args.out) if args.out else fresh_folder(Path("runs"), Path(job.sequence.name).stem)
-    silent = args.json or args.quiet
-    with show_run.progress(job, why, silent) as progress, show_run.stoppable() as stop:
-        outcome = do(job, folder, progress, stop)
+    job = replace_settings(job, bus=bus)
+    folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
+    with announce_run(job, why, is_silent=args.json or args.quiet) as progress, catch_signals() as is_to_stop:
+        outcome = do(job, folder, progress, is_to_stop)
         progress("report", 0.0)
-        write_report(folder / "trace.mcap", folder / "report.html")
+        report = build_run_report(Trace.read(folder / "trace.mcap", all=True))
+        write_html(report, folder / "report.html")
         if args.fdi:
-            outcome = diagnosed(outcome, progress)
-    with contextlib.suppress(BrokenPipeError):  # who does not read on has no bearing on the verdict
-        if args.json:
-            show_run.as_json(outcome)
-        elif not args.quiet:
-            show_run.outcome(outcome)
+            outcome = diagnose_run(outcome, progress)
+    with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
+        show_answer(add_outcome(report, outcome), args)
     return outcome.status
 
 
-def diagnosed(outcome: Outcome, progress: Progress) -> Outcome:
-    """The outcome with what `rig fdi` says of its trace, in verdict.json as well; the run's own verdict stays."""
+@contextlib.contextmanager
+def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
+    """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
+    from rig.cli.progress_bar import show_progress
+
+    is_announced = is_silent
+    with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
+        def announce(stage: str, share: float) -> None:
+            nonlocal is_announced
+            if not is_announced:  # not before there is a bus and a place for the results: an error is one line
+                is_announced = True
+                print(f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}")
+            update(stage, share)
+
+        yield announce
+
+
+def add_outcome(report: Report, outcome: Outcome) -> Report:
+    """The report of a run's trace with what only the run knows: its speed, lost frames, where the results are."""
+    from fdi.report.report import Line, Medium, Section
+
+    timing = outcome.timing
+    if outcome.job.realtime:
+        late = timing["lateness_us"]
+        text = (f"{timing['cycles']} cycles, {timing['overruns']} overruns; lateness p50 {late['p50']:g}, "
+                f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['scheduler']})")
+    else:
+        text = f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time"
+    lines = [Line("timing", text)]
+    missing = [f"{name.replace('_', ' ')} {count}" for name, count in outcome.counters.items() if count]
+    if missing:
+        lines.append(Line("missing", ", ".join(missing)))
+    if outcome.fdi:
+        lines.append(Line("servovalve", outcome.fdi["sentence"]))
+    return replace(report, sections=[*report.sections, Section("Run", lines, medium=Medium.TERMINAL)],
+                   files=[("results", f"{outcome.folder}/ trace.mcap, verdict.json, report.html")],
+                   data=outcome.to_json())
+
+
+def diagnose_run(outcome: Outcome, progress: Progress) -> Outcome:
+    """The outcome with the answer of `rig fdi`, in verdict.json as well; the run's own verdict stays."""
     from fdi.diagnosis.diagnosis import diagnose
-    from fdi.report.diagnosis_text import to_json
+    from fdi.report.diagnosis_report import collect_data
+    from fdi.report.json import to_plain
     from fdi.trace.trace import Trace
     from plant import InputError
 
     try:
-        found = to_json(diagnose(Trace.read(outcome.folder), progress=progress, source=str(outcome.folder)))
-    except InputError as error:  # a sequence too short to tell, say
-        found = {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
-    told = replace(outcome, fdi=found)
-    told.save()
-    return told
+        diagnosis = diagnose(Trace.read(outcome.folder), progress=progress, source=str(outcome.folder))
+        answer = to_plain(collect_data(diagnosis))
+    except InputError as error:  # for example a sequence that is too short
+        answer = {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
+    diagnosed = replace(outcome, fdi=answer)
+    diagnosed.save()
+    return diagnosed
 
 
-def asked(args: argparse.Namespace) -> Job:
-    """The job the options describe; the sequence's own model choice comes first, --model and --set on top."""
+def build_job(args: argparse.Namespace) -> Job:
+    """The job that the options describe; --model and --set override the sequence's own model.
+
+    Raises:
+        InputError: a sequence, model or value that cannot be used.
+    """
     from plant import InputError, load_model
     from rig.run.job import Job
     from rig.sequences import load_sequence
@@ -95,35 +143,39 @@ def asked(args: argparse.Namespace) -> Job:
     if args.controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
     job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=tuple(args.effects))
-    return replaced(job, pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
+    return replace_settings(job, pace=args.pace, controller=args.controller, plant=args.plant,
+                            max_overruns=args.max_overruns)
 
 
-def repeated(args: argparse.Namespace) -> Job:
-    """The job of a log; what only this machine can know (bus, pace, who the controller is) may be asked for anew."""
+def read_job(source: Path, args: argparse.Namespace) -> Job:
+    """The job recorded in a log, to repeat it; bus, pace, controller and plant may be given anew.
+
+    Raises:
+        InputError: no log of a run, or options that would change the job.
+    """
     from plant import InputError
     from rig.run.job import repeat
 
     if args.sequence or args.set or args.model or args.effects or args.seed is not None:
-        raise InputError("--from", str(args.source), "no SEQUENCE, --model, --set, --seed or --effects: the log has "
-                         "them")
-    log = args.source / "trace.mcap" if args.source.is_dir() else args.source
+        raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed or --effects: the log has them")
+    log = source / "trace.mcap" if source.is_dir() else source
     if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
         raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
-    return replaced(repeat(args.source), pace=args.pace, controller=args.controller, plant=args.plant,
-                    max_overruns=args.max_overruns)
+    return replace_settings(repeat(source), pace=args.pace, controller=args.controller, plant=args.plant,
+                            max_overruns=args.max_overruns)
 
 
-def replaced(job: Job, **given: object) -> Job:
-    """The job with the settings that were given."""
+def replace_settings(job: Job, **given: object) -> Job:
+    """The job with the settings that are not None."""
     from dataclasses import replace
     from typing import Any
 
-    said: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
-    return replace(job, **said)
+    settings: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    return replace(job, **settings)
 
 
-def fresh_folder(parent: Path, name: str) -> Path:
-    """A folder that was not there: parent/name, name-2, name-3, ... Made at once, so that no two runs take it."""
+def make_folder(parent: Path, name: str) -> Path:
+    """Make a new folder: parent/name, else name-2, name-3, ... Made at once, so that no two runs take it."""
     from itertools import count
 
     from plant import InputError

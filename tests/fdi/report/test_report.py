@@ -17,7 +17,8 @@ import pytest
 from synthetic_run import record
 
 from fdi.report import drawing, figures
-from fdi.report.run_page import render, write_report
+from fdi.report.html import render_html
+from fdi.report.run_report import build_run_report, write_run_page
 from fdi.report.run_verdict import verdict
 from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
@@ -32,7 +33,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def page(log: Path) -> str:
-    return render(Trace.read(log, all=True))
+    return render_run(Trace.read(log, all=True))
+
+
+def render_run(trace: Trace) -> str:
+    return render_html(build_run_report(trace))
 
 
 class _Page(HTMLParser):
@@ -83,7 +88,7 @@ def test_it_says_what_the_trace_says(page: str) -> None:
 def test_text_of_the_trace_is_no_html(log: Path) -> None:
     trace = Trace.read(log, all=True)
     nasty = "<script>alert(1)</script>"
-    page = render(replace(trace, checks=(trace.checks[0]._replace(name=nasty, detail=nasty),),
+    page = render_run(replace(trace, checks=(trace.checks[0]._replace(name=nasty, detail=nasty),),
                           provenance={"sequence": nasty, "source": nasty}, attachments={nasty: nasty.encode()}))
     assert "<script>" not in page
 
@@ -91,12 +96,13 @@ def test_text_of_the_trace_is_no_html(log: Path) -> None:
 @pytest.mark.parametrize(("status", "mood"), [("PASS", "good"), ("INVALID_TIMING", "doubtful"), ("ABORTED", "bad")])
 def test_verdict_of_the_run_comes_first(log: Path, status: str, mood: str) -> None:
     trace = Trace.read(log)
-    page = render(replace(trace, provenance={**trace.provenance, "verdict.verdict": status, "verdict.why": "because"}))
+    said = {**trace.provenance, "verdict.verdict": status, "verdict.why": "because"}
+    page = render_run(replace(trace, provenance=said))
     assert f'<div class="verdict {mood}">{status}</div>' in page and "because" in page
 
 
 def test_an_aborted_run_says_why_and_what_is_missing(aborted: Path) -> None:
-    page = render(Trace.read(aborted, all=True))
+    page = render_run(Trace.read(aborted, all=True))
     head, text = page[:page.index("</header>")], " ".join(_Page(page).text.split())
     assert ">ABORTED<" in head and "guard 'ram far out' was passed by xj" in html.unescape(head)
     assert "missing samples, marked red below the lines: 45 of xj, cor, p12; 300 of xs (of 2871)" in text
@@ -107,9 +113,11 @@ def test_an_aborted_run_says_why_and_what_is_missing(aborted: Path) -> None:
 
 
 def test_a_real_run_has_a_report(preflight: Path) -> None:
-    text = " ".join(_Page((preflight / "report.html").read_text(encoding="utf-8")).text.split())
+    page = (preflight / "report.html").read_text(encoding="utf-8")
+    text = " ".join(_Page(page).text.split())
     assert text.startswith("PASS · Preflight") and "17 of 17" in text and "missing" not in text.split("Signals")[0]
-    assert text.count("✓ pass") == 17 and "section main: rest" in text.replace("section", "section ").replace("  ", " ")
+    assert page.count('<td class="is-good ">pass</td>') == 17
+    assert "section main: rest" in text.replace("section", "section ").replace("  ", " ")
 
 
 def test_a_late_run_says_how_late(log: Path) -> None:
@@ -150,14 +158,14 @@ def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
     recover(tmp_path / "cut.mcap", tmp_path / "salvaged.mcap")
     (tmp_path / "short.csv").write_text("t,com,xj,cor\n0,0,,0\n0.001,0,1e-6,0\n0.004,0,1e-6,0\n")
     for name in ("aborted.mcap", "salvaged.mcap", "short.csv"):
-        write_report(tmp_path / name, tmp_path / "report.html")
+        write_run_page(tmp_path / name, tmp_path / "report.html")
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         _Page(page)
         assert ("salvaged" in page) == (name == "salvaged.mcap")
     assert "NOT JUDGED" in page and "2 cycles missing between 0.001 and 0.004 s" in page
     assert "Cycle timing" not in page
     with pytest.raises(InputError, match="can be written"):
-        write_report(tmp_path / "short.csv", tmp_path / "no" / "report.html")
+        write_run_page(tmp_path / "short.csv", tmp_path / "no" / "report.html")
 
 
 @pytest.mark.parametrize("phases", [[1], [0], [1, 1], [0, 1, 2]], ids=str)
@@ -174,7 +182,7 @@ def test_the_shortest_runs_draw_without_a_warning(tmp_path: Path, phases: list[i
     recorder.close()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        render(Trace.read(tmp_path, all=True))
+        render_run(Trace.read(tmp_path, all=True))
 
 
 def test_thinned_line_keeps_its_extremes() -> None:
@@ -198,7 +206,7 @@ def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
         pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
     from matplotlib.image import imread
 
-    write_report(log, tmp_path / "report.html")
+    write_run_page(log, tmp_path / "report.html")
     words = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
              f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", (tmp_path / "report.html").as_uri()]
     subprocess.run(words, capture_output=True, check=True, timeout=120)
@@ -214,4 +222,4 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
               Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
     faulty = replace(trace, events=events)
     assert figures.faults(faulty) == [("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
-    assert "lost drive" in render(faulty) and figures.signals(faulty) != figures.signals(trace)
+    assert "lost drive" in render_run(faulty) and figures.signals(faulty) != figures.signals(trace)

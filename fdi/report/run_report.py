@@ -1,0 +1,205 @@
+"""The report of a run: verdict, checks, signals over time, cycle timing, events, NMT states, provenance."""
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from fdi.output import writable
+from fdi.report.html import write_html
+from fdi.report.report import (
+    Cell,
+    Column,
+    Figure,
+    Item,
+    Line,
+    Listing,
+    Medium,
+    Mood,
+    Report,
+    Section,
+    Table,
+)
+from fdi.report.run_verdict import verdict
+from fdi.trace.trace import Check, Event, Trace
+
+MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad"}
+EVENT_MOODS: dict[str, Mood] = {"ERROR": "bad", "WARN": "doubtful"}
+
+
+def write_run_page(source: str | Path, out: str | Path) -> None:
+    """Read a trace (see Trace.read) and write its report as one HTML file.
+
+    Raises:
+        InputError: a trace that cannot be read, or a file that cannot be written.
+    """
+    trace = Trace.read(source, all=True)
+    write_html(build_run_report(trace), writable(out, "--out", source=source))
+
+
+def build_run_report(trace: Trace) -> Report:
+    """Report on a trace of `Trace.read(..., all=True)`: of a run with its checks, or of any other recording."""
+    word, reason = verdict(trace)
+    return Report(
+        command="run",
+        title=trace.provenance.get("sequence", trace.provenance.get("source", "trace")),
+        verdict=word, mood=MOODS.get(word, "neutral"),
+        sentence=reason or ("Every check passed." if trace.checks else "The trace has no checks."),
+        facts=_list_facts(trace), notes=_list_notes(trace),
+        sections=[Section("Checks", _tabulate_checks(trace.checks)),
+                  Section("Signals", [_draw_signals(trace)]),
+                  Section("Cycle timing", _show_timing(trace), medium=Medium.PAGE),
+                  Section("Events", _tabulate_events(trace.events)),
+                  Section("NMT states", _tabulate_nmt(trace), medium=Medium.PAGE),
+                  Section("Provenance", _list_provenance(trace), medium=Medium.PAGE)])
+
+
+def _list_facts(trace: Trace) -> list[tuple[str, str]]:
+    main = int((trace.phase == 1).sum())
+    facts = [("main phase", f"{main * trace.period:.3f} s, {main} cycles")]
+    if trace.checks:
+        facts.append(("checks passed", f"{sum(check.passed for check in trace.checks)} of {len(trace.checks)}"))
+    named = ((name, trace.provenance.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host"))
+    return [*facts, *((name, text) for name, text in named if text)]
+
+
+def _list_notes(trace: Trace) -> list[str]:
+    """What a reader must know before trusting the plots."""
+    notes = [*trace.notes, *describe_gaps(trace), *describe_missing_samples(trace)]
+    if "recovered.reason" in trace.provenance:
+        notes.append(f"this log was salvaged after its writer died: {trace.provenance['recovered.reason']}")
+    return notes
+
+
+def describe_gaps(trace: Trace, most: int = 5) -> list[str]:
+    """A sentence for each of the first `most` gaps, and one for the rest."""
+    lines = [f"{gap.cycles} cycles missing between {gap.t0:.3f} and {gap.t1:.3f} s" for gap in trace.gaps[:most]]
+    rest = trace.gaps[most:]
+    if rest:
+        lines.append(f"and {sum(gap.cycles for gap in rest)} cycles in {len(rest)} more gaps")
+    return lines
+
+
+def describe_missing_samples(trace: Trace) -> list[str]:
+    """At most one sentence: how many samples of which signals are missing; a load is known or not, never sampled."""
+    signals_of_count: dict[int, list[str]] = {}
+    for name in trace.signals:
+        if name != "load":
+            missing = int(np.isnan(trace.column(name)).sum())
+            signals_of_count.setdefault(missing, []).append(name)
+    parts = [f"{count} of {', '.join(names)}" for count, names in signals_of_count.items() if count]
+    return [f"missing samples, marked red below the lines: {'; '.join(parts)} (of {len(trace)})"] if parts else []
+
+
+def _tabulate_checks(checks: tuple[Check, ...]) -> list[Item]:
+    if not checks:
+        return []
+    columns = [Column("check"), Column("kind", medium=Medium.PAGE), Column(""), Column("measured", align="right"),
+               Column("limits", align="right"), Column("unit"), Column("window", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = [
+        [check.name, Cell(_name_measure(check), "muted"), Cell("pass", "good") if check.passed else Cell("FAIL", "bad"),
+         Cell(_format_value(check), is_strong=True), format_limits(check.low, check.high),
+         "" if check.unit == "1" else check.unit, Cell(_format_window(check), "muted")] for check in checks]
+    if any(check.detail for check in checks):
+        columns.append(Column("remark"))
+        rows = [[*row, Cell(check.detail, "muted")] for row, check in zip(rows, checks, strict=True)]
+    return [Table(columns, rows)]
+
+
+def _name_measure(check: Check) -> str:
+    """The kind of a check and its signal: "steady error of xj"."""
+    return " of ".join(word for word in (check.kind.replace("_", " "), check.signal) if word)
+
+
+def _format_value(check: Check) -> str:
+    return "not measurable" if math.isnan(check.value) else f"{check.value:.4g}"
+
+
+def format_limits(low: float, high: float) -> str:
+    """The limits of a check.
+
+    >>> format_limits(float("nan"), 5.0), format_limits(1.0, 2.0), format_limits(1.0, float("nan"))
+    ('<= 5', '1 .. 2', '>= 1')
+    """
+    if math.isnan(low):
+        return f"<= {high:g}"
+    if math.isnan(high):
+        return f">= {low:g}"
+    return f"{low:g} .. {high:g}"
+
+
+def _format_window(check: Check) -> str:
+    if math.isnan(check.t0):
+        return "not reached" if math.isnan(check.value) else "whole run"
+    return f"{check.t0:.3f} – {check.t1:.3f} s"
+
+
+def _draw_signals(trace: Trace) -> Figure:
+    def draw() -> str:
+        from fdi.report import figures  # here: matplotlib takes half a second to import
+
+        return figures.signals(trace)
+
+    return Figure("Command, ram position, following error, current, pressure difference and spool position over time. "
+                  "Shaded: ramps (blue) and dynamic sections (violet) of the command, injected faults (orange). The "
+                  "bars at the bottom are the windows of the checks, green for passed and red for failed; a check "
+                  "whose window was not reached has no bar.", draw)
+
+
+def _show_timing(trace: Trace) -> list[Item]:
+    rows = []
+    for name, values in (("SYNC lateness", trace.timing.lateness), ("controller's response", trace.timing.response),
+                         ("bench's own work", trace.timing.work)):
+        known = values[~np.isnan(values)] * 1e6
+        if len(known):
+            rows.append([name, *(f"{x:.0f}" for x in np.percentile(known, [50, 99, 99.9])), f"{known.max():.0f}"])
+    if not rows:
+        return []
+
+    def draw() -> str:
+        from fdi.report import figures
+
+        return figures.timing(trace)
+
+    columns = [Column("wall clock"), *(Column(name, "µs", "right") for name in ("p50", "p99", "p99.9", "max"))]
+    caption = "Number of cycles by duration, both axes logarithmic; the dotted line is the 99th percentile."
+    return [Figure(caption, draw),
+            Table(columns, rows, caption="p99 is the time that 99 of 100 cycles stay below."),
+            Line("overruns", f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}")]
+
+
+def _tabulate_events(events: tuple[Event, ...], most: int = 12) -> list[Item]:
+    """All events on the page; warnings and errors on the terminal, at most `most`."""
+    columns = [Column("t", "s", "right"), Column("level", medium=Medium.PAGE), Column("kind"), Column("event")]
+
+    def tabulate(chosen: list[Event]) -> list[list[Cell | str]]:
+        return [[format_time(event.t), Cell(event.level, EVENT_MOODS.get(event.level, "")), event.kind, event.text]
+                for event in chosen]
+
+    items: list[Item] = []
+    if events:
+        items.append(Table(columns, tabulate(list(events)), medium=Medium.PAGE))
+    notable = [event for event in events if event.level != "INFO"]
+    if notable:
+        items.append(Table(columns, tabulate(notable), terminal_rows=most, medium=Medium.TERMINAL))
+    return items
+
+
+def format_time(t: float) -> str:
+    """A time of a trace, s, with the milliseconds of its cycles."""
+    return f"{t:.3f}"
+
+
+def _tabulate_nmt(trace: Trace) -> list[Item]:
+    if not trace.nmt:
+        return []
+    rows = [[format_time(state.t), str(state.node), state.name] for state in trace.nmt]
+    return [Table([Column("t", "s", "right"), Column("node"), Column("state")], rows)]
+
+
+def _list_provenance(trace: Trace) -> list[Item]:
+    rows: list[list[Cell | str]] = [[Cell(name, "muted"), text] for name, text in sorted(trace.provenance.items())]
+    items: list[Item] = [Table([Column(""), Column("")], rows, is_list=True)] if rows else []
+    return [*items, *(Listing(data.decode("utf-8", "replace"), f"{name} ({len(data)} bytes)")
+                      for name, data in sorted(trace.attachments.items()))]
