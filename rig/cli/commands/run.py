@@ -68,6 +68,7 @@ def run_command(args: argparse.Namespace) -> int:
 def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
     """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
     from rig.cli.progress_bar import show_progress
+    from rig.cli.terminal import console
 
     is_announced = is_silent
     with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
@@ -75,7 +76,8 @@ def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
             nonlocal is_announced
             if not is_announced:  # not before there is a bus and a place for the results: an error is one line
                 is_announced = True
-                print(f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}")
+                text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
+                console().print(text, markup=False, soft_wrap=True)
             update(stage, share)
 
         yield announce
