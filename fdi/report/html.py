@@ -38,7 +38,7 @@ def load_templates() -> Environment:
 
     templates = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True,
                             lstrip_blocks=True)
-    templates.filters["groupby_kind"] = _group_by_kind
+    templates.globals["group_by_kind"] = _group_by_kind  # not a filter: page.html is compiled by other environments too
     return templates
 
 
