@@ -15,10 +15,10 @@ from fdi.discovery import explain
 from fdi.discovery.model_file import load
 from fdi.discovery.residual_pattern import pattern
 from fdi.discovery.runs import read
+from fdi.estimation.preparation import prepare_trace
 from fdi.estimation.replay import open_loop, residuals
 from fdi.report import explain_figures
 from fdi.report.drawing import STYLE, shorten_svg, to_svg
-from fdi.trace.cycles import readings
 from plant import Model
 from plant.effects import load_effects
 
@@ -36,9 +36,9 @@ def left_over(run: str, repeat: str, model: Model) -> str:
         axes = figure.subplots(3, 1, sharex=True)
         models = ((Model(), explain_figures.BEFORE, "nominal model"), (model, explain_figures.AFTER, "after rig add"))
         for which, colour, label in models:
-            cycles = readings(trace, which)[0]
-            rest = residuals(cycles, open_loop(cycles, which))
-            whole = len(cycles) // BLOCK * BLOCK
+            prepared = prepare_trace(trace, which)
+            rest = residuals(prepared, open_loop(prepared, which))
+            whole = len(prepared) // BLOCK * BLOCK
             t = np.arange(0, whole, BLOCK) * trace.period
             for ax, (name, title, scale) in zip(axes, SIGNALS, strict=True):
                 blocks = scale * rest[name][:whole].reshape(-1, BLOCK)
@@ -57,7 +57,7 @@ def main(folder: str) -> None:
     os.chdir(folder)
     runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
-    shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.trace.t)
+    shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for story, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),

@@ -56,7 +56,7 @@ PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
     "plant.effects": {"CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"},
     "fdi": {"Trace"},
-    "fdi.discovery": {"Explanation", "explain", "record"},
+    "fdi.discovery": {"Explanation", "explain"},
     "rig.device": {
         "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",
     },

@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise_floor import floors, from_data
-from fdi.estimation.repeats import aligned
-from fdi.estimation.replay import Columns, derivative, rms
-from fdi.trace.cycles import BRIDGED, Cycles, bridged
+from fdi.estimation.preparation import BRIDGED_ROWS
+from fdi.estimation.repeats import align_columns
+from fdi.estimation.replay import Columns, derivative
+from fdi.trace.columns import bridge_gaps, rms
+from fdi.trace.trace import Trace
 from plant.forced import flow_balance, force_balance
 from plant.model import Model
 
@@ -66,28 +68,28 @@ class Split(NamedTuple):
     winner: str  # "flow", "sensor", "either"
 
 
-def balance(c: Cycles, model: Model, replayed: Columns) -> Balance:
+def balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     """Flow and force of the jack from measured XS and P12; an XS that was not measured is the replay's."""
-    chosen = {name: getattr(c, name) if name in c.signals else replayed[name] for name in ("p12", "xs")}
-    (p12, lost), (xs, missing) = (bridged(chosen[name], BRIDGED) for name in ("p12", "xs"))
-    xj = bridged(c.xj, BRIDGED)[0]
-    seen = derivative(xj, max(5, round(MEAN / c.period) | 1), 1) / c.period
-    bad = lost | missing | ~c.usable
-    if "p12" not in c.signals:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
-        error = _force(c, model, p12, xj, seen)
+    chosen = {name: getattr(trace, name) if name in trace.outputs else replayed[name] for name in ("p12", "xs")}
+    (p12, lost), (xs, missing) = (bridge_gaps(chosen[name], BRIDGED_ROWS) for name in ("p12", "xs"))
+    xj = bridge_gaps(trace.xj, BRIDGED_ROWS)[0]
+    seen = derivative(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
+    bad = lost | missing | ~trace.usable
+    if "p12" not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
+        error = _force(trace, model, p12, xj, seen)
         p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
     bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
     sensed, speed = flow_balance(model, xs, p12, float(xj[0]))
-    lag = span(c.period)
-    way = gained(c.xj - sensed, lag)
+    lag = span(trace.period)
+    way = gained(trace.xj - sensed, lag)
     way[_any_within(bad, lag)] = np.nan
     dx = gained(xj, lag)
     there = ~np.isnan(way) & ~np.isnan(dx)
     power = float(np.sum(dx[there] ** 2))
     gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
     # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
-    known = speed * (1 + max(-0.2, min(gain, 0.2))) if "xs" in c.signals else seen
-    force = _force(c, model, p12, xj, known) if "p12" in c.signals else np.full(len(c), np.nan)
+    known = speed * (1 + max(-0.2, min(gain, 0.2))) if "xs" in trace.outputs else seen
+    force = _force(trace, model, p12, xj, known) if "p12" in trace.outputs else np.full(len(trace), np.nan)
     force[bad] = np.nan
     return Balance(way, force, gain, speed, sensed)
 
@@ -110,17 +112,17 @@ def _any_within(bad: Flags, rows: int) -> Flags:
     return out
 
 
-def _force(c: Cycles, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
-    takes, _, dynamic = force_balance(model, xj, speed, p12, c.load)
-    size = max(1, round(MEAN / c.period)) | 1
+def _force(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
+    takes, _, dynamic = force_balance(model, xj, speed, p12, trace.load)
+    size = max(1, round(MEAN / trace.period)) | 1
     kernel = np.ones(size) / size
     mean = np.convolve(speed, kernel, "same")
     noise = float(np.median(np.abs(np.diff(speed, 2)))) / 0.6745 / math.sqrt(6.0 * size)
-    seen = np.convolve(np.gradient(xj, c.period), kernel, "same")
+    seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
     direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
     direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
     turned = _any_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
-    turned |= np.roll(turned, -size) | ~_resolved(speed, c.period)
+    turned |= np.roll(turned, -size) | ~_resolved(speed, trace.period)
     out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
     return np.where((direction == 0.0) | turned, np.nan, out)
 
@@ -134,7 +136,7 @@ def _resolved(speed: Floats, period: float) -> Flags:
     return out
 
 
-def split(c: Cycles, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False) -> Split:
+def split(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False) -> Split:
     """How well an error of the flow and one of the sensor describe `b.way`; xs m, p12 Pa, (n,), as in the balance.
 
     `noisy`: the sensed position changes from sample to sample by more than its noise, as no flow can make it.
@@ -142,8 +144,8 @@ def split(c: Cycles, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: b
     The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
     whose noise is in the residual itself.
     """
-    lag, x = span(c.period), b.position
-    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * c.period for r in _rates(xs, p12)]
+    lag, x = span(trace.period), b.position
+    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _rates(xs, p12)]
     places = [x, b.speed, p12, *(play(x, width) for width in PLAYS)]
     there = ~np.isnan(b.way)
     columns = [gained(s, lag)[there] for s in (*rates, *places)]
@@ -214,7 +216,7 @@ class Jack(NamedTuple):
     gain: float  # by which the ram moves further than the flow says, as a fraction
 
 
-def jack(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Cycles, int, Columns]],
+def jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
          level: Mapping[str, float]) -> Jack | None:
     """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
 
@@ -223,30 +225,32 @@ def jack(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Cycles, 
     The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
     more, and what that changes is what noise does.
     """
-    b = balance(c, model, run)
+    b = balance(trace, model, run)
     found = {"way": b.way, "force": b.force}
     if repeats:
         others = [(late, balance(other, model, theirs)) for other, late, theirs in repeats]
-        pairs = [aligned({"way": o.way, "force": o.force}, late, len(c)) for late, o in others]
-        floor = {name: f.value for name, f in floors(found, pairs, c.period).items()}
+        pairs = [align_columns({"way": o.way, "force": o.force}, late, len(trace)) for late, o in others]
+        floor = {name: f.value for name, f in floors(found, pairs, trace.period).items()}
     else:
-        again = balance(noisier(c, level), model, run)
+        again = balance(noisier(trace, level), model, run)
         floor = {"way": rms(again.way - b.way), "force": rms(again.force - b.force)}
     floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
-    xs, p12 = (bridged(getattr(c, name) if name in c.signals else run[name], BRIDGED)[0] for name in ("xs", "p12"))
+    known = {name: getattr(trace, name) if name in trace.outputs else run[name] for name in ("xs", "p12")}
+    xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
     if (~np.isnan(b.way)).sum() < FEWEST or not floor.get("way", 0.0) > 0.0:
         return None
-    noisy = from_data(c.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
-    flow, sensor = shares(split(c, b, xs, p12, floor["way"], noisy), floor["way"])
-    flow = flow if "xs" in c.signals else max(flow, sensor)
-    told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and c.filled.mean() < SPARSE
+    noisy = from_data(trace.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
+    flow, sensor = shares(split(trace, b, xs, p12, floor["way"], noisy), floor["way"])
+    flow = flow if "xs" in trace.outputs else max(flow, sensor)
+    told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and trace.filled.mean() < SPARSE
     return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
 
 
-def noisier(c: Cycles, level: Mapping[str, float]) -> Cycles:
+def noisier(trace: Trace, level: Mapping[str, float]) -> Trace:
     """The trace with noise of each signal's level added, always the same."""
     rng = np.random.default_rng(0)
-    return replace(c, **{name: getattr(c, name) + size * rng.standard_normal(len(c)) for name, size in level.items()})
+    noisy = {name: trace.column(name) + size * rng.standard_normal(len(trace)) for name, size in level.items()}
+    return replace(trace, **noisy)  # type: ignore[arg-type]
 
 
 def ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,

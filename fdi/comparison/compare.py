@@ -11,20 +11,19 @@ from numpy.typing import NDArray
 from fdi.comparison import blocks, controller_block
 from fdi.comparison.localisation import Motion, Place, condition, motion, places, whole
 from fdi.comparison.residual_tests import Diagnosis, diagnose
-from fdi.estimation.noise_floor import Floor, floors, from_data
-from fdi.estimation.repeats import Repeat, aligned, matching
-from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, open_loop, read_noise, residuals, rms
+from fdi.estimation.noise_floor import Floor, floors, read_noise, sensor_floors
+from fdi.estimation.preparation import match_period, prepare_trace
+from fdi.estimation.repeats import Repeat, align_columns, find_repeat
+from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, measure_misfit, open_loop, residuals
 from fdi.estimation.tolerances import Scatter, scatter
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.cycles import Cycles, readings
+from fdi.trace.columns import rms
+from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
 from plant.model import Model
 
 Floats = NDArray[np.float64]
 
-UNITS = {"xj": "m", "p12": "Pa", "xs": "m"}
-NOISE = {"xj": "sensors.position_noise", "p12": "sensors.pressure_noise", "xs": "sensors.spool_noise"}
-FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
 LIMIT = 1.1  # floors, and three standard deviations of what is estimated from so many samples
 SECTION = 5.0  # standard deviations, that a single section may be above the floor: there are dozens
 BLOCK = 1.3  # floors, of a single block
@@ -61,7 +60,7 @@ class Comparison:
 
     source: str
     model: Model
-    cycles: Cycles
+    trace: Trace  # prepared for replay
     verdict: str  # WITHIN_FLOOR, MODEL_INCOMPLETE, CANNOT_TELL
     reason: str  # why it cannot tell, or ""
     signals: Mapping[str, Signal]
@@ -90,46 +89,36 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
         InputError: a trace, a repeat or a signal that cannot be used, in one line.
     """
     progress("reading", 0.0)
-    c, model = best_reading(trace, model, signals, source)
-    c, found = _in_step(c, model, controller_block.controller(c, model))
-    others = [matching(c, other, model, number) for number, other in enumerate(repeats, 1)]
+    trace = prepare_trace(trace, model, signals, source)
+    model = match_period(model, trace)
+    trace, found = _in_step(trace, model, controller_block.controller(trace, model))
+    others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
-    noise = sensors(c, model)
-    replay = checked(c, model, {name: f.value for name, f in noise.items()})
+    noise = sensor_floors(trace, model)
+    replay = checked(trace, model, {name: f.value for name, f in noise.items()})
     progress("repeats", 2 / STAGES)
-    runs = [(other, open_loop(other.cycles, model, replay.steps)) for other in others]
-    theirs = [aligned(residuals(other.cycles, run), other.late, len(c)) for other, run in runs]
-    floor = _blinder(noise, replay) | floors(replay.residual, theirs, c.period)
+    runs = [(other, open_loop(other.trace, model, replay.steps)) for other in others]
+    theirs = [align_columns(residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
+    floor = _blinder(noise, replay) | floors(replay.residual, theirs, trace.period)
     judged = {name: np.where(_left_out(replay), np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
-    closed, (free, speed) = closed_loop(c, model), drift(c, model)
+    closed, (free, speed) = closed_loop(trace, model), drift(trace, model)
     table = {name: _signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
     progress("blocks", 4 / STAGES)
-    ratios, parts = _blocks(c, model, replay.model, runs, table, found, noise)
+    ratios, parts = _blocks(trace, model, replay.model, runs, table, found, noise)
     progress("where", 5 / STAGES)
-    m, z2 = motion(c, replay.model), whole(judged, {name: f.value for name, f in floor.items()})
-    sections, when = places(c, z2, m, found.limit), condition(z2, m, found.limit)
-    verdict, reason = _verdict(table, sections, ratios, replay, c.period)
-    diagnoses = diagnose(c, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
+    m, z2 = motion(trace, replay.model), whole(judged, {name: f.value for name, f in floor.items()})
+    sections, when = places(trace, z2, m, found.limit), condition(z2, m, found.limit)
+    verdict, reason = _verdict(table, sections, ratios, replay, trace.period)
+    diagnoses = diagnose(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
     plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
-    scattered = scatter(c, model, {name: s.floor.value for name, s in table.items()}) if plant else None
+    scattered = scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
     progress("done", 1.0)
-    return Comparison(source, model, c, verdict, reason, table, found, ratios, parts, _named(ratios), tuple(sections),
-                      when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
-                      (*c.notes, *_notes(floor, replay, c)))
-
-
-def sensors(c: Cycles, model: Model) -> dict[str, Floor]:
-    """The floor without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
-    out = {}
-    for name in c.signals:
-        given, seen = model[NOISE[name]], from_data(c.measured(name))
-        given = read_noise(model, c.xj) if name == "xj" else given
-        found = Floor(given, "model") if given > 0.0 and seen.value < BLOCK * given else seen
-        out[name] = found._replace(value=max(found.value, FINEST[name]))
-    return out
+    return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, _named(ratios),
+                      tuple(sections), when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
+                      (*trace.notes, *_notes(floor, replay, trace)))
 
 
 def _blinder(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
@@ -145,7 +134,7 @@ def _left_out(replay: Replay) -> NDArray[np.bool_]:
 
 def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> Signal:
     limit = LIMIT + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
-    return Signal(name, UNITS[name], rms(residual), floor, rms(closed), replay.solver_error[name], limit)
+    return Signal(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
 
 
 def _spread(floor: Floor, samples: int) -> float:
@@ -153,58 +142,40 @@ def _spread(floor: Floor, samples: int) -> float:
     return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
 
 
-def best_reading(trace: Trace, model: Model, signals: Sequence[str] | None, source: str) -> tuple[Cycles, Model]:
-    """Of several ways to read the rows, the one that the model's replay fits best, and the model at its cycle."""
-    best: tuple[float, Cycles, Model] | None = None
-    ways = readings(trace, model, signals, source)
-    for c in ways:
-        own = model if c.period == model["controller.period"] else model.replace({"controller.period": c.period})
-        misfit = 0.0 if len(ways) == 1 else _misfit(c, own)
-        if best is None or misfit < best[0]:
-            best = (misfit, c, own)
-    assert best is not None
-    return best[1], best[2]
-
-
-def _misfit(c: Cycles, model: Model) -> float:
-    left = residuals(c, open_loop(c, model, 20))
-    return sum(math.log(rms(r)) for r in left.values()) / len(left)
-
-
-def _in_step(c: Cycles, model: Model, found: controller_block.Answer) -> tuple[Cycles, controller_block.Answer]:
+def _in_step(trace: Trace, model: Model, found: controller_block.Answer) -> tuple[Trace, controller_block.Answer]:
     """Columns that are cycles late in the file, set right; a firmware that answers late stays as it is."""
     com, xj = found.com_lag, found.xj_lag
     notes = []
     if xj:
-        moved = c.shifted(cor=-xj)
-        if _misfit(moved, model) < _misfit(c, model) + math.log(LAGGED):
-            c, com = moved, com - xj
+        moved = trace.with_delays(cor=-xj)
+        if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAGGED):
+            trace, com = moved, com - xj
             notes.append(f"Cor stands {_cycles(xj)} than the other columns: moved into step")
         else:
             notes.append(f"Cor fits the XJ {_cycles(-xj)}: the firmware answers late, or XJ is delayed on its way")
     if com:
-        c = c.shifted(com=com)
+        trace = trace.with_delays(com=com)
         notes.append(f"Com stands {_cycles(-com)} than the rest of the trace: moved into step")
-    return c.noted(*notes), found
+    return trace.with_notes(*notes), found
 
 
 def _cycles(n: int) -> str:
     return f"{abs(n)} cycle{'s' if abs(n) > 1 else ''} {'later' if n > 0 else 'earlier'}"
 
 
-def _blocks(c: Cycles, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
             table: Mapping[str, Signal], found: controller_block.Answer,
             noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, and the parts of the jack's."""
     signal = {name: s.ratio for name, s in table.items()}
-    pairs = [(other.cycles, other.late, theirs) for other, theirs in repeats]
-    level = {"xj": read_noise(model, c.xj)} | {name: f.value for name, f in noise.items()}
-    told = model.plant == BALANCED and {"p12", "xs"} & set(c.signals)
-    j = blocks.jack(c, model, run, pairs, level) if told else None
+    pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
+    level = {"xj": read_noise(model, trace.xj)} | {name: f.value for name, f in noise.items()}
+    told = model.plant == BALANCED and {"p12", "xs"} & set(trace.outputs)
+    j = blocks.jack(trace, model, run, pairs, level) if told else None
     answered = found.ratio if model.kind.controller else None
     if j is None:
         return blocks.ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
-    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in c.signals)
+    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
     return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
 
 
@@ -238,7 +209,7 @@ def _verdict(table: Mapping[str, Signal], sections: Sequence[Place], ratios: Map
     return "MODEL_INCOMPLETE", ""
 
 
-def _notes(floor: Mapping[str, Floor], replay: Replay, c: Cycles) -> list[str]:
+def _notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:
     """What a reader must know about the floor and about rows left out."""
     said = []
     apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
@@ -246,7 +217,7 @@ def _notes(floor: Mapping[str, Floor], replay: Replay, c: Cycles) -> list[str]:
     if apart:
         said.append(f"the error itself differs between the repeats, as stick-slip does, in floors: {', '.join(apart)}")
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED:
-        seconds = float(replay.undecided.sum()) * c.period
+        seconds = float(replay.undecided.sum()) * trace.period
         said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_hangs(replay)}")
     return said
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.cycles import Cycles, held, shift
+from fdi.trace.columns import hold_last, shift_rows
+from fdi.trace.trace import Trace
 from plant.effects import at
 from plant.model import Model, kernel
 
@@ -40,35 +41,35 @@ class Answer(NamedTuple):
         return self.error / self.floor
 
 
-def controller(c: Cycles, model: Model) -> Answer:
+def controller(trace: Trace, model: Model) -> Answer:
     """Compare; where it does not fit, look for the cycles that Com and XJ are late. NaN where firmware is unknown."""
     if not model.kind.controller:
-        return Answer(np.full(len(c), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
-    found = _compared(c, model, 0, 0)
+        return Answer(np.full(len(trace), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
+    found = _compared(trace, model, 0, 0)
     if found.ratio <= DISAGREES:
         return found
-    com, xj, gain = lags(c, model["controller.current_limit"])
+    com, xj, gain = lags(trace, model["controller.current_limit"])
     found = found._replace(gain=gain)
     if (com, xj) == (0, 0):
         return found
-    late = _compared(c, model, com, xj)
+    late = _compared(trace, model, com, xj)
     return late._replace(gain=gain) if late.error < BETTER * found.error else found
 
 
-def _compared(c: Cycles, model: Model, com: int, xj: int) -> Answer:
+def _compared(trace: Trace, model: Model, com: int, xj: int) -> Answer:
     limit = model["controller.current_limit"]
-    sensed = shift(c.xj, xj)
-    answers = firmware(model, shift(c.com, com), held(sensed))
-    residual = c.cor - answers
-    unknown = np.isnan(sensed) | ~c.usable
+    sensed = shift_rows(trace.xj, xj)
+    answers = firmware(model, shift_rows(trace.com, com), hold_last(sensed))
+    residual = trace.cor - answers
+    unknown = np.isnan(sensed) | ~trace.usable
     unknown[1:] |= unknown[:-1].copy()  # a derivative looks back by one
     if model["controller.integral_gain"] != 0.0 and unknown.any():
         unknown[int(np.argmax(unknown)):] = True  # what the integral did in a gap is not known
     unknown[:max(0, com, xj)] = True
     unknown[len(unknown) + min(0, com, xj):] = True
     residual[unknown] = np.nan
-    gain = abs(model["controller.proportional_gain"]) + abs(model["controller.derivative_gain"]) / c.period
-    rounding = [resolution(c.cor), gain * resolution(c.xj), gain * resolution(c.com)]
+    gain = abs(model["controller.proportional_gain"]) + abs(model["controller.derivative_gain"]) / trace.period
+    rounding = [resolution(trace.cor), gain * resolution(trace.xj), gain * resolution(trace.com)]
     floor = max(float(np.hypot.reduce(rounding)) / math.sqrt(12.0), FLOAT32 * limit)
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
     return Answer(residual, error, floor, com, xj, limit=limit)
@@ -96,13 +97,13 @@ def resolution(x: Floats) -> float:
     return float(np.sqrt(np.mean(np.maximum(steps, 10.0**-places) ** 2)))
 
 
-def lags(c: Cycles, limit: float) -> tuple[int, int, float]:
-    """Cycles that Com and XJ are late in Cor = g (Com - XJ), the two that fit best; and the gain g, A/m."""
-    inside = c.usable & (np.abs(c.cor) < 0.98 * min(limit, float(np.abs(c.cor).max())))
+def lags(trace: Trace, limit: float) -> tuple[int, int, float]:
+    """Trace that Com and XJ are late in Cor = g (Com - XJ), the two that fit best; and the gain g, A/m."""
+    inside = trace.usable & (np.abs(trace.cor) < 0.98 * min(limit, float(np.abs(trace.cor).max())))
     inside[:max(LAGS)], inside[min(LAGS):] = False, False
-    xj = held(c.xj)
-    columns = [shift(x, lag)[inside] for x in (c.com, xj) for lag in LAGS]
-    whole = np.column_stack([*columns, c.cor[inside]])
+    xj = hold_last(trace.xj)
+    columns = [shift_rows(x, lag)[inside] for x in (trace.com, xj) for lag in LAGS]
+    whole = np.column_stack([*columns, trace.cor[inside]])
     gram = np.einsum("ki,kj->ij", whole, whole)
     n, target = len(LAGS), gram[-1, -1]
     best = (math.inf, 0, 0, math.nan)

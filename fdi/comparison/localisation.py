@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.replay import Columns, derivative
-from fdi.trace.cycles import Cycles, held
+from fdi.trace.columns import hold_last
 from fdi.trace.sections import Section, sections
+from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -52,20 +53,20 @@ class Motion(NamedTuple):
     reversed_for: Floats  # s since the ram last reversed; inf before
 
 
-def motion(c: Cycles, model: Columns) -> Motion:
+def motion(trace: Trace, model: Columns) -> Motion:
     """What the replay of the `model` does, whose noise is not in the residuals, and how long ago it last reversed."""
     x = model["xj"]
-    size = max(5, round(SMOOTH / c.period) | 1)
-    v = derivative(x, size, 1) / c.period
-    a = derivative(x, 2 * size + 1, 2) / c.period**2
+    size = max(5, round(SMOOTH / trace.period) | 1)
+    v = derivative(x, size, 1) / trace.period
+    a = derivative(x, 2 * size + 1, 2) / trace.period**2
     sign = np.where(np.abs(v) > REVERSES, np.sign(v), np.nan)
-    sign = held(sign)
+    sign = hold_last(sign)
     turns = np.flatnonzero((np.diff(sign) != 0.0) & (sign[:-1] != 0.0)) + 1
     last = np.full(len(x), -(10**9))
     last[turns] = turns
     rows = np.arange(len(x)) - np.maximum.accumulate(last)
-    since = np.where(rows > 10**8, math.inf, rows * c.period)
-    return Motion(x, v, a, model["p12"], model["xs"], c.cor, since)
+    since = np.where(rows > 10**8, math.inf, rows * trace.period)
+    return Motion(x, v, a, model["p12"], model["xs"], trace.cor, since)
 
 
 def whole(residual: Columns, floor: Mapping[str, float]) -> Floats:
@@ -79,22 +80,22 @@ def whole(residual: Columns, floor: Mapping[str, float]) -> Floats:
     return out
 
 
-def places(c: Cycles, z2: Floats, m: Motion, limit: float) -> list[Place]:
+def places(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
     """The sections of the command with their shares of `z2` (n,), the largest first; `limit` A of the current."""
     total = float(np.nansum(z2))
     out = []
-    for section in sections(c.com, c.period):
+    for section in sections(trace.com, trace.period):
         rows = slice(section.start, section.stop)
         inside = z2[rows]
         there = ~np.isnan(inside)
-        if total <= 0.0 or there.sum() * c.period < SETTLES:
+        if total <= 0.0 or there.sum() * trace.period < SETTLES:
             continue
         chosen = np.zeros(len(z2), bool)
         chosen[rows] = True
         share = float(np.nansum(inside)) / total
         said = condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
-        words = name(section, float(np.abs(c.com[rows]).max()))
-        t0, t1 = float(c.t[section.start]), float(c.t[section.stop - 1] + c.period)
+        words = name(section, float(np.abs(trace.com[rows]).max()))
+        t0, t1 = float(trace.t[section.start]), float(trace.t[section.stop - 1] + trace.period)
         out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), said))
     return sorted(out, key=lambda place: -place.share)
 

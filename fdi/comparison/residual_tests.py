@@ -16,7 +16,7 @@ from scipy.special import kolmogi, ndtri
 
 from fdi.comparison.localisation import Motion
 from fdi.estimation.replay import Columns
-from fdi.trace.cycles import Cycles
+from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 
@@ -71,13 +71,17 @@ class Diagnosis(NamedTuple):
     depends: tuple[Depends, ...]  # the largest share first
 
 
-def diagnose(c: Cycles, residual: Columns, repeats: Mapping[str, Floats], m: Motion) -> dict[str, Diagnosis]:
+def diagnose(trace: Trace, residual: Columns, repeats: Mapping[str, Floats], m: Motion) -> dict[str, Diagnosis]:
     """Each signal's residual (n,); `repeats`: the difference to a repeat's residual over sqrt 2, where there is one."""
-    inputs = {"Cor": c.cor, "Com": c.com} | ({"load": c.load} if np.ptp(c.load) > 0.0 else {})
+    inputs = {"Cor": trace.cor, "Com": trace.com} | ({"load": trace.load} if np.ptp(trace.load) > 0.0 else {})
     colours = {name: colour(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
     quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
-    return {name: _one(c, r, repeats.get(name), {u: (inputs[u], colours[u]) for u in colours if (name, u) not in OWN},
-                       {q: x for q, x in quantities.items() if (name, q) not in OWN}) for name, r in residual.items()}
+    found = {}
+    for name, r in residual.items():
+        foreign = {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in OWN}
+        others = {q: x for q, x in quantities.items() if (name, q) not in OWN}
+        found[name] = _one(trace, r, repeats.get(name), foreign, others)
+    return found
 
 
 def colour(x: Floats) -> Floats:
@@ -104,21 +108,21 @@ def whiten(x: Floats, by: Floats) -> Floats:
     return out
 
 
-def _one(c: Cycles, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Floats]],
+def _one(trace: Trace, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Floats]],
          quantities: Mapping[str, Floats]) -> Diagnosis:
     r = np.nan_to_num(residual)
     e = whiten(r, colour(difference) if difference is not None else WHITE)
     own = autocorrelation(e)
     band = float(ndtri(0.5 + CONFIDENCE / 2)) / math.sqrt(len(e))
-    frequencies, power, departs, allowed = cumulative(e, c.period)
-    _, plain, _, _ = cumulative(r, c.period)
+    frequencies, power, departs, allowed = cumulative(e, trace.period)
+    _, plain, _, _ = cumulative(r, trace.period)
     half = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
     quiet = autocorrelation(np.nan_to_num(difference)) if difference is not None else np.eye(1, REACH + 1)[0]
-    follows = tuple(follow(name, u, by, r, c.period) for name, (u, by) in inputs.items())
+    follows = tuple(follow(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
     found = [depend(name, q, residual) for name, q in quantities.items()]
     depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
-    return Diagnosis(_memory(autocorrelation(r)) * c.period, _memory(quiet) * c.period, own, band, frequencies, power,
-                     departs, allowed, half, follows, tuple(depends))
+    return Diagnosis(_memory(autocorrelation(r)) * trace.period, _memory(quiet) * trace.period, own, band, frequencies,
+                     power, departs, allowed, half, follows, tuple(depends))
 
 
 def autocorrelation(x: Floats) -> Floats:

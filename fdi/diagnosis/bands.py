@@ -30,7 +30,7 @@ from fdi.thresholds import (
     FRICTION_HIDES_CLOGGING_RATIO,
     SECTION_MEASURED_SHARE,
 )
-from fdi.trace.cycles import Cycles, held
+from fdi.trace.columns import hold_last
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -51,9 +51,9 @@ class Judged(NamedTuple):
     notes: tuple[str, ...]
 
 
-def judge(source: Trace | Cycles, bands: Bands | None = None, model: Model | None = None,
+def judge(source: Trace, bands: Bands | None = None, model: Model | None = None,
           progress: Progress = ignore_progress, where: object = "trace") -> Judged:
-    """Judge a trace, or its cycles (whose dead and bridged samples are left out).
+    """Judge a trace; rows that its preparation found unusable are left out.
 
     Without `bands` the preflight's own are taken, or, for another command, load or model than they are of, bands are
     made by simulating units of the `model` (default: the nominal one) on this command: some seconds.
@@ -229,8 +229,6 @@ def _events(e: Excursion, t0: float, period: float) -> list[Event]:
     return out
 
 
-def columns(source: Trace | Cycles) -> tuple[Floats, Floats, Floats, float, float]:
+def columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
     """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
-    com = held(source.com)
-    xj = source.measured("xj") if isinstance(source, Cycles) else source.xj
-    return com, xj, source.load, source.period, float(source.t[0])
+    return hold_last(source.com), source.measured("xj"), source.load, source.period, float(source.t[0])

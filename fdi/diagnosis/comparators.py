@@ -16,8 +16,9 @@ from fdi.diagnosis.features import features
 from fdi.diagnosis.levels import of_value
 from fdi.diagnosis.simulated_units import Kind, runs
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.cycles import Cycles, held
+from fdi.trace.columns import hold_last
 from fdi.trace.sections import sections
+from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
 
@@ -60,24 +61,24 @@ def available() -> bool:
     return find_spec("sklearn") is not None
 
 
-def lesson(c: Cycles, model: Model, seed: int = 0, progress: Progress = ignore_progress) -> Lesson:
+def lesson(trace: Trace, model: Model, seed: int = 0, progress: Progress = ignore_progress) -> Lesson:
     """Units with every pair of fault sizes on the trace's command, and the trace.
 
     Raises:
         InputError: a command or a trace that shows no precursors.
     """
-    com, parts = held(c.com), sections(c.com, c.period)
-    xj, rows = c.measured("xj"), np.arange(len(c))
+    com, parts = hold_last(trace.com), sections(trace.com, trace.period)
+    xj, rows = trace.measured("xj"), np.arange(len(trace))
     there = ~np.isnan(xj)
-    own = features(com, np.interp(rows, rows[there], xj[there])[None], c.period, parts)
+    own = features(com, np.interp(rows, rows[there], xj[there])[None], trace.period, parts)
     if not own:
         raise InputError("--comparators", "com", "steps or slow ramps: learners see precursors alone")
     pairs = [(k, f) for k in CLOGGINGS for f in FRICTIONS]
     tables = []
     for number, (k, f) in enumerate(pairs):
         progress("simulating faults to learn from", number / len(pairs))
-        made = runs(model, com, c.load, Kind(f"{k:g}, {f:g} N", k, f), EACH, seed + number)
-        shown = features(com, made, c.period, parts)
+        made = runs(model, com, trace.load, Kind(f"{k:g}, {f:g} N", k, f), EACH, seed + number)
+        shown = features(com, made, trace.period, parts)
         tables.append(np.column_stack([shown[name] for name in own]))
     x = np.vstack([*tables, np.array([[own[name][0] for name in own]])])
     x = np.where(np.isfinite(x), x, np.nanmedian(np.where(np.isfinite(x), x, np.nan), axis=0))

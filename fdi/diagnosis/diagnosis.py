@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi.comparison.compare import sensors
 from fdi.diagnosis import levels as rules
 from fdi.diagnosis import rms_grid as grids
 from fdi.diagnosis.bands import Judged, judge, same_plant
@@ -17,7 +16,8 @@ from fdi.diagnosis.fault_unknowns import LARGEST, MOST, positive
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Event, Level
 from fdi.diagnosis.precursors import Precursor, measure
 from fdi.diagnosis.refine import COARSE, Refined, refine
-from fdi.discovery.runs import usable
+from fdi.estimation.noise_floor import sensor_floors
+from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     MOVING_RAM,
@@ -27,8 +27,6 @@ from fdi.thresholds import (
     SUSPECT_SMALLEST,
     UNIT_TOLERANCE,
 )
-from fdi.trace.cycles import Cycles
-from fdi.trace.record import Record
 from fdi.trace.sections import sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -52,8 +50,7 @@ class Diagnosis:
     precursors: Mapping[str, Precursor]
     judged: Judged | None  # what the bands say; None: there are none of this command
     others: Mapping[str, Estimate]  # suspects that are off what a healthy unit has, by parameter, SI
-    cycles: Cycles
-    record: Record
+    trace: Trace  # prepared for replay
     model: Model  # at the cycle of the trace
     floor: Mapping[str, float]  # what the sensors' noise makes of each signal, RMS SI
     bands: Bands | None
@@ -90,59 +87,58 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     if model.plant != "eha":
         raise InputError("--model", model.plant, "eha: the two faults are the paper's servovalve's")
     progress("reading", 0.0)
-    model, record, c = usable(trace, model, None, source)
-    assert c is not None
-    measured = record.position[~np.isnan(record.position)]
-    if float(np.ptp(c.com)) < MOVING_RAM and float(np.ptp(measured)) < MOVING_RAM:
+    trace = prepare_trace(trace, model, None, source)
+    model = match_period(model, trace, SAME_PERIOD)
+    if float(np.ptp(trace.com)) < MOVING_RAM and float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) < MOVING_RAM:
         raise InputError(source, "com",
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
-    notes = list(c.notes)
+    notes = list(trace.notes)
     progress("bands", 1 / STAGES)
-    bands, judged, seen = _banded(c, model, bands, notes)
+    bands, judged, seen = _banded(trace, model, bands, notes)
     progress("grid", 2 / STAGES)
-    grid = _grid(c, model, notes)
+    grid = _grid(trace, model, notes)
     progress("refinement", 3 / STAGES)
-    floor = {name: f.value for name, f in sensors(c, model).items()}
-    found = refine(model, record, (*_starts(grid), *COARSE), floor, workers)
+    floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
+    found = refine(model, trace, (*_starts(grid), *COARSE), floor, workers)
     progress("done", 1.0)
-    return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, c, record, model, floor, bands,
+    return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, trace, model, floor, bands,
                                 tuple(notes)))
 
 
-def _banded(c: Cycles, model: Model, bands: Bands | None, notes: list[str]
+def _banded(trace: Trace, model: Model, bands: Bands | None, notes: list[str]
             ) -> tuple[Bands | None, Judged | None, dict[str, Precursor]]:
     """Bands, what they say, and the precursors."""
     if bands is None:
-        bands = _own_bands(c, model, notes)
+        bands = _own_bands(trace, model, notes)
     judged = None
     if bands is not None:
-        judged = judge(c, bands, model)
+        judged = judge(trace, bands, model)
         notes += judged.notes
-    return bands, judged, measure(c, bands)
+    return bands, judged, measure(trace, bands)
 
 
-def _own_bands(c: Cycles, model: Model, notes: list[str]) -> Bands | None:
+def _own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
     own = default()
     if not same_plant(model):
         notes.append("no bands: the software's own are of the nominal unit; rig fdi --learn-bands makes others")
         return None
-    if loaded(c.load):
+    if loaded(trace.load):
         notes.append("no bands: the ram is loaded, and the software's own are of a free one")
         return None
-    if not matches(own, c.com, c.period):
+    if not matches(own, trace.com, trace.period):
         notes.append("no bands: the software's own are of the preflight command, this is another")
         return None
     return own
 
 
-def _grid(c: Cycles, model: Model, notes: list[str]) -> grids.Grid | None:
-    kinds = {s.kind for s in sections(c.com, c.period)}
+def _grid(trace: Trace, model: Model, notes: list[str]) -> grids.Grid | None:
+    kinds = {s.kind for s in sections(trace.com, trace.period)}
     if not kinds & {"step", "ramp"}:
         notes.append("no RMS grid: the command has neither steps nor ramps")
         return None
     try:
-        return grids.search(c, model)
+        return grids.search(trace, model)
     except InputError as error:  # sections that a gap has emptied
         notes.append(f"no RMS grid: {error.expected}")
         return None

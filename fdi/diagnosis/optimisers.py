@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.fault_unknowns import free_parameters, start_of
 from fdi.diagnosis.refine import COARSE, Counted, problem_of, refine
 from fdi.estimation.fit import misfit
-from fdi.trace.record import Record
+from fdi.trace.trace import Trace
 from plant.model import Model
 
 Floats = NDArray[np.float64]
@@ -69,41 +69,41 @@ class Objective:
         return self.problem.whitened(self.problem.residuals(self.free, x))
 
 
-def least_squares(model: Model, record: Record, start: tuple[float, float], floor: Mapping[str, float], seed: int
+def least_squares(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float], seed: int
                   ) -> Attempt:
     """The default: every tolerance and suspect free, Gauss-Newton steps."""
-    r = refine(model, record, (start, *COARSE), floor)
+    r = refine(model, trace, (start, *COARSE), floor)
     return Attempt("least squares", r.kintas.value, r.fss.value, rms([*r.ratio.values()]), r.simulations, True)
 
 
-def differential_evolution(model: Model, record: Record, start: tuple[float, float], floor: Mapping[str, float],
+def differential_evolution(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],
                            seed: int) -> Attempt:
     """scipy's differential evolution, a generation at a time in lanes."""
     from scipy.optimize import differential_evolution as search
 
-    objective = Objective(problem_of(model, record, floor), model, start)
+    objective = Objective(problem_of(model, trace, floor), model, start)
     done = search(lambda x: objective(x.T), objective.box, maxiter=GENERATIONS, popsize=POPULATION // 3, tol=1e-3,
                   rng=np.random.default_rng(seed), polish=False, vectorized=True, updating="deferred",
                   x0=objective.start)
     return objective.found("differential evolution", done.x)
 
 
-def simulated_annealing(model: Model, record: Record, start: tuple[float, float], floor: Mapping[str, float], seed: int
+def simulated_annealing(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float], seed: int
                         ) -> Attempt:
     """scipy's dual annealing, one simulation after the other."""
     from scipy.optimize import dual_annealing
 
-    objective = Objective(problem_of(model, record, floor), model, start)
+    objective = Objective(problem_of(model, trace, floor), model, start)
     done = dual_annealing(lambda x: float(objective(x[None])[0]), objective.box, maxfun=ANNEALED, x0=objective.start,
                           rng=np.random.default_rng(seed), no_local_search=True)
     return objective.found("simulated annealing", done.x)
 
 
-def genetic(model: Model, record: Record, start: tuple[float, float], floor: Mapping[str, float], seed: int) -> Attempt:
+def genetic(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float], seed: int) -> Attempt:
     """A genetic algorithm (pygad), a generation at a time in lanes."""
     import pygad
 
-    objective = Objective(problem_of(model, record, floor), model, start)
+    objective = Objective(problem_of(model, trace, floor), model, start)
     low, high = np.transpose(objective.box)
     rng = np.random.default_rng(seed)
     first = np.vstack([objective.start, rng.uniform(low, high, (POPULATION - 1, 3))])

@@ -16,7 +16,6 @@ from fdi.diagnosis.envelope import Bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.diagnosis.features import MEANINGS, OF_STEPS, features, kind_of
 from fdi.thresholds import POSITION_MISSING_SHARE
-from fdi.trace.cycles import Cycles
 from fdi.trace.sections import sections
 from fdi.trace.trace import Trace
 
@@ -50,7 +49,7 @@ class Precursor(NamedTuple):
         return self.friction / self.noise if self.noise > 0.0 else math.nan
 
 
-def measure(source: Trace | Cycles, bands: Bands | None = None) -> dict[str, Precursor]:
+def measure(source: Trace, bands: Bands | None = None) -> dict[str, Precursor]:
     """The precursors of a trace by name; empty where too much of the position is missing."""
     from fdi.diagnosis.bands import columns
 

@@ -29,7 +29,8 @@ from fdi.thresholds import (
     RESIDUAL_IS_NOISE,
     RESIDUAL_WORST,
 )
-from fdi.trace.record import NOISE, Record
+from fdi.trace.signals import SIGNALS
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model
 from plant.threads import mapped
@@ -84,30 +85,30 @@ class Counted(Problem):
     def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         return self.left(self.predict([f.name for f in free], np.array([values(free, row) for row in x])))
 
-    def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:
+    def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
-        return super().all_signals(names, values, r)
+        return super().all_signals(names, values, trace)
 
 
-def problem_of(model: Model, record: Record, floor: Mapping[str, float] | None = None, workers: int = 2) -> Counted:
+def problem_of(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2) -> Counted:
     """The model with the suspects ready in it, and the run to hold it against; `floor` RMS noise by signal, SI."""
-    level = {name: floor[name] if floor else model[NOISE[name]] for name in record.signals}
+    level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
     ready = quiet(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
-    return Counted(ready, record, tuple(noises.white(level[name]) for name in record.signals), workers=workers)
+    return Counted(ready, trace, tuple(noises.white(level[name]) for name in trace.outputs), workers=workers)
 
 
-def refine(model: Model, record: Record, starts: Sequence[tuple[float, float]] = COARSE,
+def refine(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE,
            floor: Mapping[str, float] | None = None, workers: int = 2) -> Refined:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
         model: the plant as it left the works.
-        record: the run.
+        trace: the run, prepared for replay.
         starts: (Kintas, FSS in N) each.
         floor: RMS noise by signal, SI; default the model's sensors.
         workers: threads.
     """
-    problem = problem_of(model, record, floor, workers)
+    problem = problem_of(model, trace, floor, workers)
     free = free_parameters(model)
     first = _first(problem, free, starts)
     problem = _with_noise(problem, first)
@@ -138,7 +139,7 @@ def _last(problem: Counted, first: Fit) -> Fit:
         last = descended(fine, last, rounds, flats(problem, first.free, last.x))
         if _reached(problem, last):
             return last
-    signals = problem.record.signals
+    signals = problem.trace.outputs
     for parts in BACK:
         ratios = dict(zip(signals, _over(problem, last), strict=True))
         if _reached(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
@@ -232,14 +233,14 @@ def offsets_of(problem: Problem) -> dict[str, float]:
     The mean opening is what the ram's way takes; what current is left makes up for a bias. The mean pressure carries
     the load.
     """
-    r, p = problem.record, problem.model.values
-    x = r.position[~np.isnan(r.position)]
-    speed = (x[-1] - x[0]) / (len(r) * p["controller.period"])
+    trace, p = problem.trace, problem.model.values
+    x = trace.xj[~np.isnan(trace.xj)]
+    speed = (x[-1] - x[0]) / (len(trace) * p["controller.period"])
     per_speed = p["jack.area"] / p["valve.flow_gain"] * p["feedback_spring.stiffness"] / p["torque_motor.gain"]
-    found = {"null_bias.current": per_speed * speed - float(r.current.mean())}
-    if "p12" in r.signals:
-        pressure = r.measured[r.signals.index("p12")]
-        found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(r.load.mean())
+    found = {"null_bias.current": per_speed * speed - float(trace.cor.mean())}
+    if "p12" in trace.outputs:
+        pressure = trace.measured("p12")
+        found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(trace.load.mean())
     return found
 
 
@@ -253,9 +254,9 @@ def _with_noise(problem: Counted, found: Fit) -> Counted:
 
 
 def _refined(last: Fit, problem: Counted) -> Refined:
-    record = problem.record
-    errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, last.residuals, strict=True)}
-    floor = {s: n.level for s, n in zip(record.signals, problem.noise, strict=True)}
+    outputs = problem.trace.outputs
+    errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
+    floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
     names = [f.name for f in last.free]
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION
+from fdi.estimation.preparation import read_cycles
 from fdi.estimation.replay import ANCHOR, known_start
-from fdi.trace.cycles import Cycles, readings
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -75,12 +75,12 @@ class Grid:
     simulations: int
 
 
-def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats = KINTAS, fss: Floats = FSS,
+def search(trace: Trace, model: Model | None = None, kintas: Floats = KINTAS, fss: Floats = FSS,
            drive: str = "current", sliding: tuple[float, ...] = SLIDING) -> Grid:
     """The RMS maps of a trace over all pairs of `kintas` (k,) and `fss` (f,) N.
 
     Args:
-        measured: a trace, or its cycles; the command must have steps or ramps.
+        trace: prepared for replay or not; the command must have steps or ramps.
         model: what is not a fault; nominal by default.
         drive: the monitor is run by the measured "current", or by the "command" in closed loop.
         sliding: FDS/FSS of the spool to try; the grid is that of the best.
@@ -89,21 +89,22 @@ def search(measured: Trace | Cycles, model: Model | None = None, kintas: Floats 
         InputError: a trace that cannot be replayed, a command with neither steps nor ramps, or an unknown drive.
     """
     model = Model() if model is None else model
-    c = measured if isinstance(measured, Cycles) else readings(measured, model)[0]
+    if not trace.outputs:
+        trace = read_cycles(trace, model)[0]
     if drive not in DRIVES:
         raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
-    parts = sections(c.com, c.period)
-    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _rows(c, parts, kind)).any()}
+    parts = sections(trace.com, trace.period)
+    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _rows(trace, parts, kind)).any()}
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
     values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
-    tried = {ratio: _rms(c, model, values, drive, ratio, rows) for ratio in sliding}
+    tried = {ratio: _rms(trace, model, values, drive, ratio, rows) for ratio in sliding}
     joint = {ratio: _joint(maps, rows) for ratio, maps in tried.items()}
     ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
     step, ramp = (_map(tried[ratio][kind], kintas, fss) if kind in rows else None for kind in ("step", "ramp"))
     both = _map(joint[ratio], kintas, fss)
     near = _valley(both, kintas, fss)
-    finer = _joint(_rms(c, model, near, drive, ratio, rows), rows)
+    finer = _joint(_rms(trace, model, near, drive, ratio, rows), rows)
     deepest = int(finer.argmin())
     best = Point(float(near[deepest, 0]), float(near[deepest, 1]), float(finer[deepest]))
     return Grid(kintas, fss, step, ramp, both, merge(step, ramp), best, ratio, drive,
@@ -122,30 +123,30 @@ def _valley(joint: Map, kintas: Floats, fss: Floats) -> Floats:
     return np.column_stack([np.repeat(kintas, len(BETWEEN)), across.reshape(-1)])
 
 
-def _rows(c: Cycles, parts: list[Section], kind: str) -> Flags:
+def _rows(trace: Trace, parts: list[Section], kind: str) -> Flags:
     """Measured rows of the sections of a kind."""
-    chosen = np.zeros(len(c), bool)
+    chosen = np.zeros(len(trace), bool)
     for s in parts:
         chosen[s.start:s.stop] |= s.kind == kind
-    return chosen & ~np.isnan(c.measured("xj"))
+    return chosen & ~np.isnan(trace.measured("xj"))
 
 
-def _rms(c: Cycles, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]
+def _rms(trace: Trace, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]
          ) -> dict[str, Floats]:
     """RMS of XJ, measured less monitor, about its mean, by kind of section; (m,) m each."""
     def reduced(runs: Floats) -> Floats:
         found = []
         for chosen in rows.values():
-            left = runs[:, 0].T[chosen] - c.xj[chosen, None]
+            left = runs[:, 0].T[chosen] - trace.xj[chosen, None]
             left -= left.mean(axis=0)  # a load, a null bias: against the pull to the measured ram they end as an offset
             found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
         return np.stack(found, -1)
 
     monitor = Monitor(model, sliding=sliding)
     if drive == "command":
-        out = monitor.closed_loop(values, c.com, float(c.xj[0]) if known_start(c) else 0.0, reduced=reduced)
+        out = monitor.closed_loop(values, trace.com, float(trace.xj[0]) if known_start(trace) else 0.0, reduced=reduced)
     else:
-        out = monitor.replay(values, c.cor, c.xj if known_start(c) else None, ANCHOR, reduced=reduced)
+        out = monitor.replay(values, trace.cor, trace.xj if known_start(trace) else None, ANCHOR, reduced=reduced)
     return dict(zip(rows, out.T, strict=True))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
-from fdi.trace.record import SIGNALS
+from fdi.trace.signals import OUTPUTS
 
 Floats = NDArray[np.float64]
 
@@ -50,20 +50,20 @@ def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
     Each is taken on the measurement and on the model's own replay, smoothed alike; the difference is what is missing.
     Signals that were not measured are the replay's: then a place behind them cannot show anything.
     """
-    problem, record = search.problem, search.problem.record
+    problem, trace = search.problem, search.problem.trace
     names = [f.name for f in h.fit.free]
     values = {**problem.model.values, **h.fit.values}
     replay = problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     measured = replay.copy()
-    for row, signal in enumerate(record.signals):
-        there = ~np.isnan(record.measured[row])
-        measured[SIGNALS.index(signal), there] = record.measured[row, there]
-    before = np.concatenate([[0.0], record.current[:-1]])
-    own = _terms(replay, before, record.load, values, problem.model.values["controller.period"])
-    seen = _terms(measured, before, record.load, values, problem.model.values["controller.period"])
-    level = [search.floor(h).get(s, 0.0) for s in SIGNALS]
+    for row, signal in enumerate(trace.outputs):
+        there = ~np.isnan(trace.measurements[row])
+        measured[OUTPUTS.index(signal), there] = trace.measurements[row, there]
+    before = np.concatenate([[0.0], trace.cor[:-1]])
+    own = _terms(replay, before, trace.load, values, problem.model.values["controller.period"])
+    seen = _terms(measured, before, trace.load, values, problem.model.values["controller.period"])
+    level = [search.floor(h).get(s, 0.0) for s in OUTPUTS]
     rng = np.random.default_rng(0)
-    noisy = [_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, record.load, values,
+    noisy = [_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load, values,
                     problem.model.values["controller.period"]) for _ in range(DRAWS)]
     found = []
     for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
@@ -73,7 +73,7 @@ def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
         found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0))
     states = States(replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW),
                     _speed(measured[0], problem.model.values["controller.period"]), measured[1], measured[2], before,
-                    record.trace.t)
+                    trace.t)
     return sorted(found, key=lambda b: -b.ratio), states
 
 

@@ -169,7 +169,7 @@ def _candidates(e: Explanation, seed: int) -> list[Candidate]:
 
 def _candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
     won, extra = gain(e.base, h), _unknown(h.fit) - _unknown(e.base.fit)
-    samples = sum(int(np.isfinite(r.measured).sum()) for r in (e.search.problem.record, *e.search.problem.also))
+    samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
     charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
     values = fitted(effect, h.fit, e.search.problem.model)
     return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
@@ -206,7 +206,7 @@ def _printed(e: Explanation, p: Fingerprint) -> Candidate:
     if CATALOGUE[p.effect].firmware:
         error["cor"] = p.after * resolution(e.search.problem.model)
         ratios = {"cor": p.after}
-    n = len(e.search.problem.record)
+    n = len(e.search.problem.trace)
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
     evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
     return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,

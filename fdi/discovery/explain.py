@@ -13,7 +13,7 @@ from fdi.discovery.significance import SEEN, Sensitivity, sensitivity
 from fdi.estimation.fit import typical
 from fdi.estimation.problem import Problem
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.record import Record
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, offered
 
@@ -50,7 +50,7 @@ class Explanation:
     search: Search = field(repr=False)
 
 
-def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: Record | None = None,
+def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
             progress: Progress = ignore_progress, workers: int | None = None) -> Explanation:
     """The verdict on a model and a measured run.
 
@@ -79,7 +79,7 @@ def explain(model: Model, est: Record, repeats: Sequence[Record] = (), holdout: 
     return _concluded(search, levels, found, controller, holdout)
 
 
-def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: Progress) -> list[list[Hypothesis]]:
+def _levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
     for count in range(1, MOST + 1):
@@ -105,7 +105,7 @@ def _levels(search: Search, base: Hypothesis, holdout: Record | None, progress: 
     return levels
 
 
-def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Record | None) -> bool:
+def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace | None) -> bool:
     """Whether the last effect is a way to go on: it takes a fair part of what was left, on the held-out run as well."""
     before, after = levels[-2][0], levels[-1][0]
     if not _fair(search, before, after):
@@ -115,14 +115,14 @@ def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Record
 
 def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
     """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
-    noise = float(np.isfinite(search.problem.record.measured).sum())
+    noise = float(np.isfinite(search.problem.trace.measurements).sum())
     return before.cost - after.cost >= FAIR * (before.cost - noise)
 
 
-def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Record) -> bool:
+def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Trace) -> bool:
     """Whether a hypothesis leaves less of a held-out run than another, in the typical block, all signals together."""
     floor = search.floor(after)
-    left = [np.array([e / floor[s] for s, e in zip(holdout.signals, typical(_unseen(search, h, holdout)), strict=True)])
+    left = [np.array([e / floor[s] for s, e in zip(holdout.outputs, typical(_unseen(search, h, holdout)), strict=True)])
             for h in (before, after)]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
     return excess[1] < BETTER * excess[0]
@@ -146,7 +146,7 @@ def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool
 
 
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
-               holdout: Record | None) -> Explanation:
+               holdout: Trace | None) -> Explanation:
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
@@ -225,18 +225,18 @@ def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
     return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
 
 
-def _holds(search: Search, h: Hypothesis, record: Record, floor: Mapping[str, float]) -> bool:
-    left = typical(_unseen(search, h, record))
-    return all(e <= HELD_OUT * floor[s] for s, e in zip(record.signals, left, strict=True))
+def _holds(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
+    left = typical(_unseen(search, h, trace))
+    return all(e <= HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
 
 
-def held_out(search: Search, h: Hypothesis, record: Record) -> dict[str, float]:
+def held_out(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
     """RMS residual on a run that the fit never saw, SI units."""
-    residuals = _unseen(search, h, record)
-    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(record.signals, residuals, strict=True)}
+    residuals = _unseen(search, h, trace)
+    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(trace.outputs, residuals, strict=True)}
 
 
-def _unseen(search: Search, h: Hypothesis, record: Record) -> Floats:
-    problem: Problem = replace(search.problem, record=record, steps=TRUEST, also=(), _lanes={})
+def _unseen(search: Search, h: Hypothesis, trace: Trace) -> Floats:
+    problem: Problem = replace(search.problem, trace=trace, steps=TRUEST, also=(), _lanes={})
     left: Floats = problem.residuals(h.fit.free, h.fit.x[None])[0]
     return left

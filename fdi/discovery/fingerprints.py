@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.record import Record, held
+from fdi.trace.columns import hold_last
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, kernel
 
@@ -35,19 +36,18 @@ def resolution(model: Model) -> float:
     return float(np.sqrt((counts**2).sum() / 12.0))
 
 
-def firmware_residual(model: Model, record: Record) -> Floats:
+def firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     firmware = tuple(e for e in model.effects if CATALOGUE[e].firmware)
     own = replace(model, effects=firmware)
-    out = np.empty(len(record))
-    position = held(record.position)
-    kernel("firmware", firmware)(own.state().memory.command, record.com, position, own.record(), out)
-    trace = record.trace
-    measured: Floats = np.where(np.isnan(trace.com) | np.isnan(trace.xj), np.nan, trace.cor)
+    out = np.empty(len(trace))
+    position = hold_last(trace.position)
+    kernel("firmware", firmware)(own.state().memory.command, trace.com, position, own.record(), out)
+    measured: Floats = np.where(trace.incomplete, np.nan, trace.cor)
     return out - measured
 
 
-def firmware(model: Model, records: Sequence[Record]) -> tuple[float, list[Fingerprint]]:
+def firmware(model: Model, traces: Sequence[Trace]) -> tuple[float, list[Fingerprint]]:
     """RMS of Cor against the model's firmware in units of its resolution, and the firmware effects that explain it.
 
     Of a plant whose controller is not known, neither.
@@ -55,20 +55,20 @@ def firmware(model: Model, records: Sequence[Record]) -> tuple[float, list[Finge
     if not model.kind.controller:
         return 0.0, []
     unit = resolution(model)
-    before = _rms(model, records) / unit
+    before = _rms(model, traces) / unit
     found = []
     if before > 3.0:
         for name, entry in CATALOGUE.items():
             if entry.firmware and name not in model.effects and len(entry.fitted) == 1:
-                found.append(_sized(model, records, name, before))
+                found.append(_sized(model, traces, name, before))
     return before, sorted((f for f in found if f.after < 0.7 * before), key=lambda f: f.after)
 
 
-def _rms(model: Model, records: Sequence[Record]) -> float:
-    return float(np.sqrt(np.mean([np.nanmean(firmware_residual(model, r) ** 2) for r in records])))
+def _rms(model: Model, traces: Sequence[Trace]) -> float:
+    return float(np.sqrt(np.mean([np.nanmean(firmware_residual(model, r) ** 2) for r in traces])))
 
 
-def _sized(model: Model, records: Sequence[Record], name: str, before: float) -> Fingerprint:
+def _sized(model: Model, traces: Sequence[Trace], name: str, before: float) -> Fingerprint:
     """The size of a firmware effect: a logarithmic search over all sizes, then closer and closer."""
     entry = CATALOGUE[name]
     parameter = entry.fitted[0]
@@ -77,7 +77,7 @@ def _sized(model: Model, records: Sequence[Record], name: str, before: float) ->
     unit, ready = resolution(model), model.having([name])
 
     def left(size: float) -> float:
-        return _rms(ready.replace({parameter: float(np.exp(size))}), records) / unit
+        return _rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
 
     for _ in range(ZOOMS):
         sizes = np.linspace(low, high, SIZES)
@@ -88,9 +88,9 @@ def _sized(model: Model, records: Sequence[Record], name: str, before: float) ->
     return Fingerprint(name, {parameter: (value, float(np.exp(low)), float(np.exp(high)))}, before, errors[k])
 
 
-def comb(record: Record) -> Fingerprint | None:
+def comb(trace: Trace) -> Fingerprint | None:
     """A transducer with few bits: every sensed position is a multiple of one step."""
-    x = record.position[~np.isnan(record.position)]
+    x = trace.position[~np.isnan(trace.position)]
     levels = np.unique(x)
     if len(levels) < 8 or "quantisation" not in CATALOGUE:
         return None

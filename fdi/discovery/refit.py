@@ -17,7 +17,7 @@ from fdi.estimation.fit import Fit, improved, linearised, misfit
 from fdi.estimation.model_unknowns import UNREPLAYED, effects_of, free_of
 from fdi.estimation.problem import Free, quiet, unknowns, whole
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.record import Record
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.lanes import ladder
@@ -70,8 +70,8 @@ class Refit:
         return gain(before.hypothesis, after.hypothesis) > HELPS and not worse
 
 
-def refit(original: Model, effects: Sequence[str], est: Record, repeats: Sequence[Record] = (),
-          holdout: Record | None = None, progress: Progress = ignore_progress,
+def refit(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
+          holdout: Trace | None = None, progress: Progress = ignore_progress,
           begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
     """Add effects to a model in this order.
 
@@ -216,14 +216,14 @@ def _healthy(free: Sequence[Free]) -> NDArray[np.bool_]:
     return np.array([np.isfinite(f.prior) for f in free])
 
 
-def _marks(model: Model, effects: Sequence[str], records: Sequence[Record]) -> dict[str, tuple[float, float, float]]:
+def _marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dict[str, tuple[float, float, float]]:
     """Parameters of effects that a replay does not show: they are read off the firmware's answers and the positions."""
     found: dict[str, tuple[float, float, float]] = {}
     for name in effects:
         if CATALOGUE[name].port not in UNREPLAYED:
             continue
-        tooth = comb(records[0]) if name == "quantisation" else None
-        prints = [tooth] if tooth else [p for p in firmware(model, records)[1] if p.effect == name]
+        tooth = comb(traces[0]) if name == "quantisation" else None
+        prints = [tooth] if tooth else [p for p in firmware(model, traces)[1] if p.effect == name]
         if not prints:
             where = "steps in the measured positions" if CATALOGUE[name].port == "reading" else \
                 "a difference between Cor and the model's firmware that it explains"
@@ -232,7 +232,7 @@ def _marks(model: Model, effects: Sequence[str], records: Sequence[Record]) -> d
     return found
 
 
-def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Record | None
+def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Trace | None
            ) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
     held = [held_out(search, h, holdout) if holdout else {} for h in chain]

@@ -15,7 +15,8 @@ from fdi.estimation.fit import Fit, fit, improved, linearised, misfit
 from fdi.estimation.model_unknowns import free_of
 from fdi.estimation.noise import Noise
 from fdi.estimation.problem import Free, Problem, quiet, whole
-from fdi.trace.record import NOISE, Record
+from fdi.trace.signals import OUTPUTS, SIGNALS
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model
 from plant.threads import R, T, mapped, threads
@@ -57,16 +58,16 @@ class Hypothesis:
 class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
 
-    def __init__(self, model: Model, record: Record, repeats: Sequence[Record], effects: Iterable[str],
+    def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None) -> None:
         self.workers = workers or threads()
-        self.sensors = {name: noises.white(model[level]) for name, level in NOISE.items()}
+        self.sensors = {name: noises.white(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
-        self.noise = tuple(noises.rounded(self.sensors[name], self.coarse.get(name, 0.0)) for name in record.signals)
+        self.noise = tuple(noises.rounded(self.sensors[name], self.coarse.get(name, 0.0)) for name in trace.outputs)
         self.model, ready = model, whole(model)
         bare = quiet(model)
-        self.problem = Problem(ready, record, self.noise, workers=1, bare=bare)
+        self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
@@ -160,8 +161,8 @@ class Search:
 
     def judged(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats."""
-        signals = self.problem.record.signals
-        own = found.residuals[:, :len(self.problem.record)]  # the first run of a fit to several
+        signals = self.problem.trace.outputs
+        own = found.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
         errors = _rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         x = found.x[None, :]
@@ -176,15 +177,15 @@ class Search:
 
     def learn_noise(self, best: Hypothesis) -> None:
         """Take the noise from what differs between the runs under the best hypothesis."""
-        self.noise = tuple(noise_of(best, self.problem.record, self.noise))
+        self.noise = tuple(noise_of(best, self.problem.trace, self.noise))
         self.problem = replace(self.problem, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
 
     def floor(self, best: Hypothesis) -> dict[str, float]:
         """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
-        found = noise_of(best, self.problem.record, self.noise)
+        found = noise_of(best, self.problem.trace, self.noise)
         return {s: float(np.hypot(n.level, self.coarse.get(s, 0.0)))
-                for s, n in zip(self.problem.record.signals, found, strict=True)}
+                for s, n in zip(self.problem.trace.outputs, found, strict=True)}
 
     def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
@@ -202,22 +203,22 @@ class Search:
         x = h.fit.x[None]
         change = (halved.residuals(h.fit.free, x) - coarse.residuals(h.fit.free, x))[0]
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
-        return max(float(t) / floor[s] for s, t in zip(self.problem.record.signals, typical, strict=True))
+        return max(float(t) / floor[s] for s, t in zip(self.problem.trace.outputs, typical, strict=True))
 
     def refine(self, steps: int, finest: int) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
-        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.record for p in self.repeats),
+        self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats),
                                workers=self.workers)
         self.fine = replace(self.problem, steps=finest, _lanes={})
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
 
 
-def noise_of(h: Hypothesis, record: Record, before: Sequence[Noise]) -> list[Noise]:
+def noise_of(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[Noise]:
     """Noise of each signal: of the difference between repeats, else of the residual where only noise is left."""
     found = []
     for i, old in enumerate(before):
         if h.others:
-            n = min(len(record), *(o.shape[1] for o in h.others))
+            n = min(len(trace), *(o.shape[1] for o in h.others))
             difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
             found.append(noises.fitted(difference))
         else:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import fit
 from fdi.estimation.noise import Noise
+from fdi.estimation.preparation import hold_inputs
 from fdi.estimation.problem import Problem
-from fdi.trace.record import SIGNALS, Record, record
+from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 
@@ -43,21 +44,21 @@ def separate(search: Search, equal: Sequence[Hypothesis]) -> Separation | None:
     if not pairs:
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
-    own = search.problem.record
-    for more in _sensors(own.signals):
-        left = min(_misfit(search, a, b, _same_command(search, a, (*own.signals, *more))) for a, b in pairs)
+    own = search.problem.trace
+    for more in _sensors(own.outputs):
+        left = min(_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
         if left > SPLITS:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
     for words, command, play in commands(search.problem.model.values["controller.period"]):
-        left = min(_misfit(search, a, b, _played(search, a, play, own.signals)) for a, b in pairs)
+        left = min(_misfit(search, a, b, _played(search, a, play, own.outputs)) for a, b in pairs)
         if left > SPLITS and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
     return best
 
 
 def _sensors(there: Sequence[str]) -> list[tuple[str, ...]]:
-    missing = tuple(s for s in SIGNALS if s not in there)
+    missing = tuple(s for s in OUTPUTS if s not in there)
     return [*((s,) for s in missing), missing] if len(missing) > 1 else [missing] if missing else []
 
 
@@ -87,17 +88,18 @@ def commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats]
             ("a step into the end stop, 45 mm, and back", steps(45e-3), step(45e-3))]
 
 
-def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Record:
+def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
     """The run as a hypothesis predicts it, with more sensors."""
     names = [f.name for f in h.fit.free]
     predicted = search.problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
-    own = search.problem.record
-    chosen = tuple(s for s in SIGNALS if s in signals)
-    return replace(own, signals=chosen, measured=predicted[[SIGNALS.index(s) for s in chosen]], position=predicted[0])
+    own = search.problem.trace
+    xj, p12, xs = predicted
+    return replace(own, outputs=tuple(s for s in OUTPUTS if s in signals), xj=xj, p12=p12, xs=xs,
+                   usable=np.ones(len(own), bool))
 
 
 def _played(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
-            signals: tuple[str, ...]) -> Record:
+            signals: tuple[str, ...]) -> Trace:
     """Another command as a hypothesis predicts it, with the model's own controller."""
     problem = search.problem
     period = problem.model.values["controller.period"]
@@ -106,13 +108,13 @@ def _played(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats
     lanes = Lanes(problem.model, names, problem.steps, 1)
     out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
     columns = dict(zip(("xj", "cor", "p12", "xs"), out.T, strict=True))
-    return record(Trace.of({"com": com, "load": load, **columns}, period, {}), signals)
+    return hold_inputs(Trace.of({"com": com, "load": load, **columns}, period, {}), signals)
 
 
-def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Record) -> float:
+def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:
     """What `wrong` leaves of what `truth` predicts, noise aside, -2 log likelihood."""
-    known = dict(zip(search.problem.record.signals, search.noise, strict=True))
+    known = dict(zip(search.problem.trace.outputs, search.noise, strict=True))
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
-                                     for s in seen.signals)
-    problem: Problem = replace(search.problem, record=seen, noise=noise, also=())
+                                     for s in seen.outputs)
+    problem: Problem = replace(search.problem, trace=seen, noise=noise, also=())
     return fit(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit

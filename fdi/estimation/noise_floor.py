@@ -17,6 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv, ndtri
 
+from fdi.trace.columns import rms
+from fdi.trace.signals import SIGNALS
+from fdi.trace.trace import Trace
+from plant.effects import CATALOGUE, at
+from plant.model import Model
+from plant.state import Input
+
 Floats = NDArray[np.float64]
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
@@ -29,6 +36,9 @@ NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it
 LINE = 5.0  # times its neighbours' power; chance does that in one line of 150
 FEWEST = 10  # windows that a search for hum needs
 WHITE_DIFFERENCE = 6.0  # variance of the second difference of white noise, over its own
+FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
+NOISIER = 1.3  # times the noise that the model gives: a signal with more shows its own
+SWEEP = 4000  # positions
 
 
 class Floor(NamedTuple):
@@ -79,6 +89,35 @@ def from_data(signal: Floats) -> Floor:
     # the median, scaled to a standard deviation, does not see the few samples in which the signal itself bends
     spread = float(np.median(second)) / float(ndtri(0.75))
     return Floor(spread / np.sqrt(WHITE_DIFFERENCE), "data", True)
+
+
+def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
+    """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
+    out = {}
+    for name in trace.outputs:
+        given, seen = model[SIGNALS[name].noise], from_data(trace.measured(name))
+        given = read_noise(model, trace.xj) if name == "xj" else given
+        found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER * given else seen
+        out[name] = found._replace(value=max(found.value, FINEST[name]))
+    return out
+
+
+def read_noise(model: Model, xj: Floats) -> float:
+    """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
+
+    A sweep through it, as neither is in a replay.
+    """
+    level = model["sensors.position_noise"]
+    law, memory = at("reading", model.effects)
+    if not any(CATALOGUE[name].port == "reading" for name in model.effects):
+        return level
+    noise = level * np.random.default_rng(0).standard_normal(SWEEP)
+    true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
+    s, p, out = model.state(), model.record()[0], np.empty(SWEEP)
+    for k, x in enumerate((true + noise).tolist()):
+        u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
+        out[k], memory = law(x, memory, s, u, p)
+    return rms(out - true)
 
 
 def quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise import Noise
-from fdi.trace.record import Record
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
 from plant.model import Model, meaning, offered
@@ -81,29 +81,29 @@ class Problem:
     """
 
     model: Model  # with every effect that may be tried
-    record: Record
+    trace: Trace
     noise: tuple[Noise, ...]  # of each signal
     steps: int = STEPS
     anchor: float = ANCHOR
     workers: int = 1
     bare: Model | None = None  # the same without the effects at off values: five times as fast where it will do
-    also: tuple[Record, ...] = ()  # further runs, of the same signals, that a fit takes in
+    also: tuple[Trace, ...] = ()  # further runs, of the same signals, that a fit takes in
     _lanes: dict[tuple[str, ...], Lanes] = field(default_factory=dict)
 
     def predict(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
-        runs = mapped(lambda r: self.all_signals(names, values, r)[:, r.columns], (self.record, *self.also),
+        runs = mapped(lambda r: self.all_signals(names, values, r)[:, r.output_columns], (self.trace, *self.also),
                       self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
-    def all_signals(self, names: Sequence[str], values: Floats, r: Record | None = None) -> Floats:
+    def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         """XJ, P12 and XS of one run (default: the first), whichever were measured: (m, 3, n)."""
         key = tuple(names)
         if key not in self._lanes:
             bare = self.bare is not None and set(key) <= set(self.bare.values)
             self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
-        r = r or self.record
-        out = self._lanes[key].replay(values, r.current, r.load, r.position, self.anchor)
+        trace = self.trace if trace is None else trace
+        out = self._lanes[key].replay(values, trace.cor, trace.load, trace.position, self.anchor)
         signals: Floats = out.transpose(0, 2, 1)
         return signals
 
@@ -115,11 +115,11 @@ class Problem:
     def left(self, predicted: Floats) -> Floats:
         """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
         parts, start = [], 0
-        for r in (self.record, *self.also):
-            residuals = predicted[..., start:start + len(r)] - r.measured
-            lines = mains(len(r), self.model.values["controller.period"])
+        for trace in (self.trace, *self.also):
+            residuals = predicted[..., start:start + len(trace)] - trace.measurements
+            lines = mains(len(trace), self.model.values["controller.period"])
             parts.append(residuals - (np.nan_to_num(residuals) @ lines) @ lines.T)
-            start += len(r)
+            start += len(trace)
         return np.concatenate(parts, axis=-1) if self.also else parts[0]
 
     def whitened(self, residuals: Floats) -> Floats:

@@ -7,6 +7,7 @@ goes on hangs on a thousandth of its friction, neither model nor solver can say 
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -14,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise_floor import WINDOW
-from fdi.trace.cycles import SIGNALS, Cycles, bridged
-from plant.effects import CATALOGUE, at
+from fdi.trace.columns import bridge_gaps, rms
+from fdi.trace.signals import OUTPUTS
+from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model
-from plant.state import Input
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -30,7 +31,6 @@ WELL_BELOW = 0.2  # of the floor, that halving the step may move a replay
 FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
 KNIFE = 1e-3  # of a friction level; no simulator, no oil and no seal is known as well as that
 EDGE = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}  # less than that is moved by a little friction without any edge
-SWEEP = 4000  # positions
 SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
 QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
 
@@ -46,85 +46,73 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
 
 
-def open_loop(c: Cycles, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
+def open_loop(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
     lanes = Lanes(model.replace(QUIET), (), steps)
-    out = lanes.replay(np.empty((1, 0)), c.cor, c.load, c.xj if known_start(c) else None, anchor)
-    return {name: out[0, :, i] for i, name in enumerate(SIGNALS)}
+    out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if known_start(trace) else None, anchor)
+    return {name: out[0, :, i] for i, name in enumerate(OUTPUTS)}
 
 
-def known_start(c: Cycles) -> bool:
+def measure_misfit(trace: Trace, model: Model) -> float:
+    """How badly a replay fits the outputs of a prepared trace: the mean logarithm of their RMS residuals."""
+    left = residuals(trace, open_loop(trace, model, 20))
+    return sum(math.log(rms(r)) for r in left.values()) / len(left)
+
+
+def known_start(trace: Trace) -> bool:
     """Whether the first position is known; else the replay starts in the middle."""
-    return not np.isnan(c.xj[0])
+    return not np.isnan(trace.xj[0])
 
 
-def checked(c: Cycles, model: Model, floor: Mapping[str, float]) -> Replay:
+def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     values = edges(model)
     lanes = Lanes(model.replace(QUIET), frictions(model), STEPS)
-    position = c.xj if known_start(c) else None
-    runs = lanes.replay(values, c.cor, c.load, position, ANCHOR)
-    others = [lanes.replay(values[:1], cor, c.load, position, ANCHOR) for cor in guesses(c)]
+    position = trace.xj if known_start(trace) else None
+    runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
+    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR) for cor in guesses(trace)]
     runs = np.concatenate([runs, *others])
-    undecided = np.zeros(len(c), bool)
-    for i, name in enumerate(SIGNALS):
+    undecided = np.zeros(len(trace), bool)
+    for i, name in enumerate(OUTPUTS):
         if name in floor:
             moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-            undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(c.measured(name))
+            undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(trace.measured(name))
     coarse, steps = runs[0], STEPS
     while True:
         finer = Lanes(model.replace(QUIET), frictions(model), 2 * steps)
-        fine = finer.replay(values[:1], c.cor, c.load, position, ANCHOR)[0]
-        error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(SIGNALS) if name in floor}
+        fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR)[0]
+        error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
         small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
         coarse, steps = fine, 2 * steps
         if small or steps >= FINEST:
             break
-    found = {name: coarse[:, i] for i, name in enumerate(SIGNALS)}
+    found = {name: coarse[:, i] for i, name in enumerate(OUTPUTS)}
     guessed = runs[len(values):] - runs[:1]
-    blind = {name: rms(guessed[:, ~undecided, i]) if len(guessed) else 0.0 for i, name in enumerate(SIGNALS)}
-    return Replay(found, residuals(c, found), steps, error, undecided, blind)
+    blind = {name: rms(guessed[:, ~undecided, i]) if len(guessed) else 0.0 for i, name in enumerate(OUTPUTS)}
+    return Replay(found, residuals(trace, found), steps, error, undecided, blind)
 
 
-def guesses(c: Cycles) -> list[Floats]:
+def guesses(trace: Trace) -> list[Floats]:
     """The current with what its filled rows may have been instead; none if every row was recorded.
 
     The fill misses a row by as much as it would miss every other recorded row around: that error, with random signs.
     """
-    if not c.filled.any():
+    if not trace.filled.any():
         return []
-    there = np.flatnonzero(~c.filled)
+    there = np.flatnonzero(~trace.filled)
     odd = there[1::2]
-    thinned = c.cor.copy()
-    thinned[c.filled], thinned[odd] = np.nan, np.nan
-    again, lost = bridged(thinned, len(c))
-    error = np.where(lost, 0.0, c.cor - again)
-    near = odd[np.clip(np.searchsorted(odd, np.arange(len(c))), 0, len(odd) - 1)]
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(c))
-    return [c.cor + np.where(c.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
+    thinned = trace.cor.copy()
+    thinned[trace.filled], thinned[odd] = np.nan, np.nan
+    again, lost = bridge_gaps(thinned, len(trace))
+    error = np.where(lost, 0.0, trace.cor - again)
+    near = odd[np.clip(np.searchsorted(odd, np.arange(len(trace))), 0, len(odd) - 1)]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(trace))
+    return [trace.cor + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
 
 
-def read_noise(model: Model, xj: Floats) -> float:
-    """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
-
-    A sweep through it, as neither is in a replay.
-    """
-    level = model["sensors.position_noise"]
-    law, memory = at("reading", model.effects)
-    if not any(CATALOGUE[name].port == "reading" for name in model.effects):
-        return level
-    noise = level * np.random.default_rng(0).standard_normal(SWEEP)
-    true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
-    s, p, out = model.state(), model.record()[0], np.empty(SWEEP)
-    for k, x in enumerate((true + noise).tolist()):
-        u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
-        out[k], memory = law(x, memory, s, u, p)
-    return rms(out - true)
-
-
-def residuals(c: Cycles, model: Columns) -> Columns:
+def residuals(trace: Trace, model: Columns) -> Columns:
     """Measured less model, of the chosen signals."""
-    return {name: c.measured(name) - model[name] for name in c.signals}
+    return {name: trace.measured(name) - model[name] for name in trace.outputs}
 
 
 def frictions(model: Model) -> tuple[str, ...]:
@@ -155,24 +143,24 @@ def _windows_above(moved: Floats, floor: float) -> Flags:
     return out
 
 
-def drift(c: Cycles, model: Model, steps: int = STEPS) -> tuple[float, float]:
+def drift(trace: Trace, model: Model, steps: int = STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
-    free = c.measured("xj") - open_loop(c, model, steps, 0.0)["xj"]
+    free = trace.measured("xj") - open_loop(trace, model, steps, 0.0)["xj"]
     there = ~np.isnan(free)
-    t = c.t[there] - c.t[there].mean()
+    t = trace.t[there] - trace.t[there].mean()
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
 
 
-def closed_loop(c: Cycles, model: Model, steps: int = STEPS) -> Columns:
+def closed_loop(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
-    before = round(SETTLED / c.period)
-    com = np.concatenate([np.full(before, c.com[0]), c.com])
-    load = np.concatenate([np.full(before, c.load[0]), c.load])
+    before = round(SETTLED / trace.period)
+    com = np.concatenate([np.full(before, trace.com[0]), trace.com])
+    load = np.concatenate([np.full(before, trace.load[0]), trace.load])
     lanes = Lanes(model.replace(QUIET), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), com, load)[0, before:]
     whole = {"xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3]}
-    left = {name: c.measured(name) - whole[name] for name in c.signals}
-    return left | {"cor": c.measured("cor") - whole["cor"]}
+    left = {name: trace.measured(name) - whole[name] for name in trace.outputs}
+    return left | {"cor": trace.measured("cor") - whole["cor"]}
 
 
 def derivative(x: Floats, size: int, order: int) -> Floats:
@@ -181,9 +169,3 @@ def derivative(x: Floats, size: int, order: int) -> Floats:
     weights = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))[order] * order
     out: Floats = np.correlate(np.pad(x, size // 2, "edge"), weights, "valid")
     return out
-
-
-def rms(x: Floats) -> float:
-    """Root mean square of what is there; NaN for nothing."""
-    there = x[~np.isnan(x)]
-    return float(np.sqrt(np.mean(there**2))) if len(there) else float("nan")

@@ -11,8 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.replay import ANCHOR, QUIET, known_start, rms
-from fdi.trace.cycles import SIGNALS, Cycles
+from fdi.estimation.replay import ANCHOR, QUIET, known_start
+from fdi.trace.columns import rms
+from fdi.trace.signals import OUTPUTS
+from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model, meaning
 
@@ -43,20 +45,20 @@ def tolerances(model: Model) -> dict[str, float]:
     return {name: size for name, size in known.items() if size > 0.0}
 
 
-def scatter(c: Cycles, model: Model, floor: Mapping[str, float]) -> Scatter:
+def scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
     known = tolerances(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
     lanes = Lanes(model.replace(QUIET), list(known), STEPS)
-    measured = np.array([c.measured(name) for name in c.signals])
-    columns = [SIGNALS.index(name) for name in c.signals]
-    scale = np.array([floor[name] for name in c.signals])[:, None]
-    position = c.xj if known_start(c) else None
+    measured = np.array([trace.measured(name) for name in trace.outputs])
+    columns = [OUTPUTS.index(name) for name in trace.outputs]
+    scale = np.array([floor[name] for name in trace.outputs])[:, None]
+    position = trace.xj if known_start(trace) else None
 
     def residual(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
-        out = lanes.replay(_possible(list(known), base + x * size), c.cor, c.load, position, ANCHOR)
+        out = lanes.replay(_possible(list(known), base + x * size), trace.cor, trace.load, position, ANCHOR)
         left: Floats = np.nan_to_num((measured - out.transpose(0, 2, 1)[:, columns]) / scale)
         return left.reshape(len(x), -1)
 
@@ -73,7 +75,8 @@ def scatter(c: Cycles, model: Model, floor: Mapping[str, float]) -> Scatter:
         best = int(np.argmin(costs + (tried**2).sum(axis=1)))
         x, now = tried[best], found[best]
     rows = now.reshape(len(scale), -1)
-    ratio = {name: rms(np.where(np.isnan(y), np.nan, r)) for name, r, y in zip(c.signals, rows, measured, strict=True)}
+    ratio = {name: rms(np.where(np.isnan(y), np.nan, r))
+             for name, r, y in zip(trace.outputs, rows, measured, strict=True)}
     error = {name: ratio[name] * floor[name] for name in ratio}
     moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
     return Scatter(error, ratio, moved, max(ratio.values()) < SCATTER)

@@ -26,7 +26,7 @@ TWICE = 2.0  # floors: noise stays within for 95 % of the time
 
 def overview(found: Comparison) -> str:
     """Command and position, then each signal measured and replayed, and what is left of it beside the floor."""
-    c, names = found.cycles, list(found.signals)
+    c, names = found.trace, list(found.signals)
     with rc_context(STYLE):
         heights = [1.5] + [1.3, 1.3] * len(names)
         figure = Figure(figsize=(11, 0.8 + sum(heights)), layout="constrained")
@@ -48,8 +48,8 @@ def overview(found: Comparison) -> str:
 
 def _replayed(ax: Axes, found: Comparison, name: str) -> None:
     label, unit, scale = SHOWN[name]
-    t = found.cycles.t
-    ax.plot(*thin_line(t, found.cycles.measured(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
+    t = found.trace.t
+    ax.plot(*thin_line(t, found.trace.measured(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
     ax.plot(*thin_line(t, found.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
     ax.set_ylabel(f"{label} [{unit}]")
     ax.legend(loc="upper right", ncols=2, frameon=False)
@@ -59,12 +59,12 @@ def _left(ax: Axes, found: Comparison, name: str) -> None:
     label, unit, scale = SHOWN[name]
     floor = TWICE * found.signals[name].floor.value * scale
     ax.axhspan(-floor, floor, color=NOISE, alpha=0.25, lw=0)
-    ax.plot(*thin_line(found.cycles.t, found.replay.residual[name] * scale), color=INK, lw=0.7)
+    ax.plot(*thin_line(found.trace.t, found.replay.residual[name] * scale), color=INK, lw=0.7)
     ax.set_ylabel(f"left of {label}\n[{unit}]")
 
 
 def _shaded(ax: Axes, found: Comparison) -> None:
-    c = found.cycles
+    c = found.trace
     for section in sections(c.com, c.period):
         if section.kind in ("ramp", "dynamic"):
             ax.axvspan(float(c.t[section.start]), float(c.t[section.stop - 1]),
@@ -99,7 +99,7 @@ def whiteness(found: Comparison) -> str:
         rows = figure.subplots(len(names), 3, squeeze=False)
         for name, axes in zip(names, rows, strict=True):
             d = found.diagnoses[name]
-            _autocorrelation(axes[0], d, found.cycles.period, SHOWN[name][0])
+            _autocorrelation(axes[0], d, found.trace.period, SHOWN[name][0])
             _periodogram(axes[1], d)
             _cross(axes[2], d)
         return to_svg(figure, "whiteness")

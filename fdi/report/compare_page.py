@@ -29,10 +29,10 @@ def render(found: Comparison) -> str:
 
 
 def _facts(found: Comparison) -> list[tuple[str, str]]:
-    c = found.cycles
+    c = found.trace
     length = f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"
     return [("model", found.model.name), ("trace", length),
-            ("repeats", str(found.repeats)), ("signals", ", ".join(SHOWN[name][0] for name in c.signals))]
+            ("repeats", str(found.repeats)), ("signals", ", ".join(SHOWN[name][0] for name in c.outputs))]
 
 
 def _signal(found: Comparison, name: str) -> dict[str, Any]:

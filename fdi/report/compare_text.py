@@ -136,7 +136,7 @@ def lines(found: Comparison) -> list[tuple[str, str]]:
         way = "further" if gain > 0 else "less"
         out.append(("flow", f"the ram moves {100 * abs(gain):.2g} % {way} than the flow through the edges says"))
     slope = found.drift * 1e6
-    if "xj" in found.signals and abs(slope) > 1.0 and not found.cycles.filled.any():
+    if "xj" in found.signals and abs(slope) > 1.0 and not found.trace.filled.any():
         out.append(("drift", f"a replay not held to the measured position departs by {slope:.3g} um/s"))
     out += [("residual", f"{SHOWN[name][0]}: {text}") for name, text in _residuals(found)]
     if found.scatter is not None:
@@ -146,7 +146,7 @@ def lines(found: Comparison) -> list[tuple[str, str]]:
 
 def _solver(found: Comparison) -> str:
     parts = [f"{SHOWN[s.name][0]} {amount(s.solver_error, s.name)}" for s in found.signals.values()]
-    step = 1e6 * found.cycles.period / found.replay.steps
+    step = 1e6 * found.trace.period / found.replay.steps
     return f"halving the step to {step:g} us moves {', '.join(parts)}"
 
 

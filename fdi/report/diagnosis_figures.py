@@ -16,8 +16,8 @@ from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
-from fdi.trace.cycles import Cycles
 from fdi.trace.sections import Section, sections
+from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 
@@ -27,14 +27,14 @@ UM, MM, MS = 1e6, 1e3, 1e3
 ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
 
 
-def overview(c: Cycles, judged: Judged) -> str:
+def overview(trace: Trace, judged: Judged) -> str:
     """Command and position of the whole trace, the stays outside the bands shaded."""
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 2.4), layout="constrained")
         ax = figure.subplots()
-        ax.plot(*thin_line(c.t, c.com * MM), color=COMMAND, lw=2.2, label="Com, command")
-        ax.plot(*thin_line(c.t, c.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
-        ax.set_xlim(float(c.t[0]), float(c.t[-1]) + c.period)
+        ax.plot(*thin_line(trace.t, trace.com * MM), color=COMMAND, lw=2.2, label="Com, command")
+        ax.plot(*thin_line(trace.t, trace.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
+        ax.set_xlim(float(trace.t[0]), float(trace.t[-1]) + trace.period)
         _shade(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
         ax.set_xlabel("time [s]")
@@ -42,29 +42,29 @@ def overview(c: Cycles, judged: Judged) -> str:
         return to_svg(figure, "overview")
 
 
-def steps(c: Cycles, bands: Bands, judged: Judged) -> str:
+def steps(trace: Trace, bands: Bands, judged: Judged) -> str:
     """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
     if not bands.steps:
         return ""
-    place = _places(c, bands)
+    place = _places(trace, bands)
     with rc_context(STYLE):
         across = min(2, len(bands.steps))
         down = -(-len(bands.steps) // across)
         figure = Figure(figsize=(11, 2.5 * down), layout="constrained")
         axes = figure.subplots(down, across, squeeze=False).ravel()
         for ax, step in zip(axes, bands.steps, strict=False):
-            _step(ax, c, bands, step, place[step.section], judged)
+            _step(ax, trace, bands, step, place[step.section], judged)
         for ax in axes[len(bands.steps):]:
             ax.set_axis_off()
         axes[0].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
         return to_svg(figure, "steps")
 
 
-def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged: Judged) -> None:
-    xj, t = c.measured("xj"), step.t * MS
+def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: Judged) -> None:
+    xj, t = trace.measured("xj"), step.t * MS
     centre, spread = step.centre(judged.friction, bands.friction)
     middle, most, there = bands.margins(step, spread)
-    rows = s.start + np.rint(step.t / c.period).astype(int)
+    rows = s.start + np.rint(step.t / trace.period).astype(int)
     rows = np.minimum(rows, s.stop - 1)
     healthy = BAND_NEAREST_LIMIT_SD * spread * UM
     ax.fill_between(t, -healthy, healthy, color=GREEN, alpha=0.15, lw=0, label="healthy")
@@ -73,40 +73,40 @@ def _step(ax: Axes, c: Cycles, bands: Bands, step: StepBand, s: Section, judged:
         ax.plot(t, np.where(there, side * limit, np.nan) * UM, color=colour, lw=1.6, label=label)
     ax.plot(t, (xj[rows] - centre) * UM, color=INK, lw=1.0, label="measured")
     ax.set_xlim(0.0, float(t[-1]))
-    _shade(ax, judged.events, MS, float(c.t[s.start]), "position")
-    ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(c.t[s.start]):.4g} s", fontsize=9)
+    _shade(ax, judged.events, MS, float(trace.t[s.start]), "position")
+    ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(trace.t[s.start]):.4g} s", fontsize=9)
     ax.set_xlabel("time from the step [ms]")
     ax.set_ylabel("off the healthy\nresponse [µm]")
 
 
-def ramps(c: Cycles, bands: Bands, judged: Judged) -> str:
+def ramps(trace: Trace, bands: Bands, judged: Judged) -> str:
     """Each judged ramp: following error and speed within their limits, and events."""
     if not bands.ramps:
         return ""
-    place = _places(c, bands)
+    place = _places(trace, bands)
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 4.6), layout="constrained")
         axes = figure.subplots(2, len(bands.ramps), sharex="col", sharey="row", squeeze=False)
         for pair, ramp in zip(axes.T, bands.ramps, strict=True):
-            _ramp(pair, c, ramp, place[ramp.section], judged)
+            _ramp(pair, trace, ramp, place[ramp.section], judged)
         axes[0, 0].set_ylabel("error [µm]")
         axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
         axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
         return to_svg(figure, "ramps")
 
 
-def _ramp(axes: Sequence[Axes], c: Cycles, ramp: RampBand, s: Section, judged: Judged) -> None:
-    rows, way, xj = judged_rows(s, c.period), np.sign(s.rate), c.measured("xj")
-    error = way * (c.com[rows] - xj[rows])
-    fast = way * speed(xj, c.period)[rows] - abs(s.rate)
+def _ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: Judged) -> None:
+    rows, way, xj = judged_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
+    error = way * (trace.com[rows] - xj[rows])
+    fast = way * speed(xj, trace.period)[rows] - abs(s.rate)
     scale = ramp.scale(float(waver(error)), float(lasting_most(fast)))
     signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
         _widths(ax, width, unit, nearer)
-        ax.plot(*thin_line(c.t[rows], values * unit), color=INK, lw=0.8, label="measured")
-        ax.set_xlim(float(c.t[rows.start]), float(c.t[rows.stop - 1]))
+        ax.plot(*thin_line(trace.t[rows], values * unit), color=INK, lw=0.8, label="measured")
+        ax.set_xlim(float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
         _shade(ax, judged.events, 1.0, 0.0, name)
-    axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(c.t[rows.start]):.4g} s", fontsize=9)
+    axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(trace.t[rows.start]):.4g} s", fontsize=9)
     axes[-1].set_xlabel("time [s]")
 
 
@@ -120,10 +120,10 @@ def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
             ax.axhline(middle - nearer * limit * unit, color=colour, lw=1.2)
 
 
-def _places(c: Cycles, bands: Bands) -> dict[int, Section]:
+def _places(trace: Trace, bands: Bands) -> dict[int, Section]:
     """The trace's sections by their number in the bands."""
-    com = columns(c)[0]
-    own = [s for s in sections(com, c.period) if s.kind in ("step", "ramp")]
+    com = columns(trace)[0]
+    own = [s for s in sections(com, trace.period) if s.kind in ("step", "ramp")]
     return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
 
 

@@ -155,10 +155,10 @@ def describe_deviation(parameter: str, size: Estimate) -> str:
 
 
 def _list_facts(d: Diagnosis) -> list[tuple[str, str]]:
-    c = d.cycles
+    c = d.trace
     changes = [f"{name}={value:g}" for name, value in sorted(d.model.differences().items())]
     return [("trace", f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"),
-            ("signals", ", ".join(SIGNAL_NAMES[name] for name in c.signals)),
+            ("signals", ", ".join(SIGNAL_NAMES[name] for name in c.outputs)),
             ("model", " ".join([d.model.name, *changes])), ("software", software())]
 
 
@@ -205,8 +205,8 @@ def _draw_bands(d: Diagnosis) -> list[Item]:
             from fdi.report import diagnosis_figures
 
             if name == "overview":
-                return diagnosis_figures.overview(d.cycles, judged)
-            return "" if bands is None else getattr(diagnosis_figures, name)(d.cycles, bands, judged)
+                return diagnosis_figures.overview(d.trace, judged)
+            return "" if bands is None else getattr(diagnosis_figures, name)(d.trace, bands, judged)
 
         return draw_now
 

@@ -15,8 +15,8 @@ from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.search import Hypothesis
 from fdi.report.drawing import COMMAND, INK, STYLE, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES
-from fdi.trace.record import Record
 from fdi.trace.sections import sections
+from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 
@@ -28,17 +28,17 @@ TWICE = 2.0  # floors: noise stays within for 95 % of the time
 BARS = 12
 
 
-def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floor: Mapping[str, float],
+def left_over(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor: Mapping[str, float],
               name_of_after: str = "with what was found") -> str:
     """What the model leaves of each signal over time, without and with the effects, over the command."""
-    t, n = record.trace.t, len(record)
+    t, n = trace.t, len(trace)
     with rc_context(STYLE):
-        figure = Figure(figsize=(11, 1.4 + 1.7 * len(record.signals)), layout="constrained")
-        heights = [0.8] + [1.2] * len(record.signals)
+        figure = Figure(figsize=(11, 1.4 + 1.7 * len(trace.outputs)), layout="constrained")
+        heights = [0.8] + [1.2] * len(trace.outputs)
         axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        axes[0].plot(*thin_line(t, record.com * 1e3), color=COMMAND, lw=1.6)
+        axes[0].plot(*thin_line(t, trace.com * 1e3), color=COMMAND, lw=1.6)
         axes[0].set_ylabel("Com [mm]")
-        for i, (ax, name) in enumerate(zip(axes[1:], record.signals, strict=True)):
+        for i, (ax, name) in enumerate(zip(axes[1:], trace.outputs, strict=True)):
             scale, unit = SCALES[name]
             line = thin_line(t, before.fit.residuals[i, :n] * scale)
             ax.plot(*line, color=BEFORE, lw=0.9, label="the model as it was")
@@ -51,18 +51,18 @@ def left_over(record: Record, before: Hypothesis, after: Hypothesis | None, floo
             ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
         axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
         for ax in axes:
-            _shaded(ax, record)
+            _shaded(ax, trace)
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(t[0]), float(t[-1]))
         figure.align_ylabels()
         return to_svg(figure, "left")
 
 
-def _shaded(ax: Axes, record: Record) -> None:
+def _shaded(ax: Axes, trace: Trace) -> None:
     """Ramps and dynamic sections of the command."""
-    for s in sections(record.com, record.trace.period):
+    for s in sections(trace.com, trace.period):
         if s.kind in ("ramp", "dynamic"):
-            ax.axvspan(float(record.trace.t[s.start]), float(record.trace.t[s.stop - 1]),
+            ax.axvspan(float(trace.t[s.start]), float(trace.t[s.stop - 1]),
                        color="#f1f3f8" if s.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
 
 

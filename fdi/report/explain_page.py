@@ -41,7 +41,7 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
         notes: what a reader must know of the runs.
     """
     e = a.explanation
-    record = e.search.problem.record
+    trace = e.search.problem.trace
     after = a.best if a.best is not e.base else None
     return _page(
         title=title, verdict=a.verdict, mood=MOODS[a.verdict], why=explain_text.sentence(a),
@@ -49,12 +49,12 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
         notes=notes, facts=[("model", model), *_runs(sources, bool(a.baseline["holdout"]))], command=[command],
         candidates=[_candidate(c, list(e.floor)) for c in a.explanations], signals=[SIGNAL_NAMES[s] for s in e.floor],
         parameters=_parameters([c for c in a.candidates if c.effect in e.effects]),
-        left=explain_figures.left_over(record, e.base, after, e.floor,
+        left=explain_figures.left_over(trace, e.base, after, e.floor,
                                 "with what was found" if e.effects else "with the best candidate"),
         ranking=explain_figures.ranking(a.explanations, e.floor) if a.candidates else "",
         ledger=explain_figures.ledger([Row(*row) for row in a.ledger], a.baseline["floor"])
         if len(a.ledger) > 2 else "",
-        shape=explain_figures.shape(shape, record.trace.t) if shape and shape.place else "",
+        shape=explain_figures.shape(shape, trace.t) if shape and shape.place else "",
         blind=[(b.effect, name_parameter(b.parameter), format_amount(b.smallest, b.unit),
                 format_amount(b.usual, b.unit),
                 not b.smallest <= b.usual) for b in a.blind], suspicious=_suspicious(a.suspicious))
@@ -63,14 +63,14 @@ def explanation(a: Answer, title: str, model: str, sources: Sequence[Source], co
 def ledger(r: Refit, p: Provenance, intervals: Mapping[str, Value], title: str, why: str,
            doubts: Sequence[Suspicious], notes: Sequence[str] = ()) -> str:
     """The page of `rig add` and `rig remove`."""
-    record, floor, rows = r.search.problem.record, p.floor or r.floor, p.ledger
+    trace, floor, rows = r.search.problem.trace, p.floor or r.floor, p.ledger
     sources, mood = [s for s in (p.trace, *p.repeats, p.holdout) if s], "good" if r.helps else "doubtful"
     first, last = r.steps[0].hypothesis, r.last.hypothesis
     return _page(
         title=title, verdict="FITTED", mood=mood, why=why, lines=[], then="", notes=notes, command=p.history,
         facts=_runs(sources, bool(p.holdout)), candidates=[], signals=[SIGNAL_NAMES[s] for s in floor],
         parameters=[(name, format_interval(v.value, v.low, v.high, v.unit)) for name, v in intervals.items()],
-        left=explain_figures.left_over(record, first, last if last is not first else None, floor), ranking="", shape="",
+        left=explain_figures.left_over(trace, first, last if last is not first else None, floor), ranking="", shape="",
         ledger=explain_figures.ledger(rows, floor), blind=[], suspicious=_suspicious(doubts),
         rows=[_row(row, floor) for row in rows])
 

@@ -1,9 +1,10 @@
-"""A captured run as numpy columns: the one thing that crosses from the rig to analysis."""
+"""A recording as numpy columns: the one thing that crosses from the rig to analysis, and its only container there."""
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,18 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.columns import shift_rows
 from fdi.trace.csv_table import read_csv, write_csv
 from fdi.trace.foreign import read_foreign, recorded_by
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, sections
+from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Messages = list[tuple[int, Any]]  # (time ns, protobuf message)
 
 REQUIRED = ("t", "com", "xj", "cor")
 OPTIONAL = ("p12", "xs", "load")
-UNITS = {"t": "s", "com": "m", "xj": "m", "cor": "A", "p12": "Pa", "xs": "m", "load": "N"}
+UNITS = {name: signal.unit for name, signal in SIGNALS.items()}
 SETUP, MAIN, CLEANUP = 0, 1, 2
 
 
@@ -88,6 +92,9 @@ class Trace:
 
     Columns have shape (n,) and SI units; a signal that was not measured is NaN throughout. t = 0 is where
     the main phase starts.
+
+    A trace that was prepared for replay (fdi.estimation.preparation) has Com, Cor and load without gaps, names the
+    `outputs` that replays are compared with, and flags the rows for which that cannot be done.
     """
 
     t: Floats
@@ -99,6 +106,10 @@ class Trace:
     load: Floats
     period: float  # s
     phase: NDArray[np.int64]  # 0 set-up, 1 main, 2 clean-up
+    usable: Flags  # rows that a replay can be compared with; all rows of a trace that was not prepared
+    filled: Flags  # rows whose current is interpolated
+    incomplete: Flags  # rows in which Com, XJ or Cor was not recorded, though preparation has filled them
+    outputs: tuple[str, ...] = ()  # of OUTPUTS, measured and chosen; none in a trace that was not prepared
     gaps: tuple[Gap, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what reading had to leave out
@@ -144,6 +155,37 @@ class Trace:
             raise KeyError(name)
         values: Floats = getattr(self, name)
         return values
+
+    def measured(self, name: str) -> Floats:
+        """A column, NaN where it is missing or its row cannot be used."""
+        return np.where(self.usable, self.column(name), np.nan)
+
+    @cached_property
+    def measurements(self) -> Floats:
+        """The outputs as rows (s, n), NaN where they are missing or cannot be used."""
+        return np.array([self.measured(name) for name in self.outputs])
+
+    @property
+    def output_columns(self) -> list[int]:
+        """Where the outputs stand among the columns of a replay."""
+        return [OUTPUTS.index(name) for name in self.outputs]
+
+    @cached_property
+    def position(self) -> Floats:
+        """XJ as a replay is drawn to it: as measured, and known in the first row, where the replay starts."""
+        if not np.isnan(self.xj[0]):
+            return self.xj
+        position = self.xj.copy()
+        position[0] = position[~np.isnan(position)][0]
+        return position
+
+    def with_notes(self, *notes: str) -> Trace:
+        """The same trace with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def with_delays(self, com: int = 0, cor: int = 0) -> Trace:
+        """The same trace with Com and Cor delayed by so many cycles (negative: advanced)."""
+        return replace(self, com=shift_rows(self.com, com), cor=shift_rows(self.cor, cor))
 
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
@@ -196,6 +238,7 @@ def _trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: o
     nothing = np.full(len(t), math.nan)
     columns = {name: grid.get(name, nothing) for name in (*REQUIRED, *OPTIONAL)}
     more.setdefault("phase", np.full(len(t), MAIN))
+    more.update(usable=np.ones(len(t), bool), filled=np.zeros(len(t), bool), incomplete=np.zeros(len(t), bool))
     in_seconds = tuple(Gap(float(t[int(g.t0)]), float(t[int(g.t1)]), g.cycles) for g in gaps)
     return Trace(**columns, period=period, gaps=in_seconds, **more)  # type: ignore[arg-type]
 

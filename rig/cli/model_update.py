@@ -88,7 +88,7 @@ def runs_of(args: argparse.Namespace, trace: str | None, model: Model, known: Pr
 def added(new: Sequence[str], runs: Runs, model: Model, known: Provenance,
           progress: Progress) -> Done:
     """The model with `new` effects as well. `runs.model` is the model before any effect was added."""
-    goes_on = bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.signals)
+    goes_on = bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)
     done = len(known.effects) if goes_on else 0
     r = refit(runs.model, [*known.effects, *new], runs.est, runs.repeats, runs.holdout, progress, model.values, done)
     rows = [Row(s.effect, s.error, s.holdout) for s in r.steps]
@@ -105,7 +105,7 @@ def removed(name: str, runs: Runs | None, model: Model, known: Provenance,
         note = f"the other parameters are as they were fitted with {name}; give a TRACE to fit them anew"
         return Done(left, less, None, {}, (), (note,))
     kept = list(known.ledger)
-    if not (kept and known.same_data(runs.sources, len(runs.repeats), runs.est.signals)):
+    if not (kept and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)):
         whole = refit(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
                       len(known.effects)).last
         kept = [Row(whole.effect, whole.error, whole.holdout)]
@@ -126,7 +126,7 @@ def _finished(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], r
     floor = {s: min(x, before_it.get(s, x)) if len(rows) > len(r.steps) else x for s, x in r.floor.items()}
     provenance = replace(
         known, software=software(), history=(*known.history, discovery_options.typed()), effects=tuple(effects),
-        signals=runs.est.signals, trace=runs.sources[0], repeats=runs.sources[1:1 + len(runs.repeats)], holdout=held,
+        signals=runs.est.outputs, trace=runs.sources[0], repeats=runs.sources[1:1 + len(runs.repeats)], holdout=held,
         floor=floor, before={**(known.before or {}), **before}, ledger=tuple(rows))
     return Done(model, provenance, r, values, suspicious(fit, model.plant), notes)
 

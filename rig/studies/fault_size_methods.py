@@ -32,14 +32,14 @@ def optimisers(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
     """Least squares and the global optimisers, each from the grid's answer."""
     from fdi.diagnosis import optimisers as ways
 
-    record, model = d.record, d.model
+    trace, model = d.trace, d.model
     start = (d.grid.merged.kintas, d.grid.merged.fss) if d.grid else (0.1, 15.0)
     for number, method in enumerate(ways.METHODS):
         name = method.__name__.replace("_", " ")
         progress(name, number / len(ways.METHODS))
         if not ways.available(method):
             continue
-        found, seconds = timed(partial(method, model, record, start, d.floor, seed))
+        found, seconds = timed(partial(method, model, trace, start, d.floor, seed))
         yield Row(found.method, found.kintas, found.fss, found.left, None, None, None, None, found.simulations, seconds)
 
 
@@ -53,7 +53,7 @@ def comparators(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
 
     if not learners.available():
         raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
-    data, before = timed(lambda: learners.lesson(d.cycles, d.model, seed, progress))
+    data, before = timed(lambda: learners.lesson(d.trace, d.model, seed, progress))
     for learner in learners.LEARNERS:
         progress(learner.__name__.replace("_", " "), 1.0)
         found, seconds = timed(partial(learner, data, seed))

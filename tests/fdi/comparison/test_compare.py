@@ -136,11 +136,11 @@ def test_every_other_row_lost_is_no_error() -> None:
     """The current between is guessed, and the floor says how little is known then."""
     columns = {name: getattr(healthy(2), name)[::2] for name in ("com", "xj", "cor", "p12", "xs", "load")}
     found = compare(Trace.of(columns, 2e-3, {}), MODEL)
-    assert found.verdict in ("CANNOT_TELL", "WITHIN_FLOOR") and found.cycles.period == 1e-3
+    assert found.verdict in ("CANNOT_TELL", "WITHIN_FLOOR") and found.trace.period == 1e-3
     slow = MODEL.replace({"controller.period": 0.002})
     run = simulate(slow, SHORT[::2], seed=1)
     found = compare(Trace.of(run._asdict(), 2e-3, {}), MODEL)
-    assert at_floor(found) and found.cycles.period == 2e-3
+    assert at_floor(found) and found.trace.period == 2e-3
 
 
 def test_rows_lost_at_random_are_no_error() -> None:

@@ -8,24 +8,26 @@ import pytest
 from noisy_traces import healthy
 
 from fdi.comparison.controller_block import DISAGREES, controller, lags, resolution
-from fdi.trace.cycles import Cycles, readings, shift
+from fdi.estimation.preparation import read_cycles
+from fdi.trace.columns import shift_rows
+from fdi.trace.trace import Trace
 from plant import Model, simulate
 
 MODEL = Model()
 
 
 @pytest.fixture(scope="module")
-def c() -> Cycles:
-    return readings(healthy(), MODEL)[0]
+def c() -> Trace:
+    return read_cycles(healthy(), MODEL)[0]
 
 
-def test_the_same_firmware_agrees_to_the_last_digit(c: Cycles) -> None:
+def test_the_same_firmware_agrees_to_the_last_digit(c: Trace) -> None:
     found = controller(c, MODEL)
     assert found.error < 1e-15 and found.ratio <= 1.0 and (found.com_lag, found.xj_lag) == (0, 0)
 
 
 @pytest.mark.parametrize("digits", [6, 9])
-def test_rounding_in_a_file_is_no_disagreement(c: Cycles, digits: int) -> None:
+def test_rounding_in_a_file_is_no_disagreement(c: Trace, digits: int) -> None:
     def rounded(x: np.ndarray) -> np.ndarray:
         return np.array([float(f"{v:.{digits - 1}e}") for v in x.tolist()])
 
@@ -33,7 +35,7 @@ def test_rounding_in_a_file_is_no_disagreement(c: Cycles, digits: int) -> None:
     assert found.ratio < DISAGREES
 
 
-def test_rounding_on_the_bus_is_no_disagreement(c: Cycles) -> None:
+def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
     """The firmware sees what the bus carries, and its answer is rounded to 1e-8 A."""
     xj = np.round(c.xj / 1e-7) * 1e-7
     cor = np.round(np.clip(3.8 * (c.com - xj), -8e-3, 8e-3) / 1e-8) * 1e-8
@@ -47,7 +49,7 @@ def test_rounding_on_the_bus_is_no_disagreement(c: Cycles) -> None:
 def test_another_firmware_is_told(changes: dict[str, float]) -> None:
     model = MODEL.replace(changes)
     run = simulate(model, healthy().com, seed=1, steps=20)
-    c = replace(readings(healthy(), MODEL)[0], com=run.com, xj=run.xj, cor=run.cor)
+    c = replace(read_cycles(healthy(), MODEL)[0], com=run.com, xj=run.xj, cor=run.cor)
     found = controller(c, MODEL)
     assert found.ratio > 100 and (found.com_lag, found.xj_lag) == (0, 0)
     assert controller(c, model).ratio <= 1.0
@@ -56,9 +58,9 @@ def test_another_firmware_is_told(changes: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize(("com", "xj"), [(3, 0), (-2, 0), (0, 2), (2, 2)])
-def test_columns_that_are_late(c: Cycles, com: int, xj: int) -> None:
+def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     """`com` cycles before row k is what Cor_k answers, the file having it earlier than it should."""
-    found = controller(replace(c, com=shift(c.com, -com), xj=shift(c.xj, -xj)), MODEL)
+    found = controller(replace(c, com=shift_rows(c.com, -com), xj=shift_rows(c.xj, -xj)), MODEL)
     assert (found.com_lag, found.xj_lag) == (com, xj) and found.ratio <= 1.0
     assert lags(c, 8e-3)[:2] == (0, 0)
 
@@ -72,7 +74,7 @@ def test_resolution_of_a_column() -> None:
     assert resolution(rng.standard_normal(1000)) < 1e-10
 
 
-def test_missing_samples_are_not_judged(c: Cycles) -> None:
+def test_missing_samples_are_not_judged(c: Trace) -> None:
     xj = c.xj.copy()
     xj[100:103] = np.nan
     found = controller(replace(c, xj=xj), MODEL)

@@ -9,19 +9,20 @@ from noisy_traces import LEVELS, healthy, noise
 
 from fdi.comparison.localisation import Motion, condition, derivative, motion, places, whole
 from fdi.comparison.residual_tests import WHITE, colour, cumulative, depend, diagnose, follow, shape, whiten
-from fdi.trace.cycles import Cycles, readings
+from fdi.estimation.preparation import read_cycles
+from fdi.trace.trace import Trace
 from plant import Model
 
 LIMIT = 8e-3
 
 
 @pytest.fixture(scope="module")
-def c() -> Cycles:
-    return readings(healthy(), Model())[0]
+def c() -> Trace:
+    return read_cycles(healthy(), Model())[0]
 
 
 @pytest.fixture(scope="module")
-def m(c: Cycles) -> Motion:
+def m(c: Trace) -> Motion:
     return motion(c, {"xj": c.xj, "p12": c.p12, "xs": c.xs})
 
 
@@ -36,7 +37,7 @@ def test_derivatives_of_a_parabola() -> None:
     assert derivative(x, 21, 2)[20:80] == pytest.approx(np.ones(60))
 
 
-def test_motion_of_the_ram(c: Cycles, m: Motion) -> None:
+def test_motion_of_the_ram(c: Trace, m: Motion) -> None:
     sine = (c.t > 9.1) & (c.t < 9.4)
     assert m.v[sine] == pytest.approx(2 * np.pi * 3e-3 * np.cos(2 * np.pi * (c.t[sine] - 9.0 - 0.009)), abs=1.5e-3)
     assert np.isinf(m.reversed_for[:400]).all()
@@ -51,20 +52,20 @@ def test_motion_of_the_ram(c: Cycles, m: Motion) -> None:
     (lambda c, m: np.abs(c.cor) > 0.99 * LIMIT, "current at its limit"),
     (lambda c, m: m.v > 5e-4, "ram extends"),
 ])
-def test_the_condition_is_named(c: Cycles, m: Motion, chosen: object, words: str) -> None:
+def test_the_condition_is_named(c: Trace, m: Motion, chosen: object, words: str) -> None:
     rows = chosen(c, m)  # type: ignore[operator]
     z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
     said = condition(z2, m, LIMIT)
     assert said.startswith(("100 %", "99 %")) and re.search(words, said), said
 
 
-def test_noise_and_what_is_everywhere_have_no_condition(c: Cycles, m: Motion) -> None:
+def test_noise_and_what_is_everywhere_have_no_condition(c: Trace, m: Motion) -> None:
     assert condition(squares(2, len(c), np.zeros(len(c))), m, LIMIT) == ""
     assert condition(squares(2, len(c), np.full(len(c), 9.0)), m, LIMIT) == ""
     assert condition(np.full(len(c), np.nan), m, LIMIT) == ""
 
 
-def test_sections_with_their_shares(c: Cycles, m: Motion) -> None:
+def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
     z2 = squares(3, len(c), np.where((c.t >= 4.0) & (c.t < 6.0), 50.0, 0.0))
     found = places(c, z2, m, LIMIT)
     assert sum(p.share for p in found) == pytest.approx(1.0, abs=0.01)
@@ -79,7 +80,7 @@ def test_signals_are_weighed_by_their_floors() -> None:
     assert z2[0] == pytest.approx((1 + 4) / 2) and np.isnan(z2[1])
 
 
-def test_white_noise_stays_within_its_bands(c: Cycles, m: Motion) -> None:
+def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
     outside, reached, dependent = 0, 0, 0
     for seed in range(100, 120):  # not that of the trace, whose noise is in its own XJ
         d = diagnose(c, {"xj": noise(seed, len(c))[:, 0]}, {}, m)["xj"]
@@ -89,7 +90,7 @@ def test_white_noise_stays_within_its_bands(c: Cycles, m: Motion) -> None:
     assert outside <= 4 and reached <= 3 and dependent == 0  # 5 %, 1 % of two, none
 
 
-def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Cycles, m: Motion) -> None:
+def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Motion) -> None:
     r, repeat = (noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
     alone = diagnose(c, {"xj": r}, {}, m)["xj"]
     d = diagnose(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
@@ -105,7 +106,7 @@ def test_a_colour_is_taken_out() -> None:
 
 
 @pytest.mark.parametrize("lag", [1, 7, 30])
-def test_what_follows_an_input_is_found_with_its_lag(c: Cycles, lag: int) -> None:
+def test_what_follows_an_input_is_found_with_its_lag(c: Trace, lag: int) -> None:
     u = np.random.default_rng(0).standard_normal(len(c)).cumsum()
     left = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
     found = follow("Cor", u, WHITE, left, 1e-3)

@@ -10,8 +10,8 @@ from fdi.diagnosis.fault_unknowns import LARGEST, MOST, free_parameters, start_o
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level
 from fdi.diagnosis.levels import level, ruling, severity
 from fdi.diagnosis.refine import Refined, problem_of, refine
+from fdi.estimation.preparation import hold_inputs
 from fdi.estimation.valley import flats, relaxed, sloped
-from fdi.trace.record import record
 from plant import Model, load_model
 from rig.studies.campaign.case import simulate_case
 from rig.studies.campaign.matrix import build_matrix
@@ -26,7 +26,7 @@ def faulty(kintas: float, fss: float, **more: float) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def off_grid() -> Refined:
-    return refine(MODEL, record(recorded(faulty(0.17, 45.0))))
+    return refine(MODEL, hold_inputs(recorded(faulty(0.17, 45.0))))
 
 
 def test_a_pair_between_the_cells_of_a_grid(off_grid: Refined) -> None:
@@ -51,7 +51,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
     run = cases.measure_case(case, "est").trace
     trace = recorded({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
-    found = refine(MODEL, record(trace))
+    found = refine(MODEL, hold_inputs(trace))
     true = case.effects[0].value
     assert found.reached and found.fss.low * 0.98 < true < found.fss.high * 1.02
     assert found.kintas.low == pytest.approx(0.0, abs=0.03) and found.kintas.high < 0.2
@@ -62,7 +62,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     ({"constant_load.force": -1e3}, "constant_load.force", -1e3),
     ({"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}, "jack.dynamic_friction", 1000.0)])
 def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], name: str, value: float) -> None:
-    found = refine(MODEL, record(recorded(settings)))
+    found = refine(MODEL, hold_inputs(recorded(settings)))
     assert found.reached
     assert level(CLOGGING, found.kintas) == level(FRICTION, found.fss) == Level.ACCEPTABLE
     other = found.others[name]
@@ -71,7 +71,7 @@ def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], n
 
 def test_flat_directions_change_no_signal() -> None:
     """Scaled together, they are another plant and the same run; along any one of their parameters the run changes."""
-    problem, free = problem_of(MODEL, record(recorded({}))), free_parameters(MODEL)
+    problem, free = problem_of(MODEL, hold_inputs(recorded({}))), free_parameters(MODEL)
     x = start_of(free, 0.2, 20.0)
     flat = flats(problem, free, x)
     assert flat.shape == (len(free), 4)
@@ -81,7 +81,7 @@ def test_flat_directions_change_no_signal() -> None:
 
 
 def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
-    problem, found = problem_of(MODEL, record(recorded({}))), off_grid.fit
+    problem, found = problem_of(MODEL, hold_inputs(recorded({}))), off_grid.fit
     flat = flats(problem, found.free, found.x)
     here = sloped(problem, found.free, found.x, found.covariance, flat)
     along = np.abs(np.tensordot(flat.T, here.jacobian, 1)).max()

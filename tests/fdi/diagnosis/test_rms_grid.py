@@ -11,7 +11,7 @@ from rig_command import rig
 
 from fdi import Trace
 from fdi.diagnosis.rms_grid import FSS, KINTAS, Map, Point, bisector, merge, search
-from fdi.trace.cycles import readings
+from fdi.estimation.preparation import read_cycles
 from plant import InputError, Model, simulate
 from plant.monitor import Monitor
 from plant.profile import build
@@ -44,7 +44,7 @@ def test_maps_are_rms_of_the_monitor() -> None:
     measured = trace(0.25, 30.0)
     grid = search(measured, sliding=(1.0,))
     row, column = 7, 5
-    c = readings(measured, Model())[0]
+    c = read_cycles(measured, Model())[0]
     run = Monitor(Model()).replay(np.array([[KINTAS[row], FSS[column]]]), c.cor, c.xj, 20.0)[0, 0]
     step = np.r_[500:4001]  # the sections of the preflight
     ramp = np.r_[4001:6001, 6501:8501]

@@ -16,7 +16,7 @@ from fdi.discovery.search import Search, common
 from fdi.discovery.significance import Sensitivity, p_value, smallest_visible
 from fdi.estimation.fit import BLOCK, FITTED, misfit, weights
 from fdi.estimation.noise import fitted, level
-from fdi.trace.record import record
+from fdi.estimation.preparation import hold_inputs
 from fdi.trace.trace import Trace
 from plant import InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
@@ -110,7 +110,7 @@ def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
 
 def test_the_firmware_leaves_its_mark_without_noise() -> None:
     model = Model()
-    healthy, limited = record(_recorded({})), record(_recorded({"command_rate_limit.rate": 0.12}))
+    healthy, limited = hold_inputs(_recorded({})), hold_inputs(_recorded({"command_rate_limit.rate": 0.12}))
     assert np.nanmax(np.abs(firmware_residual(model, healthy))) == 0.0
     assert firmware(model, [healthy]) == (0.0, [])
     error, found = firmware(model, [limited])
@@ -121,8 +121,8 @@ def test_the_firmware_leaves_its_mark_without_noise() -> None:
 
 
 def test_a_converter_with_few_bits_leaves_a_comb() -> None:
-    assert comb(record(_recorded({}))) is None
-    tooth = comb(record(_recorded({"quantisation.lsb": 7.3e-6})))
+    assert comb(hold_inputs(_recorded({}))) is None
+    tooth = comb(hold_inputs(_recorded({"quantisation.lsb": 7.3e-6})))
     assert tooth is not None
     assert tooth.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4)
 
@@ -165,17 +165,17 @@ def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Pa
 def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
     short = Trace.of({k: v[:50] for k, v in _recorded({}).__dict__.items() if k in ("com", "xj", "cor")}, 1e-3, {})
     with pytest.raises(InputError, match="at least 200 cycles"):
-        record(short)
+        hold_inputs(short)
     with pytest.raises(InputError, match="measured signal"):
         trace = _recorded({})
-        record(Trace.of({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
+        hold_inputs(Trace.of({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
 
 
 @pytest.mark.parametrize("hertz", [11.4767, 99.6187])
 def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None:
     """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
     ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
-    search = Search(Model(), record(recorded(ripple)), [], ["supply_ripple"], 1)
+    search = Search(Model(), hold_inputs(recorded(ripple)), [], ["supply_ripple"], 1)
     starts = tones(search.problem, search.base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10

@@ -97,11 +97,11 @@ def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
 
 def test_global_optimisers_leave_less_than_the_grid(other_command: Diagnosis) -> None:
     d, grid = other_command, (0.1, 38.0)
-    at_grid = optimisers.Objective(optimisers.problem_of(d.model, d.record, d.floor), d.model, grid)
+    at_grid = optimisers.Objective(optimisers.problem_of(d.model, d.trace, d.floor), d.model, grid)
     left = at_grid.found("grid", at_grid.start).left
     for method in (optimisers.differential_evolution, optimisers.simulated_annealing, optimisers.genetic):
         if optimisers.available(method):
-            found = method(d.model, d.record, grid, d.floor, 0)
+            found = method(d.model, d.trace, grid, d.floor, 0)
             assert found.left < 0.9 * left and 200 < found.simulations < 500
             assert 19.0 <= found.fss <= 76.0 and 0.0 <= found.kintas <= 0.3
 
@@ -111,7 +111,7 @@ def test_learners_know_units_that_they_never_saw(other_command: Diagnosis, monke
         pytest.skip("needs scikit-learn")
     monkeypatch.setattr(comparators, "CLOGGINGS", (0.0, 0.3))
     monkeypatch.setattr(comparators, "FRICTIONS", (5.0, 45.0, 90.0))
-    data = comparators.lesson(other_command.cycles, other_command.model)
+    data = comparators.lesson(other_command.trace, other_command.model)
     assert data.unseen.sum() == 2 * 3 * comparators.HELD_OUT
     for learner in comparators.LEARNERS:
         found = learner(data)

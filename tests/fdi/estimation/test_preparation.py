@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.estimation.repeats import aligned, matching
-from fdi.trace.cycles import FEWEST, bridged, held, readings, shift
+from fdi.estimation.preparation import FEWEST_ROWS, read_cycles
+from fdi.estimation.repeats import align_columns, find_repeat
+from fdi.trace.columns import bridge_gaps, hold_last, shift_rows
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 
@@ -27,11 +28,11 @@ def made(period: float = 1e-3, **changes: np.ndarray) -> Trace:
 
 def test_a_plain_trace_stays_as_it_is() -> None:
     trace = healthy()
-    (c,) = readings(trace, MODEL)
-    assert c.signals == ("xj", "p12", "xs") and c.notes == () and c.usable.all() and not c.filled.any()
+    (c,) = read_cycles(trace, MODEL)
+    assert c.outputs == ("xj", "p12", "xs") and c.notes == () and c.usable.all() and not c.filled.any()
     assert (c.cor == trace.cor).all() and (c.measured("xs") == trace.xs).all() and len(c) == len(trace)
-    (c,) = readings(trace, MODEL, ["xs", "xj"])
-    assert c.signals == ("xj", "xs") and np.isnan(c.p12).all()
+    (c,) = read_cycles(trace, MODEL, ["xs", "xj"])
+    assert c.outputs == ("xj", "xs") and np.isnan(c.p12).all()
 
 
 @pytest.mark.parametrize(("changes", "field", "words"), [
@@ -41,36 +42,36 @@ def test_a_plain_trace_stays_as_it_is() -> None:
     ({"p12": 1e-5 * healthy().p12}, "p12", "values in Pa"),
     ({"p12": 100 * healthy().p12}, "p12", "values in Pa"),
     ({"xs": 1e6 * healthy().xs}, "xs", "values in m"),
-    ({"xs": np.zeros(13_500)}, "xs", r"lives; it is 0 throughout \(--signals xj,p12 leaves it out\)"),
-    ({"xj": np.full(13_500, 1e-3)}, "xj", "lives; it is 0.001 throughout$"),
+    ({"xs": np.zeros(13_500)}, "xs", r"changes; it is 0 throughout \(--signals xj,p12 leaves it out\)"),
+    ({"xj": np.full(13_500, 1e-3)}, "xj", "changes; it is 0.001 throughout$"),
     ({"cor": np.full(13_500, np.nan)}, "cor", "a measured column"),
 ])
 def test_what_cannot_be_is_refused_in_a_line(changes: dict[str, np.ndarray], field: str, words: str) -> None:
     with pytest.raises(InputError, match=f"trace: {field}: expected .*{words}") as told:
-        readings(made(**changes), MODEL)
+        read_cycles(made(**changes), MODEL)
     assert "\n" not in str(told.value)
 
 
 def test_too_short_and_times_in_ms() -> None:
-    with pytest.raises(InputError, match=f"at least {FEWEST} rows, not 100"):
-        readings(Trace.of({name: x[:100] for name, x in columns().items()}, 1e-3, {}), MODEL)
+    with pytest.raises(InputError, match=f"at least {FEWEST_ROWS} rows, not 100"):
+        read_cycles(Trace.of({name: x[:100] for name, x in columns().items()}, 1e-3, {}), MODEL)
     with pytest.raises(InputError, match="times in s, one row a cycle; the rows are 1 s apart"):
-        readings(made(1.0, t=np.arange(13_500.0)), MODEL)
+        read_cycles(made(1.0, t=np.arange(13_500.0)), MODEL)
     with pytest.raises(InputError, match="some of xj,p12,xs"):
-        readings(healthy(), MODEL, ["speed"])
+        read_cycles(healthy(), MODEL, ["speed"])
     with pytest.raises(InputError, match="a measured signal; this trace has xj, xs"):
-        readings(made(p12=np.full(13_500, np.nan)), MODEL, ["p12"])
+        read_cycles(made(p12=np.full(13_500, np.nan)), MODEL, ["p12"])
 
 
 def test_rows_at_2_khz_are_taken_once_a_cycle() -> None:
     twice = {name: np.repeat(x, 2) for name, x in columns().items() if name != "t"}
-    (c,) = readings(Trace.of(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
+    (c,) = read_cycles(Trace.of(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
     assert c.period == 1e-3 and (c.cor == healthy().cor).all() and "one row a cycle" in c.notes[0]
 
 
 def test_rows_at_500_hz_can_be_read_in_two_ways() -> None:
     half = Trace.of({name: x[::2] for name, x in columns().items()}, 2e-3, {})
-    slow, sparse = readings(half, MODEL)
+    slow, sparse = read_cycles(half, MODEL)
     assert slow.period == 2e-3 and len(slow) == 6750 and "taken as the trace's, 2 ms" in slow.notes[0]
     assert sparse.period == 1e-3 and len(sparse) == 13_499 and "one cycle in 2" in sparse.notes[0]
     assert sparse.filled.sum() == 6749 and np.isnan(sparse.xs[1::2]).all() and (sparse.cor[::2] == half.cor).all()
@@ -81,38 +82,38 @@ def test_single_lost_rows_are_filled_and_long_gaps_are_left_out() -> None:
     cor = healthy().cor.copy()
     cor[[100, 5000, 5002]] = np.nan
     cor[9000:9100] = np.nan
-    (c,) = readings(made(cor=cor), MODEL)
+    (c,) = read_cycles(made(cor=cor), MODEL)
     assert c.filled.sum() == 103 and c.usable[100] and c.usable[5000]
     assert not c.usable[9000:9399].any() and c.usable[9400] and c.usable[8999]
     assert "missing in 103 of 13500 rows; 0.4 s" in c.notes[-1]
     assert abs(c.cor[5000] - healthy().cor[5000]) < 5e-5
     step = healthy().cor.copy()
     step[500] = np.nan  # the row in which the demand jumps by 5 mm
-    (c,) = readings(made(cor=step), MODEL)
+    (c,) = read_cycles(made(cor=step), MODEL)
     assert not c.usable[500]
 
 
 def test_a_sensor_that_hangs_is_left_out_while_it_does() -> None:
     p12 = healthy().p12.copy()
     p12[9000:10_000] = p12[9000]
-    (c,) = readings(made(p12=p12), MODEL)
+    (c,) = read_cycles(made(p12=p12), MODEL)
     assert not c.usable[9000:10_000].any() and c.usable.sum() == 12_500
     assert "p12 is frozen for 1.00 s, first at 9.00 s" in c.notes[0]
     coarse = np.round(healthy().xj / 2e-3) * 2e-3  # a converter of a few bits rests for long, and is alive
-    assert readings(made(xj=coarse), MODEL)[0].usable.all()
+    assert read_cycles(made(xj=coarse), MODEL)[0].usable.all()
     dead = healthy().xs.copy()
     dead[11_000:] = dead[11_000]
-    assert not readings(made(xs=dead), MODEL)[0].usable[11_000:].any()
+    assert not read_cycles(made(xs=dead), MODEL)[0].usable[11_000:].any()
 
 
 def test_a_trace_that_starts_in_motion() -> None:
-    (c,) = readings(Trace.of({name: x[9700:] for name, x in columns().items()}, 1e-3, {}), MODEL)
+    (c,) = read_cycles(Trace.of({name: x[9700:] for name, x in columns().items()}, 1e-3, {}), MODEL)
     assert not c.usable[:300].any() and c.usable[300] and "already moves" in c.notes[0]
 
 
 def test_times_that_jitter_are_cycles_still() -> None:
     rng = np.random.default_rng(0)
-    (c,) = readings(made(t=columns()["t"] + rng.uniform(-2e-4, 2e-4, 13_500)), MODEL)
+    (c,) = read_cycles(made(t=columns()["t"] + rng.uniform(-2e-4, 2e-4, 13_500)), MODEL)
     assert len(c) == 13_500 and "off an even grid" in c.notes[0]
 
 
@@ -123,24 +124,25 @@ def test_cubics_fill_gaps_and_long_gaps_are_held() -> None:
     x[[10, 30, 31]] = np.nan
     x[40:50] = np.nan
     x[:2] = np.nan
-    filled, marked = bridged(x, 5)
+    filled, marked = bridge_gaps(x, 5)
     assert filled[[10, 30, 31]] == pytest.approx(curve[[10, 30, 31]])
     assert (filled[40:50] == curve[39]).all() and marked[40:50].all() and marked[:2].all() and marked.sum() == 12
-    assert held(np.array([np.nan, 1.0, np.nan, 2.0])).tolist() == [0.0, 1.0, 1.0, 2.0]
-    assert shift(np.arange(4), 1).tolist() == [0, 0, 1, 2] and shift(np.arange(4), -1).tolist() == [1, 2, 3, 3]
+    assert hold_last(np.array([np.nan, 1.0, np.nan, 2.0])).tolist() == [0.0, 1.0, 1.0, 2.0]
+    assert shift_rows(np.arange(4), 1).tolist() == [0, 0, 1, 2]
+    assert shift_rows(np.arange(4), -1).tolist() == [1, 2, 3, 3]
 
 
 def test_a_repeat_is_found_by_its_command() -> None:
-    (c,) = readings(healthy(), MODEL)
-    assert matching(c, healthy(1), MODEL, 1).late == 0
+    (c,) = read_cycles(healthy(), MODEL)
+    assert find_repeat(c, healthy(1), MODEL, 1).late == 0
     later = Trace.of({name: x[100:] for name, x in columns().items()}, 1e-3, {})
-    repeat = matching(c, later, MODEL, 1)
+    repeat = find_repeat(c, later, MODEL, 1)
     assert repeat.late == 100
-    rows = aligned({"xj": repeat.cycles.xj}, repeat.late, len(c))["xj"]
+    rows = align_columns({"xj": repeat.trace.xj}, repeat.late, len(c))["xj"]
     assert np.isnan(rows[:100]).all() and (rows[100:] == c.xj[100:]).all()
     with pytest.raises(InputError, match=r"--repeat .*: com: expected the command of the trace it repeats"):
-        matching(c, replace(healthy(1), com=-healthy(1).com, provenance={"source": "other.csv"}), MODEL, 1)
+        find_repeat(c, replace(healthy(1), com=-healthy(1).com, provenance={"source": "other.csv"}), MODEL, 1)
     with pytest.raises(InputError, match="a signal that the trace has too"):
-        matching(readings(healthy(), MODEL, ["xs"])[0], made(xs=np.full(13_500, np.nan)), MODEL, 1)
+        find_repeat(read_cycles(healthy(), MODEL, ["xs"])[0], made(xs=np.full(13_500, np.nan)), MODEL, 1)
     with pytest.raises(InputError, match="rows as in the trace"):
-        matching(c, Trace.of({name: x[::3] for name, x in columns().items()}, 2.5e-3, {}), MODEL, 1)
+        find_repeat(c, Trace.of({name: x[::3] for name, x in columns().items()}, 2.5e-3, {}), MODEL, 1)
