@@ -244,12 +244,12 @@ def _trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: o
 
 
 def _from_log(log: Log, everything: bool) -> Trace:
-    signals, timing, rest = _messages(log)
+    signals, timing, rest = log.read_columns("/signals"), log.read_columns("/timing"), _messages(log)
     run = dict(log.metadata.get("run", {}))
-    if not signals:
+    if not len(signals["time_ns"]):
         raise InputError(log.path, "/signals", "at least one cycle")
     names = ("com", "xj", "cor", "p12", "xs", "load")
-    table = np.array([(time_ns, m.cycle, m.phase, *(getattr(m, name) for name in names)) for time_ns, m in signals])
+    table = np.column_stack([signals[name].astype(float) for name in ("time_ns", "cycle", "phase", *names)])
     table = table[np.argsort(table[:, 1], kind="stable")]
     cycle, phase = table[:, 1].astype(int), table[:, 2].astype(int)
     if (np.diff(cycle) == 0).any():
@@ -269,17 +269,18 @@ def _from_log(log: Log, everything: bool) -> Trace:
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
     return _trace(grid, period, gaps, phase=filled.astype(int), provenance=_provenance(log, run),
                   units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
-                  timing=_timing([m for _, m in timing], cycle[kept], int(cycle[first]), period),
+                  timing=_timing(timing, cycle[kept], int(cycle[first]), period),
                   events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
                   nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
                   checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
 
 
-def _messages(log: Log) -> tuple[Messages, Messages, dict[str, Messages]]:
-    found: dict[str, Messages] = {name: [] for name in ("/signals", "/timing", "/events", "/nmt", "/checks")}
+def _messages(log: Log) -> dict[str, Messages]:
+    """Events, NMT states and checks: the topics with few messages."""
+    found: dict[str, Messages] = {name: [] for name in ("/events", "/nmt", "/checks")}
     for topic, time_ns, message in log.messages(*found):
         found[topic].append((time_ns, message))
-    return found.pop("/signals"), found.pop("/timing"), found
+    return found
 
 
 def _period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
@@ -315,12 +316,13 @@ def _seconds(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], fl
     return seconds
 
 
-def _timing(records: list[Any], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
+def _timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
     """Of the cycles that have a row; t = 0 at cycle `zero`."""
-    wanted = set(cycles.tolist())
-    kept = [((m.cycle - zero) * period, m.lateness, m.response, m.work, m.overrun) for m in records
-            if m.cycle in wanted]
-    if not kept:
+    if not len(columns["time_ns"]):
         return NO_TIMING
-    t, lateness, response, work, overrun = (np.array(column) for column in zip(*kept, strict=True))
+    kept = np.isin(columns["cycle"], cycles)
+    if not kept.any():
+        return NO_TIMING
+    t = (columns["cycle"][kept].astype(int) - zero) * period
+    lateness, response, work, overrun = (columns[name][kept] for name in ("lateness", "response", "work", "overrun"))
     return Timing(np.round(t, 9), lateness, response, work, overrun)
