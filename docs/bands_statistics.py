@@ -1,4 +1,4 @@
-"""The tables of docs/bands.md: `python docs/bands_statistics.py` judges fresh units by the shipped bands."""
+"""Print the tables of docs/bands.md, from units that the bands have not seen: python docs/bands_statistics.py."""
 from __future__ import annotations
 
 import math
@@ -23,7 +23,7 @@ UNITS = (("healthy", Kind("healthy"), 1008, 2026), ("healthy, others", Kind("hea
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the table of band verdicts and the table of precursors."""
     com = load_sequence("preflight").main_profile().command
     parts, bands, model = sections(com), default(), load_model()
     for name, kind, count, seed in UNITS:

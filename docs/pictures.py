@@ -1,4 +1,4 @@
-"""Make the pictures of the README anew: python docs/pictures.py (needs the extra `view`)."""
+"""Make the figures preflight.svg and viewer.png: python docs/pictures.py (needs the extra `view`)."""
 from __future__ import annotations
 
 import subprocess
@@ -16,7 +16,7 @@ RIG = [sys.executable, "-m", "rig.cli.main"]
 
 
 def main() -> None:
-    """One preflight run, drawn by the report's own figure and by the viewer."""
+    """Run the preflight check once; draw it with the figure of the report and with the viewer."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([*RIG, "run", "preflight", "--quiet", "--out", folder], check=True)
         (HERE / "preflight.svg").write_text(figures.signals(Trace.read(folder)), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Make the pictures of the tutorial anew, in the folder where its runs are: python docs/tutorial_pictures.py FOLDER."""
+"""Make the figures of the tutorial from the runs in a folder: python docs/tutorial_pictures.py FOLDER."""
 from __future__ import annotations
 
 import os
@@ -22,13 +22,13 @@ from fdi.report.drawing import STYLE, shorten_svg, to_svg
 from plant import Model
 from plant.effects import load_effects
 
-BLOCK = 36  # rows between two points of a drawing: a page has no more dots
+BLOCK = 36  # rows per point of a figure, which has no more pixels
 HERE = Path(__file__).parent / "tutorial"
 SIGNALS = (("xj", "XJ [µm]", 1e6), ("p12", "P12 [bar]", 1e-5), ("xs", "XS [µm]", 1e6))
 
 
-def left_over(run: str, repeat: str, model: Model) -> str:
-    """What the nominal model and `model` leave of each signal of a run, as rig compare replays it."""
+def draw_residuals(run: str, repeat: str, model: Model) -> str:
+    """Residuals of each signal of a run with the nominal model and with `model`, replayed as rig compare does."""
     trace = Trace.read(run)
     floor = compare(trace, model, [Trace.read(repeat)]).signals
     with rc_context(STYLE):
@@ -53,19 +53,19 @@ def left_over(run: str, repeat: str, model: Model) -> str:
 
 
 def main(folder: str) -> None:
-    """Residuals and ledgers of both stories, the shape of what the catalogue did not know."""
+    """Draw residuals and ledger of both examples, and the residual pattern of the second."""
     os.chdir(folder)
     runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
     shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
-    for story, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
+    for example, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                      ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load(Path(file))
-        (HERE / f"{story}_left.svg").write_text(shorten_svg(left_over(run, repeat, model)), encoding="utf-8")
+        (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
         drawn = explain_figures.ledger(known.ledger, known.floor or {})
-        (HERE / f"{story}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
+        (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the pictures and tables of worked_cases.md anew: python docs/worked_cases.py (six runs, a minute)."""
+"""Make the figures and tables of worked_cases.md: python docs/worked_cases.py (six runs, one minute)."""
 from __future__ import annotations
 
 import subprocess
@@ -19,12 +19,12 @@ HERE = Path(__file__).parent / "worked_cases"
 RIG = [sys.executable, "-m", "rig.cli.main"]
 FSS_NC = 5.0  # N
 CASES = {"14": (0.25, 6 * FSS_NC), "15": (0.17, 9 * FSS_NC)}
-SCATTERED = 40  # units, for the table of what tolerance does
+SCATTERED = 40  # units in the table of tolerances
 TOLERANCE = 0.015
 
 
-def run(folder: str, kintas: float = 0.0, fss: float = FSS_NC, seed: int = 1) -> Trace:
-    """A preflight on the rig with faults from the first cycle on; FDS goes with FSS."""
+def run_preflight(folder: str, kintas: float = 0.0, fss: float = FSS_NC, seed: int = 1) -> Trace:
+    """Run a preflight check with faults from the first cycle on; FDS stays in proportion to FSS."""
     out = Path(folder, f"{kintas:g}_{fss:g}_{seed}")
     faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
     settings = [word for name, value in faults.items() for word in ("--set", f"{name}={value!r}")]
@@ -32,8 +32,8 @@ def run(folder: str, kintas: float = 0.0, fss: float = FSS_NC, seed: int = 1) ->
     return Trace.read(out)
 
 
-def row(name: str, drive: str, trace: Trace) -> str:
-    """A line of the table: minima of the three maps, centre of gravity."""
+def format_minima(name: str, drive: str, trace: Trace) -> str:
+    """Minima of the three maps and centre of gravity as a row of the table."""
     g = search(trace, drive=drive)
     assert g.step and g.ramp
     cells = [f"{p.kintas:.3f}, {p.fss:.1f} N ({p.rms * 1e6:.1f} µm)" for p in (
@@ -42,8 +42,8 @@ def row(name: str, drive: str, trace: Trace) -> str:
            f"{g.merged.weight:.2f} |"
 
 
-def spread(kintas: float, fss: float, command: np.ndarray) -> str:
-    """What 1.5 % of scatter in every base parameter makes of the answers: mean and deviation of their errors."""
+def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
+    """Mean and standard deviation of the errors under 1.5 % scatter of every base parameter, as a row of the table."""
     nominal, found = Model(), []
     tolerances = [name for name in nominal.names() if nominal.kind.groups[name.split(".")[0]].__name__ not in (
         "Controller", "Sensors") and name not in ("filter.clogging", "filter.law") and "friction" not in name]
@@ -61,18 +61,18 @@ def spread(kintas: float, fss: float, command: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Six runs, eight pictures, two tables."""
+    """Make six runs, draw eight figures, print two tables."""
     HERE.mkdir(exist_ok=True)
 
     def save(number: str, text: str) -> None:
         (HERE / f"fig{number}.svg").write_text(shorten_svg(text), encoding="utf-8")
 
     with tempfile.TemporaryDirectory() as folder:
-        healthy = run(folder)
-        clogged = {f"Kintas {k:g}": run(folder, kintas=k) for k in (0.25, 0.35)}
-        stiff = {f"FSS {f:g} N": run(folder, fss=f) for f in (35.0, 70.0)}
-        cases = {number: run(folder, *faults) for number, faults in CASES.items()}
-        again = run(folder, seed=2)
+        healthy = run_preflight(folder)
+        clogged = {f"Kintas {k:g}": run_preflight(folder, kintas=k) for k in (0.25, 0.35)}
+        stiff = {f"FSS {f:g} N": run_preflight(folder, fss=f) for f in (35.0, 70.0)}
+        cases = {number: run_preflight(folder, *faults) for number, faults in CASES.items()}
+        again = run_preflight(folder, seed=2)
     save("7", figures.steps({"healthy": healthy} | clogged))
     save("8", figures.ramps({"healthy": healthy} | stiff))
     case = cases["14"]
@@ -83,11 +83,11 @@ def main() -> None:
     for number, trace in cases.items():
         save(number, figures.maps(search(trace), CASES[number]))
         for drive in ("current", "command"):
-            print(row(f"{CASES[number][0]:g}, {CASES[number][1]:g} N", drive, trace))
+            print(format_minima(f"{CASES[number][0]:g}, {CASES[number][1]:g} N", drive, trace))
     for drive in ("current", "command"):
-        print(row("healthy", drive, again))
+        print(format_minima("healthy", drive, again))
     for faults in (*CASES.values(), (0.0, FSS_NC), (0.35, FSS_NC), (0.0, 70.0)):
-        print(spread(*faults, healthy.com))
+        print(format_scatter(*faults, healthy.com))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import argparse
 import inspect
 import json
 import re
+import runpy
 import shlex
 from collections.abc import Iterator
 from dataclasses import fields
@@ -151,6 +152,12 @@ def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
         used = values(args, "trace", "words", "repeat", "holdout", "effects", "model", "command_file")
         assert set(used) - effects - {"eha"} <= there, line
         there |= set(values(args, "out", "write_effect"))
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "docs").glob("*.py")), ids=lambda path: path.name)
+def test_the_scripts_of_the_pages_can_be_imported(script: Path) -> None:
+    """They take minutes to run; a name that has moved shows when they are imported."""
+    runpy.run_path(str(script), run_name="imported")
 
 
 PHYSICS = (ROOT / "docs" / "physics.md").read_text()

@@ -1,4 +1,4 @@
-"""What the bench of the tutorial has and no catalogue knows; it makes the data and is used nowhere else."""
+"""An effect outside the catalogue, which makes the data of the tutorial's second example and is used nowhere else."""
 from math import pi, sin
 from typing import Annotated, NamedTuple
 
