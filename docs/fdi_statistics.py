@@ -16,6 +16,7 @@ from rig.studies.campaign.show_campaign import asked, percent
 from rig.studies.campaign.summary import name_size, summarise_campaign
 
 PAGE = Path(__file__).with_suffix(".md")
+MET = {None: "", True: "met", False: "**not met**"}
 BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 
 
@@ -29,7 +30,7 @@ def format_rates(found: Sequence[Mapping[str, Any]]) -> str:
     """The required rates as a table."""
     return format_table(("", "count", "share", "95 % interval", "required", ""),
                         [(r["name"].strip(), *percent(r["share"]), asked(100 * r["least"], 100 * r["most"]),
-                          "" if r["met"] is None else "met" if r["met"] else "**not met**")
+                          MET[r["met"]])
                          for r in found if r["share"]["of"]])
 
 
@@ -71,8 +72,8 @@ def main(folder: str, *others: str) -> None:
     """Write the page and its figure."""
     figures = summarise_campaign(read_campaign_rows(folder))
     took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
-    text = f"{figures['cases']} cases: {status}. Time per trace on one core, beside other work: " \
-           f"{took['median']:.1f} s (median), {took['p95']:.1f} s (95th percentile), {took['most']:.1f} s (longest).\n\n"
+    times = f"{took['median']:.1f} s (median), {took['p95']:.1f} s (95th percentile), {took['most']:.1f} s (longest)"
+    text = f"{figures['cases']} cases: {status}. Time per trace on one core, beside other work: {times}.\n\n"
     text += "".join(format_tolerance(of) for of in reversed(figures["tolerances"]))
     text += "".join(map(format_other_campaign, others))
     for reason in figures["reasons"]:
