@@ -1,4 +1,4 @@
-"""The picture of a trend: sizes with their intervals, the course through them, what may come, the two limits."""
+"""The figure of a trend: sizes with their intervals, the fitted course, the forecast, and the two limits."""
 from __future__ import annotations
 
 import math
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fdi.prognosis.trend import Trend
-from fdi.prognosis.unit_trend import NAMES, Answer
+from fdi.prognosis.unit_trend import LIMIT_NAMES, UnitTrend
 from fdi.report.drawing import COMMAND, INK, RED, STYLE, to_svg
 from plant.errors import InputError
 
@@ -19,13 +19,13 @@ COURSE, AHEAD, MIDDLE = "#1f6feb", "#d9730d", "#b7791f"
 LABELS = {"kintas": "filter clogging, Kintas", "fss": "spool friction, FSS"}
 
 
-def drawing(found: Answer) -> str:
+def draw_trends(unit: UnitTrend) -> str:
     """Both faults as SVG text that stands inside a page."""
     with rc_context(STYLE):
-        return to_svg(_figure(found), "trend")
+        return to_svg(_build_figure(unit), "trend")
 
 
-def save(found: Answer, out: Path) -> None:
+def save_trends(unit: UnitTrend, out: Path) -> None:
     """Both faults as .png or .svg.
 
     Raises:
@@ -34,65 +34,65 @@ def save(found: Answer, out: Path) -> None:
     with rc_context(STYLE):
         try:
             undated = {"Date": None} if out.suffix == ".svg" else None
-            _figure(found).savefig(out, dpi=130, facecolor="white", metadata=undated)
+            _build_figure(unit).savefig(out, dpi=130, facecolor="white", metadata=undated)
         except OSError as error:
             raise InputError("--out", str(out), f"a file that can be written ({error.strerror})") from error
 
 
-def _figure(found: Answer) -> Figure:
+def _build_figure(unit: UnitTrend) -> Figure:
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
-    for ax, trend in zip(axes, found.trends, strict=True):
-        _panel(ax, trend, found)
+    for ax, trend in zip(axes, unit.trends, strict=True):
+        _draw_fault(ax, trend, unit)
     axes[0].legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=5, frameon=False)
-    if found.gathered.axis != "date":
-        axes[-1].set_xlabel(f"{found.gathered.axis} [{found.unit}]")
+    if unit.gathered.axis != "date":
+        axes[-1].set_xlabel(f"{unit.gathered.axis} [{unit.unit}]")
     return figure
 
 
-def _panel(ax: Axes, trend: Trend, found: Answer) -> None:
-    t = _axis(np.array([p.t for p in found.gathered.points[-len(trend.t):]]), found)
+def _draw_fault(ax: Axes, trend: Trend, unit: UnitTrend) -> None:
+    t = _convert_times(np.array([p.t for p in unit.gathered.points[-len(trend.t):]]), unit)
     value, low, high = np.array(trend.sizes).T
     limits = {"maintenance": (trend.fault.middle, MIDDLE), "non_nominal": (trend.fault.most, RED)}
     if trend.past is not None and trend.future is not None:
-        curves = (trend.past, COURSE, "course so far"), (trend.future, AHEAD, "what may come, 95 %")
+        curves = (trend.past, COURSE, "fitted course"), (trend.future, AHEAD, "forecast, 95 %")
         for curve, colour, name in curves:
-            at = _axis(curve.t, found)
+            at = _convert_times(curve.t, unit)
             ax.fill_between(at, curve.low, curve.high, color=colour, alpha=0.15, lw=0)
             ax.plot(at, curve.middle, color=colour, lw=1.4, label=name, ls="-" if curve is trend.past else "--")
-    for used, colour, name in ((trend.used, INK, "traces"), (~trend.used, COMMAND, "not part of the trend")):
+    for used, colour, name in ((trend.used, INK, "traces"), (~trend.used, COMMAND, "traces left out")):
         if used.any():
             ax.errorbar(t[used], value[used], [(value - low)[used], (high - value)[used]], fmt="o", ms=4, lw=1,
                         color=colour, label=name)
     top = 1.25 * max(trend.fault.most, float(value.max()))
-    last = _axis(np.array([max(trend.t[-1], trend.future.t[-1] if trend.future else -np.inf)]), found)[0]
+    last = _convert_times(np.array([max(trend.t[-1], trend.future.t[-1] if trend.future else -np.inf)]), unit)[0]
     for level, (limit, colour) in limits.items():
         ax.axhline(limit, color=colour, lw=1.0, ls=":")
-        ax.text(t[0], limit, f"{NAMES[level]} ", color=colour, va="bottom", ha="left", fontsize=8)
-        _when(ax, trend, level, limit, colour, last, found)
+        ax.text(t[0], limit, f"{LIMIT_NAMES[level]} ", color=colour, va="bottom", ha="left", fontsize=8)
+        _mark_arrival(ax, trend, level, limit, colour, last, unit)
     for b in trend.breaks:
-        ax.annotate("not in line" if b.kind == "last" else b.kind, (t[b.row], value[b.row]), (0, 9),
+        ax.annotate("outlier?" if b.kind == "last" else b.kind, (t[b.row], value[b.row]), (0, 9),
                     textcoords="offset points", ha="center", fontsize=8, color=RED)
     ax.set_ylim(min(0.0, float(low.min())), top)
     ax.set_ylabel(LABELS[trend.fault.symbol] + ("" if trend.fault.unit == "1" else f" [{trend.fault.unit}]"))
 
 
-def _when(ax: Axes, trend: Trend, level: str, limit: float, colour: str, last: Any, found: Answer) -> None:
+def _mark_arrival(ax: Axes, trend: Trend, level: str, limit: float, colour: str, last: Any, unit: UnitTrend) -> None:
     """The 95 % interval of when a limit is reached, as a bar on its line; an arrow where it leaves the picture."""
     left = trend.remaining.get(level)
     if left is None or trend.verdict != "TREND" or left.high == 0.0 or left.low == math.inf:
         return
     end = float(trend.t[-1])
-    a, b = (_axis(np.array([end + x if math.isfinite(x) else 1e9]), found)[0] if math.isfinite(x) else last
+    a, b = (_convert_times(np.array([end + x if math.isfinite(x) else 1e9]), unit)[0] if math.isfinite(x) else last
             for x in (left.low, left.high))
     a, b = min(a, last), min(b, last)
     ax.plot([a, b], [limit, limit], color=colour, lw=4, alpha=0.6, solid_capstyle="butt")
-    if math.isfinite(left.value) and (at := _axis(np.array([end + left.value]), found)[0]) <= last:
+    if math.isfinite(left.value) and (at := _convert_times(np.array([end + left.value]), unit)[0]) <= last:
         ax.plot([at], [limit], "D", color=colour, ms=6)
 
 
-def _axis(t: Any, found: Answer) -> Any:
+def _convert_times(t: Any, unit: UnitTrend) -> Any:
     """Times as matplotlib takes them."""
-    if found.gathered.axis != "date":
+    if unit.gathered.axis != "date":
         return t
     return np.array(np.asarray(t) * 86400, dtype="datetime64[s]")
