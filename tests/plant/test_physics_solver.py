@@ -14,7 +14,7 @@ from places import ROOT
 from plant import Model, simulate
 from plant.segments import Chirp, Hold, Ramp, Sine
 from rig.cli import main
-from rig.studies.benchmarks.plant_step import accuracy
+from rig.studies.benchmarks.plant_step import measure_accuracy
 
 GENTLE = build((Hold(time=0.05), Ramp(to=1e-3, time=1.0), Sine(amplitude=3e-3, frequency=1.0, time=1.0),
                 Chirp(amplitude=0.5e-3, f0=1.0, f1=20.0, fade=20.0, time=2.0))).command  # nothing saturates
@@ -134,7 +134,7 @@ def test_loads_against_an_explicit_scheme() -> None:
 
 @pytest.fixture(scope="module")
 def table() -> Iterator[list]:
-    yield accuracy(PREFLIGHT, (50, 100, 200))
+    yield measure_accuracy(PREFLIGHT, (50, 100, 200))
 
 
 def test_error_of_the_default_step(table: list, capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,12 +33,13 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.output import write_text
     from rig.cli.progress_bar import show_progress
     from rig.sequences import load_sequence
-    from rig.studies.benchmarks import plant_step
+    from rig.studies.benchmarks.plant_step import measure_accuracy
+    from rig.studies.benchmarks.run_benchmarks import run_benchmarks
 
     command = load_sequence("preflight").main_profile().command
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        answer = plant_step.report(command, progress)
-    rows = plant_step.accuracy(command) if args.accuracy else []
+        answer = run_benchmarks(command, progress)
+    rows = measure_accuracy(command) if args.accuracy else []
     if rows:
         answer["accuracy"] = [row._asdict() for row in rows]
     if args.out is not None:
@@ -95,7 +96,7 @@ def _show(answer: dict[str, Any], rows: Sequence[Accuracy]) -> None:
     from rich.table import Table
 
     from rig.cli.terminal import console
-    from rig.studies.benchmarks.peers import GET_GCC
+    from rig.studies.benchmarks.rivals import GET_GCC
 
     out = console()
     table = Table("The plant", "", "Python / C", "against Python", box=None, pad_edge=False)

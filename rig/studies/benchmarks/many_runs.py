@@ -1,9 +1,8 @@
-"""How fast many runs at once are, beside C, jax and ProgPy: the same runs of the same equations, in one process."""
+"""Many runs at once, beside C, jax and ProgPy: the same runs of the same equations, in one process."""
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,88 +10,82 @@ from numpy.typing import NDArray
 from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import STEPS, Lanes
-from rig.studies.benchmarks.peers import (
+from rig.studies.benchmarks.peers import Task, make_c_replay, make_jax_replay, make_progpy_replay
+from rig.studies.benchmarks.rivals import (
     FLAGS,
-    GET_GCC,
     SAME_ROUNDING,
+    Race,
     Replay,
-    Task,
-    gcc,
-    in_c,
-    in_jax,
-    in_progpy,
-    missing,
+    Rival,
+    explain_missing,
+    explain_missing_gcc,
+    race_rivals,
+    skip_rival,
 )
-from rig.studies.benchmarks.stopwatch import durations
+from rig.studies.benchmarks.stopwatch import measure_median_duration
 
 Array = NDArray[np.float64]
 OURS = "ours, one thread"
 NAMES = ("spool.static_friction", "jack.damping")
-MEMBERS, CYCLES, FIRST = 64, 5000, 500  # the runs begin where the preflight's first step does
-PIECE = 5  # cycles for a rival that is slower by orders of magnitude
 
 
-class Rival(NamedTuple):
-    """One way to make many runs."""
-
-    name: str
-    speed: float | None  # steps of a run per second; None where it could not be measured
-    ratio: float | None  # our speed over its, round by round
-    difference: float | None  # m, largest between its positions and ours
-    note: str
-
-
-def many(command: Array, progress: Progress = ignore_progress, rounds: int = 7,
-         cycles: int = CYCLES) -> list[Rival]:
-    """Runs of the bare model, with different friction and drag, from the current of a run over `command` (n,) m."""
-    task = _task(command, cycles)
+def compare_many_runs(command: Array, progress: Progress = ignore_progress, rounds: int = 7, runs: int = 64,
+                      cycles: int = 5000) -> list[Rival]:
+    """Runs of the bare model with different friction and drag, from the current of a run over `command` (n,) m."""
+    task = _make_task(command, runs, cycles)
     with tempfile.TemporaryDirectory() as folder:
         progress("many runs at once: compiling the rivals", 0.0)
-        runs, skipped = _rivals(task, Path(folder))
-        rows = {name: run().copy() for name, run in runs.items()}
+        replays, skipped = _make_rivals(task, Path(folder))
         progress("many runs at once", 0.0)
-        seconds = durations(runs, rounds)
-    work = MEMBERS * cycles * task.steps
-    found = [Rival(name, float(work / np.median(s)), float(np.median(s / seconds[OURS])),
-                   float(np.abs(rows[name] - rows[OURS])[..., 0].max()), "") for name, s in seconds.items()]
-    return [*found, *skipped, _progpy(task, work / float(np.median(seconds[OURS])), rows[OURS], progress)]
+        race = race_rivals(replays, OURS, runs * cycles * task.steps, rounds, _compare_positions)
+    progress("many runs at once: ProgPy", 0.0)
+    return [*race.rivals, *skipped, _measure_progpy(task, race)]
 
 
-def _task(command: Array, cycles: int) -> Task:
+def _make_task(command: Array, runs: int, cycles: int, first: int = 500) -> Task:
+    """Runs that begin at cycle `first`, where the first step of the preflight begins."""
     model = Model()
-    current = simulate(model, command).cor[FIRST:FIRST + cycles].copy()
-    spread = np.random.default_rng(0).uniform([5.0, 1.0], [50.0, 2.0], (MEMBERS, 2))
+    current = simulate(model, command).cor[first:first + cycles].copy()
+    spread = np.random.default_rng(0).uniform([5.0, 1.0], [50.0, 2.0], (runs, 2))
     return Task(model, NAMES, spread * [1.0, model[NAMES[1]]], current, np.zeros(cycles), STEPS)
 
 
-def _rivals(task: Task, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
-    def ours(workers: int | None) -> Replay:
-        lanes = Lanes(task.model, task.names, task.steps, workers)
-        return lambda: lanes.replay(task.values, task.current, task.load)
-
-    runs, skipped = {OURS: ours(1), "ours, a thread a core": ours(None)}, []
-    in_gcc = {"C, one run after the other": ("replay_each", FLAGS), "C, 16 runs side by side": ("replay_lanes", FLAGS),
-              "C, 64 runs side by side": ("replay_lanes", (*FLAGS, "-DWIDTH=64")),
-              "C, 16 runs, -ffp-contract=off": ("replay_lanes", SAME_ROUNDING)}
-    for i, (name, (function, flags)) in enumerate(in_gcc.items()):
-        if gcc():
-            runs[name] = in_c(task, function, flags, folder / f"{i}.so")
+def _make_rivals(task: Task, folder: Path) -> tuple[dict[str, Replay], list[Rival]]:
+    """The rivals that can be measured here, and the others with the reason."""
+    replays: dict[str, Replay] = {OURS: _make_own_replay(task, 1),
+                                  "ours, a thread a core": _make_own_replay(task, None)}
+    skipped = []
+    in_c = {"C, one run after the other": ("replay_each", FLAGS), "C, 16 runs side by side": ("replay_lanes", FLAGS),
+            "C, 64 runs side by side": ("replay_lanes", (*FLAGS, "-DWIDTH=64")),
+            "C, 16 runs, -ffp-contract=off": ("replay_lanes", SAME_ROUNDING)}
+    for number, (name, (function, flags)) in enumerate(in_c.items()):
+        if reason := explain_missing_gcc():
+            skipped.append(skip_rival(name, reason))
         else:
-            skipped.append(Rival(name, None, None, None, f"skipped, there is no gcc; to get it: {GET_GCC}"))
-    if why := missing("jax"):
-        skipped.append(Rival("jax, vmap", None, None, None, f"skipped, {why}"))
+            replays[name] = make_c_replay(task, function, flags, folder / f"{number}.so")
+    if reason := explain_missing("jax"):
+        skipped.append(skip_rival("jax, vmap", reason))
     else:
-        runs["jax, vmap"] = in_jax(task)
-    return runs, skipped
+        replays["jax, vmap"] = make_jax_replay(task)
+    return replays, skipped
 
 
-def _progpy(task: Task, our_speed: float, our_rows: Array, progress: Progress) -> Rival:
-    """On a short piece, as it is so much slower."""
-    if why := missing("progpy"):
-        return Rival("ProgPy, vectorised", None, None, None, f"skipped, {why}")
-    progress("many runs at once: ProgPy", 0.0)
-    run = in_progpy(task._replace(current=task.current[:PIECE], load=task.load[:PIECE]))
-    rows, seconds = run(), float(np.median(durations({"": run}, 3)[""]))
-    speed = MEMBERS * (PIECE - 1) * task.steps / seconds  # the last row is a state, not a cycle
-    return Rival("ProgPy, vectorised", speed, our_speed / speed,
-                 float(np.abs(rows - our_rows[:, :PIECE])[..., 0].max()), f"measured on {PIECE - 1} cycles")
+def _make_own_replay(task: Task, workers: int | None) -> Replay:
+    lanes = Lanes(task.model, task.names, task.steps, workers)
+    return lambda: lanes.replay(task.values, task.current, task.load)
+
+
+def _compare_positions(rows: Array, reference: Array) -> float:
+    return float(np.abs(rows - reference)[..., 0].max())
+
+
+def _measure_progpy(task: Task, race: Race, cycles: int = 5) -> Rival:
+    """ProgPy on the first `cycles` cycles alone, because it is slower by orders of magnitude."""
+    name = "ProgPy, vectorised"
+    if reason := explain_missing("progpy"):
+        return skip_rival(name, reason)
+    replay = make_progpy_replay(task._replace(current=task.current[:cycles], load=task.load[:cycles]))
+    rows, seconds = replay(), measure_median_duration(replay, 3)
+    speed = len(task.values) * (cycles - 1) * task.steps / seconds  # the last row is a state, not a cycle
+    return Rival(name, speed, race.speed / speed, _compare_positions(rows, race.reference[:, :cycles]),
+                 f"measured on {cycles - 1} cycles")

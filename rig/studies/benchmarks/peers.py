@@ -1,15 +1,11 @@
-"""The reference model's step written for other people's libraries: what a user would have if ours were not there.
+"""The reference model's step written for other libraries: what a user would have without this software.
 
-Each rival is given the same runs, of the bare model from the same current, and returns its rows as `Lanes.replay` does.
+Each rival gets the same runs, of the bare model from the same current, and returns its rows as `Lanes.replay` does.
 """
 from __future__ import annotations
 
 import ctypes
-import importlib.util
-import shutil
-import subprocess
-from collections.abc import Callable, Mapping
-from importlib.resources import files
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -19,14 +15,9 @@ from numpy.typing import NDArray
 
 from plant import Model
 from plant.step import coefficients
+from rig.studies.benchmarks.rivals import Replay, build_library
 
 Array = NDArray[np.float64]
-Replay = Callable[[], Array]
-
-FLAGS = ("-O3", "-march=native")
-SAME_ROUNDING = (*FLAGS, "-ffp-contract=off")  # no fused multiply-add: the rounding of Python
-GET_GCC = "apt-get install gcc"
-GET_EXTRA = "pip install 'eha-rig[bench]'"
 
 
 class Task(NamedTuple):
@@ -55,23 +46,9 @@ class Task(NamedTuple):
         return float(self.model["controller.period"]) / self.steps
 
 
-def gcc() -> str:
-    """Where the C compiler is; "" without one."""
-    return shutil.which("gcc") or ""
-
-
-def built(source: str, flags: tuple[str, ...], target: Path) -> ctypes.CDLL:
-    """A C file of rig/studies/benchmarks as a library; gcc must be there."""
-    folder = files("rig.studies.benchmarks")
-    # no -std=c..: that would forbid the fused multiply-add without saying so
-    line = [gcc(), *flags, "-shared", "-fPIC", f"-I{folder}", str(folder / source), "-o", str(target), "-lm"]
-    subprocess.run(line, check=True)
-    return ctypes.CDLL(str(target))
-
-
-def in_c(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Replay:
-    """`replay_each` or `replay_lanes` of lanes.c."""
-    library = built("lanes.c", flags, target)
+def make_c_replay(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Replay:
+    """The function `replay_each` or `replay_lanes` of lanes.c."""
+    library = build_library("lanes.c", flags, target)
     records = np.repeat(task.model.record(), len(task.values))
     numbers = records.view(np.float64).reshape(len(records), -1)
     for column, name in enumerate(task.names):
@@ -88,46 +65,41 @@ def in_c(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Rep
     return run
 
 
-def missing(module: str) -> str:
-    """Why a rival from the extra is not in the race; "" when it is there."""
-    return "" if importlib.util.find_spec(module) else f"{module} is not installed; to get it: {GET_EXTRA}"
-
-
-def in_jax(task: Task) -> Replay:
-    """jax: one run as two nested scans, compiled, vmap over the runs. Unrolling the steps was tried and is slower."""
+def make_jax_replay(task: Task) -> Replay:
+    """jax: one run as two nested scans, compiled, vmap over the runs. Unrolling the steps is slower."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     h, numbers = task.h, jax.numpy
 
-    def one(parameters: Any, current: Any, load: Any) -> Any:
-        p = _dotted(parameters)
+    def replay_run(parameters: Any, current: Any, load: Any) -> Any:
+        p = _make_namespaces(parameters)
         k = coefficients(p, h)
 
         def cycle(s: Any, held: Any) -> Any:
             def forward(s: Any, _: None) -> tuple[Any, None]:
-                return step(numbers, s, held[0], held[1], p, k, h), None
+                return step_bare_model(numbers, s, held[0], held[1], p, k, h), None
 
             after, _ = jax.lax.scan(forward, s, None, task.steps)
             return after, numbers.stack([s[4], s[6], s[2]])
 
         return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]
 
-    compiled = jax.jit(jax.vmap(one, (0, None, None)))
+    compiled = jax.jit(jax.vmap(replay_run, (0, None, None)))
     acting = np.r_[0.0, task.current[:-1]]
     return lambda: np.asarray(compiled(task.parameters, acting, task.load))
 
 
-def in_progpy(task: Task) -> Replay:
-    """NASA ProgPy: the step as a model of its own kind, vectorised over the runs, simulated by its `simulate_to`."""
+def make_progpy_replay(task: Task) -> Replay:
+    """NASA ProgPy: the step as a ProgPy model, vectorised over the runs, simulated by `simulate_to`."""
     period = float(task.model["controller.period"])
-    plant, acting = _progpy_plant(task), np.r_[0.0, task.current[:-1]]
+    plant, acting = _define_progpy_plant(task), np.r_[0.0, task.current[:-1]]
 
     def inputs(t: float, x: Any = None) -> Any:
         row = min(int(t / period), len(acting) - 1)
         return plant.InputContainer({"current": acting[row], "load": task.load[row]})
 
-    # half a step early: it adds its steps up, and takes the first state past a time
+    # half a step early: ProgPy adds its steps up, and saves the first state past a time
     times = [(row - 0.5 / task.steps) * period for row in range(1, len(acting))]
 
     def run() -> Array:
@@ -138,10 +110,10 @@ def in_progpy(task: Task) -> Replay:
     return run
 
 
-def _progpy_plant(task: Task) -> Any:
+def _define_progpy_plant(task: Task) -> Any:
     from progpy import PrognosticsModel
 
-    p, h, names = _dotted(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
+    p, h, names = _make_namespaces(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
     k = coefficients(p, h)
 
     class Plant(PrognosticsModel):  # type: ignore[misc]
@@ -155,7 +127,7 @@ def _progpy_plant(task: Task) -> Any:
             return self.StateContainer({name: np.zeros(len(task.values)) for name in names})
 
         def next_state(self, x: Any, u: Any, dt: float) -> Any:
-            after = step(np, [x[name] for name in names], u["current"], u["load"], p, k, h)
+            after = step_bare_model(np, [x[name] for name in names], u["current"], u["load"], p, k, h)
             return self.StateContainer(dict(zip(names, after, strict=True)))
 
         def output(self, x: Any) -> Any:
@@ -164,11 +136,12 @@ def _progpy_plant(task: Task) -> Any:
     return Plant(process_noise=0, measurement_noise=0)
 
 
-def _dotted(groups: Mapping[str, Mapping[str, Any]]) -> Any:
+def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
+    """The groups as objects with attributes, as `plant.step` reads its parameters."""
     return SimpleNamespace(**{group: SimpleNamespace(**fields) for group, fields in groups.items()})
 
 
-def step(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h: float) -> tuple[Any, ...]:
+def step_bare_model(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h: float) -> tuple[Any, ...]:
     """`plant.step.step` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
     xf, vf, xs, vs, xj, vj, _ = s
     torque = p.torque_motor.gain * current - p.flapper.stiffness * xf - p.feedback_spring.stiffness * (

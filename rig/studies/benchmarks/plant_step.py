@@ -1,6 +1,6 @@
-"""The project's own benchmarks: what a step costs beside the same step in C, and what error the default step makes.
+"""A step of the reference model: its cost beside the same step in C, and the error that the step size makes.
 
-Costs are medians of rounds that alternate between the rivals, all in one process: the machine's moods hit them alike.
+Costs are medians over rounds that alternate between the rivals, in one process.
 """
 from __future__ import annotations
 
@@ -8,26 +8,21 @@ import ctypes
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.progress import Progress, ignore_progress
-from plant import Actuator, Model, simulate
+from plant import Model, simulate
 from plant.model import STEPS, kernel
 from plant.run import noise
-from rig.studies.benchmarks.many_runs import many
-from rig.studies.benchmarks.peers import FLAGS, SAME_ROUNDING, built, gcc
-from rig.studies.benchmarks.peers_grid import grid
-from rig.studies.benchmarks.stopwatch import Run, duration, durations
+from rig.studies.benchmarks.rivals import FLAGS, SAME_ROUNDING, build_library, find_gcc
+from rig.studies.benchmarks.stopwatch import Work, measure_durations
 
 Array = NDArray[np.float64]
 
 FRICTIONLESS = {f"{body}.{kind}_friction": 0.0 for body in ("spool", "jack") for kind in ("static", "dynamic")}
 QUIET = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
-FINEST = 5000  # steps a cycle that stand for the truth, 0.2 us
-MICRO = 1e6
 
 
 class StepCost(NamedTuple):
@@ -53,33 +48,33 @@ class Accuracy(NamedTuple):
     largest_friction: float
 
 
-def step_vs_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
+def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
     """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
-    if not gcc():
+    if not find_gcc():
         return None
     model, draws = Model(), noise(0, len(command))
     with tempfile.TemporaryDirectory() as folder:
         runs, outs = {}, {}
-        runs["python"], outs["python"] = _python_run(model, command, draws, steps)
+        runs["python"], outs["python"] = _make_python_run(model, command, draws, steps)
         for name, flags in (("c", FLAGS), ("c_same_rounding", SAME_ROUNDING)):
-            library = built("step.c", flags, Path(folder) / f"{name}.so")
-            runs[name], outs[name] = _c_run(library, model, command, draws, steps)
-        seconds = durations(runs, rounds)
+            library = build_library("step.c", flags, Path(folder) / f"{name}.so")
+            runs[name], outs[name] = _make_c_run(library, model, command, draws, steps)
+        seconds = measure_durations(runs, rounds)
     each = {name: float(np.median(t)) / (len(command) * steps) * 1e9 for name, t in seconds.items()}
     ratios = {name: float(np.median(seconds["python"] / t)) for name, t in seconds.items()}  # round by round
-    version = subprocess.run([gcc(), "-dumpfullversion"], capture_output=True, text=True, check=True).stdout.strip()
+    version = subprocess.run([find_gcc(), "-dumpfullversion"], capture_output=True, text=True, check=True)
     return StepCost(each["python"], each["c"], each["c_same_rounding"], ratios["c"], ratios["c_same_rounding"],
                     float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
-                    bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version}")
+                    bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version.stdout.strip()}")
 
 
-def _python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Run, Array]:
+def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
     run, state, record = kernel("closed_loop", model.effects), model.state(), model.record()
     return lambda: run(state, command, load, draws, record, steps, out), out
 
 
-def _c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, steps: int) -> tuple[Run, Array]:
+def _make_c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
     record = model.record()
     assert library.model_bytes() == record.nbytes, "step.c knows other parameters than plant.parameters"
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
@@ -89,57 +84,20 @@ def _c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, ste
     return lambda: library.closed_loop(*pointers, len(command), steps, result), out
 
 
-def cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
-    """What `Actuator.sample` and `advance` cost called from Python, s a cycle."""
-    plant = Actuator(Model())
-    plant.warm()
+def measure_accuracy(command: Array, steps: tuple[int, ...] = (20, 50, 100, 200, 500), finest: int = 5000
+                     ) -> list[Accuracy]:
+    """Error in XJ of some step sizes over `command` (n,) m, closed loop, without noise; friction off and on.
 
-    def run() -> None:
-        for _ in range(cycles):
-            plant.advance(1e-3 * plant.sample()[0])
-
-    return duration(run, rounds) / cycles
-
-
-def speed(command: Array, rounds: int = 9) -> float:
-    """How many times faster than real time a whole simulated run is, its noise and its columns included."""
-    model = Model()
-    return len(command) * model["controller.period"] / duration(lambda: simulate(model, command), rounds)
-
-
-def accuracy(command: Array, steps: tuple[int, ...] = (20, 50, 100, 200, 500), finest: int = FINEST) -> list[Accuracy]:
-    """Error in XJ of some step sizes over `command`, closed loop, without noise; friction off and on."""
+    The truth is the same run with `finest` steps a cycle: 5000 are steps of 0.2 us.
+    """
     columns = {}
     for friction in (False, True):
         model = Model().replace(QUIET | ({} if friction else FRICTIONLESS))
         truth = simulate(model, command, steps=finest).xj
-        columns[friction] = [_error(simulate(model, command, steps=n).xj - truth) for n in steps]
+        columns[friction] = [_measure_error(simulate(model, command, steps=n).xj - truth) for n in steps]
     return [Accuracy(n, *off, *on) for n, off, on in zip(steps, columns[False], columns[True], strict=True)]
 
 
-def _error(e: Array) -> tuple[float, float]:
-    return float(np.sqrt((e**2).mean())) * MICRO, float(np.abs(e).max()) * MICRO
-
-
-def lockstep() -> float:
-    """A whole preflight run on the embedded bus, log and all, as a multiple of real time; the best of three."""
-    from rig.run.job import Job
-    from rig.run.runner import run
-    from rig.sequences import load_sequence
-
-    job = Job(sequence=load_sequence("preflight"), model=Model())
-    speeds = []
-    for _ in range(3):
-        with tempfile.TemporaryDirectory() as folder:
-            speeds.append(run(job, Path(folder), ignore_progress, lambda: False).speed)
-    return max(speeds)
-
-
-def report(command: Array, progress: Progress = ignore_progress) -> dict[str, Any]:
-    """Everything about cost as one JSON object; `step` is None without gcc. `progress` gets the stage."""
-    progress("one run, and a run on the embedded bus", 0.0)
-    cost = step_vs_c(command)
-    one = {"step": cost and cost._asdict(), "times_real_time": speed(command), "cycle": cycle_cost(),
-           "lockstep": lockstep()}
-    return one | {"many": [rival._asdict() for rival in many(command, progress)],
-                  "grid": [rival._asdict() for rival in grid(command, progress)]}
+def _measure_error(error: Array) -> tuple[float, float]:
+    """RMS and largest absolute value, um."""
+    return float(np.sqrt((error**2).mean())) * 1e6, float(np.abs(error).max()) * 1e6

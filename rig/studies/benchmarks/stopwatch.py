@@ -1,4 +1,4 @@
-"""How long something takes: medians of rounds that alternate between rivals, as the machine's moods hit all alike."""
+"""Durations: rounds that alternate between rivals, so that a disturbance of the machine hits all of them."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 from rig.network.clock import WallClock
 
 Array = NDArray[np.float64]
-Run = Callable[[], object]
+Work = Callable[[], object]
 
 
-def durations(runs: Mapping[str, Run], rounds: int) -> dict[str, Array]:
-    """Durations of each run, (rounds,) s, after one to warm up; the rounds alternate."""
+def measure_durations(works: Mapping[str, Work], rounds: int) -> dict[str, Array]:
+    """Durations of each work, (rounds,) s, after one warm-up; the rounds alternate between them."""
     clock = WallClock()
-    taken: dict[str, list[int]] = {name: [] for name in runs}
+    taken: dict[str, list[int]] = {name: [] for name in works}
     for turn in range(rounds + 1):
-        for name, run in runs.items():
+        for name, work in works.items():
             start = clock.now()
-            run()
-            if turn:
+            work()
+            if turn > 0:
                 taken[name].append(clock.now() - start)
     return {name: np.array(times) * 1e-9 for name, times in taken.items()}
 
 
-def duration(run: Run, rounds: int) -> float:
-    """Median duration of a run, s."""
-    return float(np.median(durations({"": run}, rounds)[""]))
+def measure_median_duration(work: Work, rounds: int) -> float:
+    """The median duration of one work, s."""
+    return float(np.median(measure_durations({"": work}, rounds)[""]))

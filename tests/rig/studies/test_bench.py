@@ -9,14 +9,14 @@ import pytest
 from physics_cases import PREFLIGHT
 
 from rig.cli import main
-from rig.studies.benchmarks import many_runs, peers, peers_grid, plant_step
+from rig.studies.benchmarks import grid_runs, many_runs, plant_step, rivals, run_benchmarks, single_run
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {peers.GET_GCC}")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {rivals.GET_GCC}")
 
 
 @needs_gcc
 def test_c_and_python_take_the_same_step() -> None:
-    cost = plant_step.step_vs_c(PREFLIGHT, rounds=3)
+    cost = plant_step.compare_step_with_c(PREFLIGHT, rounds=3)
     assert cost is not None
     assert cost.identical
     assert cost.difference < 1e-9  # m, with another rounding: no more than stick-slip makes of it
@@ -24,10 +24,10 @@ def test_c_and_python_take_the_same_step() -> None:
 
 
 def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(peers.shutil, "which", lambda name: None)
-    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(plant_step, "cycle_cost", lambda: 4e-6)
-    monkeypatch.setattr(plant_step, "lockstep", lambda: 10.0)
+    monkeypatch.setattr(rivals.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(run_benchmarks, "measure_cycle_cost", lambda: 4e-6)
+    monkeypatch.setattr(run_benchmarks, "measure_bus_run_speed", lambda: 10.0)
     assert main.main(["bench"]) == 0
     words = " ".join(capsys.readouterr().out.split())
     assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in words
@@ -38,10 +38,11 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 
 def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    monkeypatch.setattr(plant_step, "step_vs_c", lambda command: None)
-    monkeypatch.setattr(plant_step, "lockstep", lambda: 10.0)
-    for part in ("many", "grid"):
-        monkeypatch.setattr(plant_step, part, lambda command, tell: [many_runs.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")])
+    monkeypatch.setattr(run_benchmarks, "compare_step_with_c", lambda command: None)
+    monkeypatch.setattr(run_benchmarks, "measure_bus_run_speed", lambda: 10.0)
+    for part in ("compare_many_runs", "compare_grid_runs"):
+        rival = rivals.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")
+        monkeypatch.setattr(run_benchmarks, part, lambda command, progress, rival=rival: [rival])
     assert main.main(["bench", "--json", "--out", str(tmp_path / "b.json")]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads((tmp_path / "b.json").read_text())
@@ -53,14 +54,14 @@ def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(plant_step, "report", lambda command, tell: {"step": None})
+    monkeypatch.setattr(run_benchmarks, "run_benchmarks", lambda command, progress: {"step": None})
     assert main.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
 
 
 def test_a_cycle_from_python_costs_far_less_than_a_cycle() -> None:
-    assert plant_step.cycle_cost(2000, 3) < 200e-6
+    assert single_run.measure_cycle_cost(2000, 3) < 200e-6
 
 
 @needs_gcc
@@ -71,7 +72,7 @@ def test_every_rival_makes_the_same_runs() -> None:
     def note_stage(stage: str, share: float) -> None:
         stages.append(stage)
 
-    found = {rival.name: rival for rival in many_runs.many(PREFLIGHT, note_stage, rounds=2, cycles=300)}
+    found = {rival.name: rival for rival in many_runs.compare_many_runs(PREFLIGHT, note_stage, rounds=2, cycles=300)}
     assert len(found) == 8 and stages
     for name, rival in found.items():
         if rival.speed is None:
@@ -92,13 +93,13 @@ def test_every_rival_makes_the_same_map() -> None:
     def note_stage(stage: str, share: float) -> None:
         stages.append(stage)
 
-    found = {rival.name: rival for rival in peers_grid.grid(PREFLIGHT[:1500], note_stage, rounds=2)}
+    found = {rival.name: rival for rival in grid_runs.compare_grid_runs(PREFLIGHT[:1500], note_stage, rounds=2)}
     assert len(found) == 8 and stages
     for name, rival in found.items():
         if rival.speed is None:
             assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
-        elif name != peers_grid.REFERENCE:
+        elif name != grid_runs.REFERENCE:
             assert rival.difference is not None and rival.difference < 1e-12
-    reference = found[peers_grid.REFERENCE]
+    reference = found[grid_runs.REFERENCE]
     assert reference.ratio is not None and reference.ratio > 2.0  # 13 on a quiet machine
     assert reference.difference is not None and 1e-6 < reference.difference < 3e-3
