@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fdi import Trace
-from fdi.diagnosis.bands import excursions, suited
-from fdi.diagnosis.rms_grid import search
+from fdi.diagnosis.bands import choose_bands, find_excursions
+from fdi.diagnosis.rms_grid import search_grid
 from fdi.report import paper_figures as figures
 from fdi.report.drawing import shorten_svg
 from plant import Model, simulate
@@ -34,7 +34,7 @@ def run_preflight(folder: str, kintas: float = 0.0, fss: float = FSS_NC, seed: i
 
 def format_minima(name: str, drive: str, trace: Trace) -> str:
     """Minima of the three maps and centre of gravity as a row of the table."""
-    g = search(trace, drive=drive)
+    g = search_grid(trace, drive=drive)
     assert g.step and g.ramp
     cells = [f"{p.kintas:.3f}, {p.fss:.1f} N ({p.rms * 1e6:.1f} µm)" for p in (
         g.step.minimum, g.ramp.minimum, g.joint.minimum, g.best)]
@@ -52,7 +52,7 @@ def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
         unit = nominal.replace({name: nominal[name] * (1 + TOLERANCE * rng.standard_normal()) for name in tolerances})
         unit = unit.replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
-        g = search(Trace.of(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
+        g = search_grid(Trace.of(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
         found.append([*g.merged[:2], *g.joint.minimum[:2], *g.best[:2]])
     off = np.array(found) - [kintas, fss, kintas, fss, kintas, fss]
     mean, sd = off.mean(0), off.std(0, ddof=1)
@@ -76,12 +76,12 @@ def main() -> None:
     save("7", figures.steps({"healthy": healthy} | clogged))
     save("8", figures.ramps({"healthy": healthy} | stiff))
     case = cases["14"]
-    bands = suited(case.com, case.load, case.period, None, lambda *_: None)
-    found, friction, _ = excursions(case.com, case.xj, case.period, bands, case.sections())
+    bands = choose_bands(case.com, case.load, case.period, None, lambda *_: None)
+    found, friction, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
     for number, kind, signal in (("10", "step", "position"), ("11", "ramp", "position"), ("12", "ramp", "speed")):
         save(number, figures.banded(found, friction, bands, case, kind, signal))
     for number, trace in cases.items():
-        save(number, figures.maps(search(trace), CASES[number]))
+        save(number, figures.maps(search_grid(trace), CASES[number]))
         for drive in ("current", "command"):
             print(format_minima(f"{CASES[number][0]:g}, {CASES[number][1]:g} N", drive, trace))
     for drive in ("current", "command"):

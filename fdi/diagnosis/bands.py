@@ -1,33 +1,33 @@
-"""A trace held against bands: levels of both faults, events with entry and exit times, and which fault rules."""
+"""Bands around a healthy response: what they are, and the verdict on a trace that is judged by them.
+
+Filter clogging is judged where the command steps, spool friction where it ramps slowly. A limit is the mean response of
+faulty units moved towards the healthy one until nearly every unit with a fault of that size is beyond it. Friction
+delays a step as clogging does, so the friction that the ramps show is allowed for before a step is judged.
+"""
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.comparison.localisation import name
-from fdi.diagnosis.envelope import (
-    Bands,
-    StepBand,
-    Width,
-    check_command,
-    judged_rows,
-    lasting_most,
-    loaded,
-    matches,
-    speed,
-    stays,
-    waver,
-)
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Event, Level
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Level
 from fdi.diagnosis.simulated_units import DYNAMIC
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
+    BAND_EVENT_SAMPLES,
+    BAND_FAULT_CLEARANCE_SD,
+    BAND_LARGEST_LOAD,
+    BAND_NEAREST_LIMIT_SD,
     BAND_UNITS_QUICK,
     FAST_SLIP_RATIO,
     FRICTION_HIDES_CLOGGING_RATIO,
+    SAME_COMMAND_POSITION,
+    SAME_COMMAND_RATE,
+    SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
 from fdi.trace.columns import hold_last
@@ -39,53 +39,345 @@ from plant.model import Model, load_model
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
+STEP_JUDGED_UNTIL = 0.1  # s after a step; later there is only stick-slip, which the ramps show better
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Bands of one command
+# ---------------------------------------------------------------------------------------------------------------------
+
+class StepBand(NamedTuple):
+    """A step's response from STEP_JUDGED_FROM to STEP_JUDGED_UNTIL: m over `t` (K,) s since the step."""
+
+    section: int  # number among the command's sections
+    t: Floats
+    healthy: Floats  # (K,) mean
+    shift: Floats  # (F, K) what friction adds, by the amounts of Bands.friction
+    spread: Floats  # (F, K) standard deviation of healthy filters, by the same amounts
+    middle: Floats  # (K,) what Table 2's lesser clogging adds
+    most: Floats  # (K,) what the greater clogging adds
+
+    def centre(self, friction: float, known: Floats) -> tuple[Floats, Floats]:
+        """Mean and standard deviation, (K,) each, with `friction` N, between the amounts `known` (F,) N."""
+        weights = _interpolation_weights(friction, known)
+        return self.healthy + weights @ self.shift, weights @ self.spread
+
+
+class Width(NamedTuple):
+    """How far a signal may be from `centre`, either way."""
+
+    centre: float
+    healthy: float
+    middle: float  # inf: the fault cannot be told from healthy units
+    most: float
+
+
+class RampBand(NamedTuple):
+    """A ramp's following error, m, and speed beyond the demand's, m/s, both positive in the ramp's direction."""
+
+    section: int
+    position: Width
+    speed: Width
+    half_range: Floats  # (F,) m, half the range of the error with each amount of Bands.friction
+    slip: float  # 1/s, fastest slip over that half range where FDS is FSS/1.5
+    ease: float  # s, how much of the range is lost where the spool slips faster: range ~ FSS (1 - ease slip)
+
+    def scale(self, half: float, fastest: float) -> float:
+        """Factor on the error that makes it the error with FDS = FSS/1.5.
+
+        Args:
+            half: half the range of the error, m.
+            fastest: fastest lasting slip, m/s.
+        """
+        slip = fastest / half if half > 0.0 else self.slip
+        factor = (1 - self.ease * self.slip) / max(1 - self.ease * slip, 0.1)
+        return float(np.clip(factor, 0.9, 1.3))  # what low and high dynamic friction account for
+
+    def sliding(self, half: float, fastest: float) -> float:
+        """1.5 FDS over FSS: the speed of a slip goes with FSS - FDS, which is FSS/3 where it is `slip`."""
+        if self.slip <= 0.0:
+            return 1.0
+        own = fastest / (self.scale(half, fastest) * half) if half > 0.0 else self.slip
+        return float(np.clip(STATIC_OVER_DYNAMIC * (1 - own / (3 * self.slip)), 0.0, STATIC_OVER_DYNAMIC))
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Bands of one command."""
+
+    sections: tuple[Section, ...]  # of the command, rows of `period`
+    period: float  # s
+    friction: Floats  # (F,) N, increasing, the healthy amount first
+    steps: tuple[StepBand, ...]
+    ramps: tuple[RampBand, ...]
+    middle_share: float  # of StepBand.middle, where the limit of MidBand is
+    most_share: float  # of StepBand.most, where the limit of MaxBand is
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    precursors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # healthy scatter, sensitivities
+
+    @property
+    def judges(self) -> tuple[bool, bool]:
+        """Whether this command shows clogging, and whether it shows friction."""
+        return (any(self.margins(s, s.spread[0])[2].any() for s in self.steps),
+                any(np.isfinite(r.position.middle) for r in self.ramps))
+
+    def margins(self, step: StepBand, spread: Floats) -> tuple[Floats, Floats, Flags]:
+        """Distances of the limits MidBand and MaxBand from the centre, m, and where the step is judged; (K,) each."""
+        judged = np.abs(step.middle) > BAND_FAULT_CLEARANCE_SD * spread
+        middle = np.maximum(self.middle_share * np.abs(step.middle), BAND_NEAREST_LIMIT_SD * spread)
+        return middle, np.maximum(self.most_share * np.abs(step.most), middle), judged
+
+
+def _interpolation_weights(friction: float, known: Floats) -> Floats:
+    """Weights (F,) of linear interpolation at `friction` between the amounts `known`, constant beyond the ends."""
+    return np.array([np.interp(friction, known, row) for row in np.eye(len(known))])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is measured on a response
+# ---------------------------------------------------------------------------------------------------------------------
+
+class Stay(NamedTuple):
+    """Rows first..last (inclusive) beyond a limit."""
+
+    first: int
+    last: int
+
+
+def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[Stay]:
+    """Where a flag (n,) is up for `lasting` rows in a row, until it is down for as many.
+
+    One or two samples are no event; a single sample back inside does not end one.
+    """
+    edges = np.flatnonzero(np.diff(beyond.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    runs = [Stay(int(a), int(b) - 1) for a, b in edges]
+    joined: list[list[Stay]] = []
+    for run in runs:
+        if joined and run.first - joined[-1][-1].last <= lasting:
+            joined[-1].append(run)
+        else:
+            joined.append([run])
+    found = []
+    for group in joined:
+        lasting_runs = [run for run in group if run.last - run.first + 1 >= lasting]
+        if lasting_runs:
+            found.append(Stay(lasting_runs[0].first, group[-1].last))
+    return found
+
+
+def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
+    """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all levels."""
+    known = np.where(np.isnan(x), -np.inf, x)
+    windows = np.lib.stride_tricks.sliding_window_view(known, lasting, axis=-1)
+    out: Floats = windows.min(axis=-1).max(axis=-1)
+    return out
+
+
+def compute_speed(x: Floats, period: float, span: float = 0.02) -> Floats:
+    """Speed, m/s, of a position (.., n) m, time last: difference over `span` s; NaN at the ends and beside gaps.
+
+    Over 20 ms, 2 um of noise become 0.14 mm/s. A spike of one sample becomes two of one sample each, so it does not
+    last either.
+    """
+    half = max(1, round(span / period / 2))
+    out = np.full(np.shape(x), np.nan)
+    out[..., half:-half] = (x[..., 2 * half:] - x[..., :-2 * half]) / (2 * half * period)
+    return out
+
+
+def compute_half_range(error: Floats) -> Floats:
+    """Half the range of a following error (.., n) m, time last, from its 1st to its 99th percentile."""
+    low, high = np.nanpercentile(error, (1, 99), axis=-1)
+    half: Floats = (high - low) / 2
+    return half
+
+
+def select_ramp_rows(s: Section, period: float, settling: float = 0.2) -> slice:
+    """The rows of a ramp that are judged: from `settling` s after its start, when the ram follows."""
+    return slice(s.start + round(settling / period), s.stop)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which bands a trace is judged by
+# ---------------------------------------------------------------------------------------------------------------------
+
+def check_command(bands: Bands, found: Sequence[Section], period: float, where: object) -> None:
+    """Refuse bands of another command.
+
+    Raises:
+        InputError: the first difference.
+    """
+    mine, theirs = _outline_command(bands.sections, bands.period), _outline_command(found, period)
+    if len(mine) != len(theirs):
+        raise InputError(where, "com", f"the command of the bands, {_describe_command(bands)}; this one has "
+                                       f"{len(theirs)} sections (rig fdi --learn-bands makes bands of it)")
+    for a, b in zip(mine, theirs, strict=True):
+        near = (abs(a.start - b.start) < SAME_COMMAND_TIME and abs(a.first - b.first) < SAME_COMMAND_POSITION
+                and abs(a.last - b.last) < SAME_COMMAND_POSITION
+                and abs(a.rate - b.rate) <= SAME_COMMAND_RATE * abs(a.rate) + 1e-6)
+        if a.kind != b.kind or not near:
+            raise InputError(where, "com", f"the command of the bands, {_describe_command(bands)}; at {b.start:.3g} s "
+                                           f"it differs (rig fdi --learn-bands makes bands of it)")
+
+
+def matches_command(bands: Bands, com: Floats, period: float) -> bool:
+    """Whether the bands are of this command, (n,) m."""
+    try:
+        check_command(bands, sections(com, period), period, "")
+    except InputError:
+        return False
+    return True
+
+
+class _Outline(NamedTuple):
+    kind: str
+    start: float  # s from the first change of the command
+    first: float
+    last: float
+    rate: float
+
+
+def _outline_command(parts: Sequence[Section], period: float) -> list[_Outline]:
+    """The steps and ramps: how long a test rests before and after them does not matter."""
+    chosen = [s for s in parts if s.kind in ("step", "ramp")]
+    begin = chosen[0].start if chosen else 0
+    return [_Outline(s.kind, (s.start - begin) * period, s.first, s.last, s.rate) for s in chosen]
+
+
+def _describe_command(bands: Bands) -> str:
+    kinds = [s.kind for s in bands.sections]
+    name = bands.provenance.get("command", "")
+    return f"{name} ({kinds.count('step')} steps, {kinds.count('ramp')} ramps)".strip()
+
+
+def is_loaded(load: Floats) -> bool:
+    """Whether a known load, (n,) N, moves the ram by more than can be seen."""
+    return bool((np.abs(np.nan_to_num(load)) > BAND_LARGEST_LOAD).any())
+
+
+def is_nominal_plant(model: Model) -> bool:
+    """Whether a healthy unit of the model is a nominal one; its two faults and its noise do not count."""
+    apart = set(model.differences()) - {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
+    return model.plant == "eha" and not any(not name.startswith("sensors.") for name in apart)
+
+
+def choose_bands(com: Floats, load: Floats, period: float, model: Model | None = None,
+                 progress: Progress = ignore_progress) -> Bands:
+    """The preflight's own bands if they are of this command, load and model; else bands made for them."""
+    from fdi.diagnosis.bands_file import load_default_bands
+    from fdi.diagnosis.learn_bands import simulate_bands
+
+    if (model is None or is_nominal_plant(model)) and not is_loaded(load):
+        own = load_default_bands()
+        if matches_command(own, com, period):
+            return own
+    return simulate_bands(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, progress=progress)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The verdict
+# ---------------------------------------------------------------------------------------------------------------------
+
+class Event(NamedTuple):
+    """A stay outside a band."""
+
+    band: str  # "middle" | "most"
+    signal: str  # "position" | "speed"
+    section: str  # of the command, as fdi.trace.sections names it
+    t_in: float  # s
+    t_out: float  # s
+    excess: float  # furthest beyond the band, m or m/s
+
 
 class Judged(NamedTuple):
     """What the bands say. A fault whose sections the command lacks, or the trace lost, has no level."""
 
     levels: Mapping[str, Level]  # by the effect's name
-    ruling: str | None  # the fault that is further gone; None if both are acceptable
+    ruling: str | None  # the more severe fault; None if both are acceptable
     events: tuple[Event, ...]  # in order of time
     severity: Mapping[str, float]  # furthest lasting excursion, in MidBand limits; above 1 is an event
     friction: float  # N, what the ramps show: FSS / (1 - Kintas)
     notes: tuple[str, ...]
 
 
-def judge(source: Trace, bands: Bands | None = None, model: Model | None = None,
-          progress: Progress = ignore_progress, where: object = "trace") -> Judged:
+def judge_trace(source: Trace, bands: Bands | None = None, model: Model | None = None,
+                progress: Progress = ignore_progress, where: object = "trace") -> Judged:
     """Judge a trace; rows that its preparation found unusable are left out.
 
-    Without `bands` the preflight's own are taken, or, for another command, load or model than they are of, bands are
-    made by simulating units of the `model` (default: the nominal one) on this command: some seconds.
+    Without `bands` the preflight's own are taken if they are of this command, load and model. Otherwise bands are
+    made by simulating units of the `model` (default: the nominal one) on this command, which takes some seconds.
 
     Raises:
         InputError: no position, or bands of another command or load.
     """
-    com, xj, load, period, t0 = columns(source)
-    chosen = bands or suited(com, load, period, model, progress)
-    return judge_columns(com, xj, period, chosen, load, t0, where)
+    com, xj, load, period, t0 = read_columns(source)
+    chosen = bands or choose_bands(com, load, period, model, progress)
+    return judge_position(com, xj, period, chosen, load, t0, where)
 
 
-def suited(com: Floats, load: Floats, period: float, model: Model | None = None,
-           progress: Progress = ignore_progress) -> Bands:
-    """The preflight's own bands if they are of this command, load and model; else bands made for them."""
-    from fdi.diagnosis.bands_file import default
-    from fdi.diagnosis.learn_bands import build
-
-    plain = model is None or same_plant(model)
-    if plain and not loaded(load) and matches(own := default(), com, period):
-        return own
-    return build(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, progress=progress)
+def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
+    """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
+    return hold_last(source.com), source.measured("xj"), source.load, source.period, float(source.t[0])
 
 
-def same_plant(model: Model) -> bool:
-    """Whether a healthy unit of the model is a nominal one; its two faults and its noise do not count."""
-    apart = set(model.differences()) - {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
-    return model.plant == "eha" and not any(not name.startswith("sensors.") for name in apart)
+def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,
+                   where: object = "trace", parts: list[Section] | None = None) -> Judged:
+    """Judge a command and sensed position, (n,) m, NaN where missing, one row per `period` s from `t0` s.
 
+    `parts` are the command's sections, for callers that judge many runs of one command.
+
+    Raises:
+        InputError: no position, bands of another command, or a load that the bands do not know.
+    """
+    if np.isnan(xj).all():
+        raise InputError(where, "xj", "a measured position: bands judge nothing else")
+    parts = parts or sections(com, period)
+    check_command(bands, parts, period, where)
+    if load is not None and is_loaded(load) and "load" not in bands.provenance:
+        most = float(np.nanmax(np.abs(load)))
+        raise InputError(where, "load", f"none, as these bands are of an unloaded ram, not {most:.3g} N")
+    found, friction, notes = find_excursions(com, xj, period, bands, parts)
+    events = sorted((event for e in found for event in _find_events(e, t0, period)), key=lambda event: event.t_in)
+    levels, severity = {}, {}
+    for fault in FAULTS:
+        own = [e for e in found if e.fault == fault.name and e.signal == "position" and e.judged]
+        if not own:
+            reason = _explain_no_level(fault.name, found, friction, bands)
+            notes.append(f"{fault.name} is not judged by bands: {reason}")
+            continue
+        severity[fault.name] = max(0.0, *(float(find_lasting_peak(e.departure / e.middle)) for e in own))
+        levels[fault.name] = _choose_level({event.band for e in own for event in _find_events(e, t0, period)})
+    if FRICTION.name in levels and max(find_slips(found)) > FAST_SLIP_RATIO * max(1.0, severity[FRICTION.name]):
+        notes.append("the spool slips faster than its static friction accounts for: its dynamic friction is low")
+    gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
+    ruling = max(gone, key=lambda f: gone[f]) if gone else None
+    return Judged(levels, ruling, tuple(events), severity, friction, tuple(notes))
+
+
+def _choose_level(left: set[str]) -> Level:
+    """The level of a fault from the bands that the position has left."""
+    if "most" in left:
+        return Level.NON_NOMINAL
+    if "middle" in left:
+        return Level.MAINTENANCE
+    return Level.ACCEPTABLE
+
+
+def _explain_no_level(fault: str, found: list[Excursion], friction: float, bands: Bands) -> str:
+    if not any(e.fault == fault and e.signal == "position" for e in found):
+        return "no section of the trace shows it"
+    if fault == CLOGGING.name and friction > FRICTION_HIDES_CLOGGING_RATIO * float(bands.friction[0]):
+        return f"{friction:.0f} N of friction hide it"
+    return "Table 2's fault is within the scatter of healthy units"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Excursions: how far each judged signal is from its centre
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Excursion(NamedTuple):
-    """One signal of one section over its limits; (n,) each, rows from `start`."""
+    """Departure of one signal of one section from its centre, with its limits; (n,) each, rows from `start`."""
 
     signal: str  # "position" | "speed"
     section: Section
@@ -97,112 +389,71 @@ class Excursion(NamedTuple):
 
     @property
     def judged(self) -> bool:
-        """Whether there is a limit over known samples for long enough to be left."""
+        """Whether a limit applies to known samples for as long as an event lasts."""
         limited = np.isfinite(self.departure) & np.isfinite(self.middle)
-        return bool(lasting_most(limited.astype(float)) > 0.0)
+        return bool(find_lasting_peak(limited.astype(float)) > 0.0)
 
 
-def judge_columns(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,
-                  where: object = "trace", parts: list[Section] | None = None) -> Judged:
-    """Judge a command and sensed position, (n,) m, NaN where missing, one row per `period` s from `t0` s.
-
-    `parts` are the command's sections, for who judges many runs of one.
-
-    Raises:
-        InputError: no position, bands of another command, or a load that the bands do not know.
-    """
-    if np.isnan(xj).all():
-        raise InputError(where, "xj", "a measured position: bands judge nothing else")
-    parts = parts or sections(com, period)
-    check_command(bands, parts, period, where)
-    if load is not None and loaded(load) and "load" not in bands.provenance:
-        most = float(np.nanmax(np.abs(load)))
-        raise InputError(where, "load", f"none, as these bands are of an unloaded ram, not {most:.3g} N")
-    found, friction, notes = excursions(com, xj, period, bands, parts)
-    events = sorted((event for e in found for event in _events(e, t0, period)), key=lambda event: event.t_in)
-    levels, severity = {}, {}
-    for fault in FAULTS:
-        own = [e for e in found if e.fault == fault.name and e.signal == "position" and e.judged]
-        if not own:
-            notes.append(f"{fault.name} is not judged by bands: {_why(fault.name, found, friction, bands)}")
-            continue
-        severity[fault.name] = max(0.0, *(float(lasting_most(e.departure / e.middle)) for e in own))
-        left = {event.band for e in own for event in _events(e, t0, period)}
-        levels[fault.name] = (Level.NON_NOMINAL if "most" in left else Level.MAINTENANCE if "middle" in left else
-                              Level.ACCEPTABLE)
-    if FRICTION.name in levels and max(slips(found)) > FAST_SLIP_RATIO * max(1.0, severity[FRICTION.name]):
-        notes.append("the spool slips faster than its static friction accounts for: less dynamic friction than a third "
-                     "below it")
-    gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
-    ruling = max(gone, key=lambda f: gone[f]) if gone else None
-    return Judged(levels, ruling, tuple(events), severity, friction, tuple(notes))
-
-
-def _why(fault: str, found: list[Excursion], friction: float, bands: Bands) -> str:
-    if not any(e.fault == fault and e.signal == "position" for e in found):
-        return "no section of the trace shows it"
-    if fault == CLOGGING.name and friction > FRICTION_HIDES_CLOGGING_RATIO * float(bands.friction[0]):
-        return f"{friction:.0f} N of friction hide it"
-    return "Table 2's fault is within what healthy units scatter"
-
-
-def slips(found: list[Excursion]) -> list[float]:
-    """Fastest lasting slip on each ramp, in MidBand limits of speed."""
-    return [float(lasting_most(e.departure / e.middle)) for e in found if e.signal == "speed"] or [0.0]
-
-
-def excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts: list[Section]
-               ) -> tuple[list[Excursion], float, list[str]]:
-    """Every judged signal of every judged section, the friction that the ramps show (N), and what was left out."""
+def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts: list[Section]
+                    ) -> tuple[list[Excursion], float, list[str]]:
+    """Every judged signal of every judged section, the friction that the ramps show (N), and notes on omissions."""
     own = [s for s in parts if s.kind in ("step", "ramp")]
     known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
     place = dict(zip(known, own, strict=True))
     notes: list[str] = []
     out: list[Excursion] = []
     shown = []
-    velocity = speed(xj, period)
+    velocity = compute_speed(xj, period)
     for ramp in bands.ramps:
-        s, rows = place[ramp.section], judged_rows(place[ramp.section], period)
+        s, rows = place[ramp.section], select_ramp_rows(place[ramp.section], period)
         error = np.sign(s.rate) * (com[rows] - xj[rows])
-        if _lost(error, s, notes):
+        if _is_lost(error, s, notes):
             continue
         beyond = np.sign(s.rate) * velocity[rows] - abs(s.rate)
-        half = float(waver(error))
-        fastest = float(lasting_most(beyond))
+        half = float(compute_half_range(error))
+        fastest = float(find_lasting_peak(beyond))
         scale = ramp.scale(half, fastest)
-        amount = float(np.interp(scale * half, ramp.waver, bands.friction))
+        amount = float(np.interp(scale * half, ramp.half_range, bands.friction))
         shown.append((amount, amount * ramp.sliding(half, fastest)))
-        out.append(_ramp("position", s, rows.start, scale * (error - ramp.position.centre), ramp.position))
-        out.append(_ramp("speed", s, rows.start, beyond - ramp.speed.centre, ramp.speed))
+        departure = scale * (error - ramp.position.centre)
+        out.append(_make_ramp_excursion("position", s, rows.start, departure, ramp.position))
+        out.append(_make_ramp_excursion("speed", s, rows.start, beyond - ramp.speed.centre, ramp.speed))
     least = float(bands.friction[0])
     friction, sliding = np.mean(shown, axis=0).tolist() if shown else (least, least)
     if bands.ramps and not shown:
         notes.append("steps are judged as if the spool had healthy friction: no ramp shows how much there is")
     for step in bands.steps:
-        made = _step(xj, period, bands, step, place[step.section], (friction, sliding))
-        if not _lost(xj[made.start:made.start + len(made.departure)], made.section, notes):
+        made = _make_step_excursion(xj, period, bands, step, place[step.section], (friction, sliding))
+        if not _is_lost(xj[made.start:made.start + len(made.departure)], made.section, notes):
             out.append(made)
     return out, friction, notes
 
 
-def _lost(x: Floats, s: Section, notes: list[str]) -> bool:
+def find_slips(found: list[Excursion]) -> list[float]:
+    """Fastest lasting slip on each ramp, in MidBand limits of speed."""
+    return [float(find_lasting_peak(e.departure / e.middle)) for e in found if e.signal == "speed"] or [0.0]
+
+
+def _is_lost(x: Floats, s: Section, notes: list[str]) -> bool:
+    """Whether too much of a section is missing to judge it; if so, with a note."""
     lost = float(np.isnan(x).mean()) if len(x) else 1.0
-    if lost > 1.0 - SECTION_MEASURED_SHARE:
+    too_much = lost > 1.0 - SECTION_MEASURED_SHARE
+    if too_much:
         notes.append(f"{name(s)} is not judged: {100 * lost:.0f} % of its position is missing")
-    return lost > 1.0 - SECTION_MEASURED_SHARE
+    return too_much
 
 
-def _ramp(signal: str, s: Section, start: int, departure: Floats, width: Width) -> Excursion:
+def _make_ramp_excursion(signal: str, s: Section, start: int, departure: Floats, width: Width) -> Excursion:
     middle, most = (np.full(len(departure), limit) for limit in (width.middle, width.most))
     return Excursion(signal, s, start, np.abs(departure), middle, most, FRICTION.name)
 
 
-def _step(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section, amounts: tuple[float, float]
-          ) -> Excursion:
-    """Departure towards clogging; on rows where no limit stands it is NaN.
+def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section,
+                         amounts: tuple[float, float]) -> Excursion:
+    """Departure towards clogging; NaN on rows without a limit.
 
-    A step is delayed by what slides (FDS) and scatters by what sticks (FSS). So two amounts of friction are allowed,
-    and what is left by either counts.
+    A step is delayed by the sliding friction (FDS) and scatters with the static one (FSS). So both amounts of friction
+    are allowed for, and the smaller departure counts.
     """
     first, stop = round(step.t[0] / period), round(step.t[-1] / period) + 1
     rows = np.arange(first, min(stop, s.stop - s.start))
@@ -216,19 +467,14 @@ def _step(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section, a
                      CLOGGING.name)
 
 
-def _events(e: Excursion, t0: float, period: float) -> list[Event]:
+def _find_events(e: Excursion, t0: float, period: float) -> list[Event]:
     out = []
     for band, limit in (("middle", e.middle), ("most", e.most)):
         with np.errstate(invalid="ignore"):
             beyond = e.departure > limit
-        for stay in stays(beyond):
+        for stay in find_stays(beyond):
             rows = slice(stay.first, stay.last + 1)
             excess = float(np.nanmax(e.departure[rows] - limit[rows]))
             begin = t0 + (e.start + stay.first) * period
             out.append(Event(band, e.signal, name(e.section), begin, t0 + (e.start + stay.last + 1) * period, excess))
     return out
-
-
-def columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
-    """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
-    return hold_last(source.com), source.measured("xj"), source.load, source.period, float(source.t[0])

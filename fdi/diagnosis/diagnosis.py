@@ -1,4 +1,4 @@
-"""The whole check of one captured test: bands, precursors, grid, refined sizes, levels, and what else is wrong."""
+"""The diagnosis of one captured test: bands, precursors, RMS grid, refined sizes, levels, and what else is wrong."""
 from __future__ import annotations
 
 import math
@@ -7,15 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi.diagnosis import levels as rules
-from fdi.diagnosis import rms_grid as grids
-from fdi.diagnosis.bands import Judged, judge, same_plant
-from fdi.diagnosis.bands_file import default
-from fdi.diagnosis.envelope import Bands, loaded, matches
-from fdi.diagnosis.fault_unknowns import LARGEST, MOST, positive
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Event, Level
-from fdi.diagnosis.precursors import Precursor, measure
-from fdi.diagnosis.refine import COARSE, Refined, refine
+from fdi.diagnosis.bands import Bands, Event, Judged, is_loaded, is_nominal_plant, judge_trace, matches_command
+from fdi.diagnosis.bands_file import load_default_bands
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
+from fdi.diagnosis.precursors import Precursor, measure_precursors
+from fdi.diagnosis.refine import COARSE_STARTS, LARGEST_FSS, LARGEST_KINTAS, Refined, get_positive, refine_sizes
+from fdi.diagnosis.rms_grid import Grid, search_grid
 from fdi.estimation.noise_floor import sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
@@ -32,27 +29,26 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 
-STAGES = 4
-WORDS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
+VERDICTS = ("ACCEPTABLE", "MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE", "CANNOT_TELL")
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What `rig fdi` tells of a trace."""
+    """The answer of `rig fdi` on a trace."""
 
     source: str
-    verdict: str  # one of WORDS
+    verdict: str  # one of VERDICTS
     levels: Mapping[str, Level | None]  # by fault; None: cannot be judged
     ruling: str | None  # the fault that is further gone; None if neither is
     sizes: Mapping[str, Estimate]  # by fault, Kintas and N, as the levels are judged by them
     refined: Refined
-    grid: grids.Grid | None  # None: the command has neither steps nor ramps
+    grid: Grid | None  # None: the command has neither steps nor ramps
     precursors: Mapping[str, Precursor]
-    judged: Judged | None  # what the bands say; None: there are none of this command
-    others: Mapping[str, Estimate]  # suspects that are off what a healthy unit has, by parameter, SI
+    judged: Judged | None  # the verdict of the bands; None: there are none of this command
+    others: Mapping[str, Estimate]  # suspects outside the healthy range, by parameter, SI
     trace: Trace  # prepared for replay
     model: Model  # at the cycle of the trace
-    floor: Mapping[str, float]  # what the sensors' noise makes of each signal, RMS SI
+    floor: Mapping[str, float]  # RMS noise by signal, SI
     bands: Bands | None
     notes: tuple[str, ...]
 
@@ -63,17 +59,16 @@ class Diagnosis:
 
     @property
     def passed(self) -> bool:
-        """Whether both faults are acceptable and nothing else is in the way of saying so."""
+        """Whether both faults are known to be acceptable."""
         return self.verdict == "ACCEPTABLE"
 
 
 def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = None,
-             progress: Progress = ignore_progress, source: str = "trace",
-             workers: int = 2) -> Diagnosis:
+             progress: Progress = ignore_progress, source: str = "trace", workers: int = 2) -> Diagnosis:
     """Judge the two faults from a trace of any command.
 
     Args:
-        trace: needs Com, XJ and Cor; P12, XS and a known load make it surer.
+        trace: needs Com, XJ and Cor; P12, XS and a known load narrow the intervals.
         model: the unit as it left the works; default the nominal one.
         bands: default: those that come with the software, if they are of this command.
         progress: called with each stage and the share done, 0 to 1.
@@ -81,7 +76,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         workers: threads.
 
     Raises:
-        InputError: what cannot be judged at all, in one line.
+        InputError: a trace that cannot be judged at all.
     """
     model = model or load_model()
     if model.plant != "eha":
@@ -93,58 +88,58 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         raise InputError(source, "com",
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
     notes = list(trace.notes)
-    progress("bands", 1 / STAGES)
-    bands, judged, seen = _banded(trace, model, bands, notes)
-    progress("grid", 2 / STAGES)
-    grid = _grid(trace, model, notes)
-    progress("refinement", 3 / STAGES)
+    progress("bands", 0.25)
+    bands, judged, seen = _judge_by_bands(trace, model, bands, notes)
+    progress("grid", 0.5)
+    grid = _search_grid(trace, model, notes)
+    progress("refinement", 0.75)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
-    found = refine(model, trace, (*_starts(grid), *COARSE), floor, workers)
+    found = refine_sizes(model, trace, (*_list_starts(grid), *COARSE_STARTS), floor, workers)
     progress("done", 1.0)
-    return _concluded(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, trace, model, floor, bands,
-                                tuple(notes)))
+    return _conclude(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, trace, model, floor, bands,
+                               tuple(notes)))
 
 
-def _banded(trace: Trace, model: Model, bands: Bands | None, notes: list[str]
-            ) -> tuple[Bands | None, Judged | None, dict[str, Precursor]]:
-    """Bands, what they say, and the precursors."""
+def _judge_by_bands(trace: Trace, model: Model, bands: Bands | None, notes: list[str]
+                    ) -> tuple[Bands | None, Judged | None, dict[str, Precursor]]:
+    """Bands, their verdict, and the precursors."""
     if bands is None:
-        bands = _own_bands(trace, model, notes)
+        bands = _find_own_bands(trace, model, notes)
     judged = None
     if bands is not None:
-        judged = judge(trace, bands, model)
+        judged = judge_trace(trace, bands, model)
         notes += judged.notes
-    return bands, judged, measure(trace, bands)
+    return bands, judged, measure_precursors(trace, bands)
 
 
-def _own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
+def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
-    own = default()
-    if not same_plant(model):
+    own = load_default_bands()
+    if not is_nominal_plant(model):
         notes.append("no bands: the software's own are of the nominal unit; rig fdi --learn-bands makes others")
         return None
-    if loaded(trace.load):
+    if is_loaded(trace.load):
         notes.append("no bands: the ram is loaded, and the software's own are of a free one")
         return None
-    if not matches(own, trace.com, trace.period):
+    if not matches_command(own, trace.com, trace.period):
         notes.append("no bands: the software's own are of the preflight command, this is another")
         return None
     return own
 
 
-def _grid(trace: Trace, model: Model, notes: list[str]) -> grids.Grid | None:
+def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
     kinds = {s.kind for s in sections(trace.com, trace.period)}
     if not kinds & {"step", "ramp"}:
         notes.append("no RMS grid: the command has neither steps nor ramps")
         return None
     try:
-        return grids.search(trace, model)
+        return search_grid(trace, model)
     except InputError as error:  # sections that a gap has emptied
         notes.append(f"no RMS grid: {error.expected}")
         return None
 
 
-def _starts(grid: grids.Grid | None) -> list[tuple[float, float]]:
+def _list_starts(grid: Grid | None) -> list[tuple[float, float]]:
     """The grid's answers as starts of the refinement."""
     if grid is None:
         return []
@@ -152,30 +147,33 @@ def _starts(grid: grids.Grid | None) -> list[tuple[float, float]]:
     return [(grid.merged.kintas, grid.merged.fss), *((p.kintas, p.fss) for p in minima)]
 
 
-def _concluded(d: Diagnosis) -> Diagnosis:
+def _conclude(d: Diagnosis) -> Diagnosis:
     """Levels, verdict, and what else is off."""
-    sizes = _sizes(d.refined)
-    levels = {f.name: rules.level(f, sizes[f.name]) for f in FAULTS}
-    far = max(d.refined.ratio.values()) > RESIDUAL_JUDGES_NOTHING
+    sizes = _widen_intervals(d.refined)
+    levels = {f.name: judge_size(f, sizes[f.name]) for f in FAULTS}
+    is_useless = max(d.refined.ratio.values()) > RESIDUAL_JUDGES_NOTHING
     if not d.refined.reached:
-        levels = {name: found if found == Level.ACCEPTABLE and not far else None for name, found in levels.items()}
-    others = {name: e for name, e in d.refined.others.items() if not far and _unhealthy(name, e, d.model)}
-    return replace(d, levels=levels, sizes=sizes, ruling=rules.ruling(sizes, levels), others=others,
-                   verdict=_verdict(levels, d.refined.reached))
+        kept = () if is_useless else (Level.ACCEPTABLE,)
+        levels = {name: found if found in kept else None for name, found in levels.items()}
+    others = {}
+    if not is_useless:
+        others = {name: e for name, e in d.refined.others.items() if _is_unhealthy(name, e, d.model)}
+    return replace(d, levels=levels, sizes=sizes, ruling=find_ruling_fault(sizes, levels), others=others,
+                   verdict=_decide_verdict(levels, d.refined.reached))
 
 
-def _sizes(found: Refined) -> dict[str, Estimate]:
+def _widen_intervals(found: Refined) -> dict[str, Estimate]:
     """The sizes of both faults; where more than noise is left, their intervals are wider by as much."""
     wider = 1.0 if found.reached else max(found.ratio.values())
 
-    def widened(e: Estimate, most: float) -> Estimate:
+    def widen(e: Estimate, most: float) -> Estimate:
         low, high = e.value - wider * (e.value - e.low), e.value + wider * (e.high - e.value)
         return Estimate(e.value, max(low, 0.0), min(high, most))
 
-    return {CLOGGING.name: widened(found.kintas, MOST), FRICTION.name: widened(found.fss, LARGEST)}
+    return {CLOGGING.name: widen(found.kintas, LARGEST_KINTAS), FRICTION.name: widen(found.fss, LARGEST_FSS)}
 
 
-def _verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
+def _decide_verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
     known = [found for found in levels.values() if found is not None]
     if not reached:
         return "SOMETHING_ELSE"
@@ -185,11 +183,11 @@ def _verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
     return "ACCEPTABLE" if len(known) == len(levels) else "CANNOT_TELL"
 
 
-def _unhealthy(name: str, e: Estimate, model: Model) -> bool:
-    """Whether a suspect is surely off what a healthy unit has: there are many of them, so by more than 95 %."""
+def _is_unhealthy(name: str, e: Estimate, model: Model) -> bool:
+    """Whether a suspect is surely outside the healthy range; there are six of them, so 95 % is not enough."""
     low = e.value - SUSPECT_INTERVAL_FACTOR * (e.value - e.low)
     high = e.value + SUSPECT_INTERVAL_FACTOR * (e.high - e.value)
     if name in SUSPECT_SMALLEST:
         return (low > 0.0 or high < 0.0) and abs(e.value) > SUSPECT_SMALLEST[name]
-    usual, way = positive(model, name), math.exp(SUSPECT_HEALTHY_TOLERANCES * UNIT_TOLERANCE)
-    return low > usual * way or high < usual / way
+    usual, factor = get_positive(model, name), math.exp(SUSPECT_HEALTHY_TOLERANCES * UNIT_TOLERANCE)
+    return low > usual * factor or high < usual / factor

@@ -1,8 +1,20 @@
-"""The two progressive faults, their levels, and what is said about them."""
+"""The two progressive faults of the servovalve, and the rules from a size with its interval to one of three levels.
+
+A limit of Table 2 counts as reached when it lies inside the 95 % interval or below it, while the limit before it (the
+healthy size, for MidBand) is excluded. A fault is acceptable only if MidBand lies clear of the interval
+(`ACCEPTABLE_INTERVAL_FACTOR`): a missed fault costs more than an early look. So a fault exactly at MidBand is found in
+98 % of all tests, as long as the interval excludes a healthy unit. An interval that holds both the healthy size and
+MidBand cannot be judged.
+"""
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
+
+from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
+
+STATIC_OVER_DYNAMIC = 1.5  # FSS over FDS of the nominal spool (plant/nominal.toml)
 
 
 class Level(IntEnum):
@@ -14,7 +26,7 @@ class Level(IntEnum):
 
     @property
     def word(self) -> str:
-        """As in the JSON answer."""
+        """The level as in the JSON answer."""
         return self.name.lower()
 
 
@@ -43,12 +55,34 @@ class Estimate(NamedTuple):
     high: float
 
 
-class Event(NamedTuple):
-    """A stay outside a band."""
+def judge_size(fault: Fault, size: Estimate) -> Level | None:
+    """The level of a fault of that size; None if the interval holds both a healthy unit and MidBand.
 
-    band: str  # "middle" | "most"
-    signal: str  # "position" | "speed"
-    section: str  # of the command, as fdi.trace.sections names it
-    t_in: float  # s
-    t_out: float  # s
-    excess: float  # furthest beyond the band, m or m/s
+    >>> judge_size(CLOGGING, Estimate(0.02, 0.0, 0.07)).word, judge_size(CLOGGING, Estimate(0.23, 0.18, 0.28)).word
+    ('acceptable', 'maintenance')
+    """
+    if size.value + ACCEPTABLE_INTERVAL_FACTOR * (size.high - size.value) < fault.middle:
+        return Level.ACCEPTABLE
+    if size.low <= fault.healthy:
+        return None
+    if size.high >= fault.most and size.low > fault.middle:
+        return Level.NON_NOMINAL
+    return Level.MAINTENANCE
+
+
+def classify_size(fault: Fault, value: float) -> Level:
+    """The class of a size without an interval, by Table 2 of the paper; a size at a limit is beyond it."""
+    return Level(int(value >= fault.middle) + int(value >= fault.most))
+
+
+def compute_severity(fault: Fault, value: float) -> float:
+    """How far a fault has gone: 0 healthy, 1 at MidBand, 2 at MaxBand, straight lines between and beyond."""
+    if value <= fault.middle:
+        return (value - fault.healthy) / (fault.middle - fault.healthy)
+    return 1.0 + (value - fault.middle) / (fault.most - fault.middle)
+
+
+def find_ruling_fault(sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None]) -> str | None:
+    """Name of the more severe of the faults that are not acceptable; None if there is none."""
+    gone = [f for f in FAULTS if levels.get(f.name) not in (None, Level.ACCEPTABLE)]
+    return max(gone, key=lambda f: compute_severity(f, sizes[f.name].value)).name if gone else None

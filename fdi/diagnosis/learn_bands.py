@@ -1,4 +1,4 @@
-"""Bands made: by simulating units of a model on a command, or from a fleet's own healthy traces."""
+"""Making bands: by simulating units of a model on a command, or from a fleet's own healthy traces."""
 from __future__ import annotations
 
 import hashlib
@@ -10,28 +10,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.bands import excursions
-from fdi.diagnosis.envelope import (
-    FIRST,
-    HORIZON,
+from fdi.diagnosis.bands import (
+    STEP_JUDGED_FROM,
+    STEP_JUDGED_UNTIL,
     Bands,
     RampBand,
     StepBand,
     Width,
-    judged_rows,
-    lasting_most,
-    speed,
-    waver,
+    check_command,
+    choose_bands,
+    compute_half_range,
+    compute_speed,
+    find_excursions,
+    find_lasting_peak,
+    is_loaded,
+    judge_position,
+    read_columns,
+    select_ramp_rows,
 )
-from fdi.diagnosis.faults import CLOGGING, FRICTION
-from fdi.diagnosis.features import features, slow
-from fdi.diagnosis.simulated_units import STEPS, Kind, runs
+from fdi.diagnosis.bands_file import KNOT_CYCLES, save_bands
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Level
+from fdi.diagnosis.precursors import compute_features, is_slow_ramp
+from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.output import writable
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import software
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
+    BAND_NEAREST_LIMIT_SD,
     BAND_UNITS,
+    FLEET_FEWEST_TRACES,
+    FLEET_PRIOR_TRACES,
+    POSITION_MISSING_SHARE,
     RAMP_FAULT_MISSED_SHARE,
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
@@ -43,18 +53,61 @@ from plant.model import Model, load_model
 
 Floats = NDArray[np.float64]
 
-SEED = 0
-BETWEEN = (20.0, 50.0, 100.0, 140.0)  # N of friction, beside Table 2's, at which its effect on steps is known
-EASY = 0.2  # FDS over FSS of units that slip easily
-COARSE = 2  # cycles between the times at which shifts and spreads are known
 
+def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model | None = None,
+                    com: Floats | None = None, name: str = "", seed: int = 0, progress: Progress = ignore_progress
+                    ) -> dict[str, Any]:
+    """Bands from the traces `sources`, or without any by simulation over the command `com` (n,) m; written to `out`.
 
-def build(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS, faulty: int = BAND_UNITS,
-          seed: int = SEED, steps: int = STEPS, progress: Progress = ignore_progress, name: str = "") -> Bands:
-    """Bands of a command (n,) m with a known load (n,) N, one row per `period` s, by simulating units of a model.
+    Returns what was made, for --json.
 
     Raises:
-        InputError: a command without steps and ramps, a period that is not the model's, or no convergence of both.
+        InputError: traces that cannot be learned from, or a place that cannot be written.
+    """
+    place = writable(out, "--out")
+    if sources:
+        traces = []
+        for done, source in enumerate(sources):
+            progress("reading", done / len(sources))
+            traces.append(Trace.read(source))
+        bands = learn_bands(traces, model, [str(source) for source in sources], progress)
+    elif com is None:
+        raise InputError("--learn-bands", "", "traces, or a command to simulate")
+    else:
+        model = model or load_model()
+        bands = simulate_bands(model, com, np.zeros_like(com), model["controller.period"], seed=seed,
+                               progress=progress, name=name)
+    save_bands(bands, place)
+    judged = [fault.name for fault, is_shown in zip((CLOGGING, FRICTION), bands.judges, strict=True) if is_shown]
+    return {"bands": str(out), "judges": judged, "provenance": dict(bands.provenance)}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# By simulation
+# ---------------------------------------------------------------------------------------------------------------------
+
+def simulate_bands(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS,
+                   faulty: int = BAND_UNITS, seed: int = 0, steps: int = 20, progress: Progress = ignore_progress,
+                   name: str = "", frictions: Sequence[float] = (20.0, 50.0, 100.0, 140.0), low_sliding: float = 0.2
+                   ) -> Bands:
+    """Bands of a command (n,) m with a known load (n,) N, one row per `period` s, by simulating units of a model.
+
+    Args:
+        model: the design; its tolerances and sensor noise set the healthy scatter.
+        com: command.
+        load: known load.
+        period: s.
+        count: healthy units.
+        faulty: units of each fault.
+        seed: of the units.
+        steps: of the solver in a cycle.
+        progress: called with each stage and the share done, 0 to 1.
+        name: of the command, for the file.
+        frictions: FSS, N, beside Table 2's, at which the effect of friction on steps is found.
+        low_sliding: FDS over FSS of units that slip easily.
+
+    Raises:
+        InputError: a command without steps and ramps, or a period that is not the model's.
     """
     parts = sections(com, period)
     if not any(s.kind in ("step", "ramp") for s in parts):
@@ -63,137 +116,232 @@ def build(model: Model, com: Floats, load: Floats, period: float, count: int = B
         raise InputError("trace", "t", f"one row per {1e3 * model['controller.period']:g} ms, the model's cycle, for "
                                        f"bands by simulation, not per {1e3 * period:g} ms")
     sound = float(model[FRICTION.parameter])
-    amounts = [sound, *(size for size in sorted({*BETWEEN, FRICTION.middle, FRICTION.most}) if size > 1.2 * sound)]
+    amounts = [sound, *(size for size in sorted({*frictions, FRICTION.middle, FRICTION.most}) if size > 1.2 * sound)]
 
-    def units(kind: Kind, number: int = faulty) -> Floats:
-        return runs(model, com, load, kind, number, seed, steps, progress)
+    def draw(kind: UnitKind, number: int = faulty) -> Floats:
+        return simulate_units(model, com, load, kind, number, seed, steps, progress)
 
-    frictions = [units(Kind("healthy"), count), *(units(Kind(f"{size:g} N", friction=size)) for size in amounts[1:])]
-    clogged = [units(Kind(f"Kintas {size:g}", clogging=size)) for size in (CLOGGING.middle, CLOGGING.most)]
-    stepped = tuple(_step(i, s, period, frictions, clogged) for i, s in enumerate(parts) if s.kind == "step")
-    easy = units(Kind("low dynamic friction", friction=FRICTION.middle, sliding=EASY))
-    rubbing = [*frictions, easy]
-    ramped = tuple(_ramp(i, s, com, period, rubbing, amounts) for i, s in enumerate(parts) if slow(s, period))
-    tables = {"healthy": frictions[0][:faulty], CLOGGING.name: clogged[0],
-              FRICTION.name: frictions[amounts.index(FRICTION.middle)]}
+    healthy = draw(UnitKind("healthy"), count)
+    rubbing = [healthy, *(draw(UnitKind(f"{size:g} N", friction=size)) for size in amounts[1:])]
+    clogged = [draw(UnitKind(f"Kintas {size:g}", clogging=size)) for size in (CLOGGING.middle, CLOGGING.most)]
+    easy = draw(UnitKind("low dynamic friction", friction=FRICTION.middle, sliding=low_sliding))
+    stepped = tuple(_make_step_band(i, s, period, rubbing, clogged) for i, s in enumerate(parts) if s.kind == "step")
+    ramped = tuple(_make_ramp_band(i, s, com, period, [*rubbing, easy], amounts)
+                   for i, s in enumerate(parts) if is_slow_ramp(s, period))
+    tables = {"healthy": healthy[:faulty], CLOGGING.name: clogged[0],
+              FRICTION.name: rubbing[amounts.index(FRICTION.middle)]}
     facts = {"made": "by simulation", "command": name, "model": model.name, "runs": str(count), "faulty": str(faulty),
-             "seed": str(seed), **_facts(parts, period)}
-    bands = Bands(tuple(parts), period, np.array(amounts), stepped, ramped, 1.0, 1.0, facts,
-                  _sensitivities(tables, frictions[0], com, period, parts))
+             "seed": str(seed), **_describe_origin(parts, period)}
     if np.abs(load).max() > 0.0:
-        bands = replace(bands, provenance=facts | {"load": f"up to {np.abs(load).max():.4g} N"})
-    shares = [_share(bands, com, x, most) for x, most in zip(clogged, (False, True), strict=True)]
-    return replace(bands, middle_share=shares[0], most_share=shares[1])
+        facts["load"] = f"up to {np.abs(load).max():.4g} N"
+    bands = Bands(tuple(parts), period, np.array(amounts), stepped, ramped, 1.0, 1.0, facts,
+                  _measure_sensitivities(tables, healthy, com, period, parts))
+    middle_share, most_share = (_find_limit_share(bands, com, x, is_most)
+                                for x, is_most in zip(clogged, (False, True), strict=True))
+    return replace(bands, middle_share=middle_share, most_share=most_share)
 
 
-def run(sources: Sequence[str | Path], out: str | Path, model: Model | None = None, com: Floats | None = None,
-        name: str = "", seed: int = SEED, progress: Progress = ignore_progress) -> dict[str, Any]:
-    """Bands from the traces `sources`, or without any by simulation over the command `com` (n,) m; written to `out`.
+def _make_step_band(number: int, s: Section, period: float, rubbing: Sequence[Floats], clogged: Sequence[Floats]
+                    ) -> StepBand:
+    """The band of a step from units with rising friction, the healthy ones first, and units with rising clogging.
 
-    Returns what was made, for --json.
-
-    Raises:
-        InputError: traces that cannot be learned from, or a place that cannot be written.
+    Shifts and spreads are taken at knots that are KNOT_CYCLES apart, with straight lines between them.
     """
-    from fdi.diagnosis.bands_file import save
-    from fdi.diagnosis.fleet_bands import learn
-
-    place = writable(out, "--out")
-    if sources:
-        traces = []
-        for done, source in enumerate(sources):
-            progress("reading", done / len(sources))
-            traces.append(Trace.read(source))
-        bands = learn(traces, model, [str(source) for source in sources], progress)
-    elif com is None:
-        raise InputError("--learn-bands", "", "traces, or a command to simulate")
-    else:
-        model = model or load_model()
-        bands = build(model, com, np.zeros_like(com), model["controller.period"], seed=seed, progress=progress,
-                      name=name)
-    save(bands, place)
-    clogging, friction = bands.judges
-    return {"bands": str(out), "judges": [fault.name for fault, seen in ((CLOGGING, clogging), (FRICTION, friction))
-                                          if seen], "provenance": dict(bands.provenance)}
-
-
-def _step(number: int, s: Section, period: float, frictions: Sequence[Floats], clogged: Sequence[Floats]) -> StepBand:
-    first, stop = round(FIRST / period), min(round(HORIZON / period) + 1, s.stop - s.start)
+    first, stop = round(STEP_JUDGED_FROM / period), min(round(STEP_JUDGED_UNTIL / period) + 1, s.stop - s.start)
     fine = np.arange(first, stop)
-    coarse = np.unique(np.r_[fine[::COARSE], fine[-1:]])
+    knots = np.unique(np.r_[fine[::KNOT_CYCLES], fine[-1:]])
 
-    def between(values: Floats) -> Floats:
-        line: Floats = np.interp(fine, coarse, values[coarse - first])
+    def interpolate(values: Floats) -> Floats:
+        line: Floats = np.interp(fine, knots, values[knots - first])
         return line
 
-    parts = [x[:, s.start + first:s.start + stop] for x in (*frictions, *clogged)]
+    parts = [x[:, s.start + first:s.start + stop] for x in (*rubbing, *clogged)]
     few = len(parts[-1])
     healthy, alike = parts[0].mean(axis=0), parts[0][:few].mean(axis=0)  # a fault's units are the first healthy ones
-    shifts = [between(x.mean(axis=0) - alike) for x in parts[1:]]
-    known = len(frictions)
-    spread = np.array([between(x.std(axis=0, ddof=1)) for x in parts[:known]])
+    shifts = [interpolate(x.mean(axis=0) - alike) for x in parts[1:]]
+    known = len(rubbing)
+    spread = np.array([interpolate(x.std(axis=0, ddof=1)) for x in parts[:known]])
     shift = np.array([np.zeros(len(fine)), *shifts[:known - 1]])
     return StepBand(number, fine.astype(float) * period, healthy, shift, spread, shifts[-2], shifts[-1])
 
 
-def _ramp(number: int, s: Section, com: Floats, period: float, frictions: Sequence[Floats], amounts: Sequence[float]
-          ) -> RampBand:
-    rows, way = judged_rows(s, period), np.sign(s.rate)
-    errors = [way * (com[rows] - x[:, rows]) for x in frictions]
-    speeds = [way * speed(x, period)[:, rows] - abs(s.rate) for x in frictions]
+def _make_ramp_band(number: int, s: Section, com: Floats, period: float, rubbing: Sequence[Floats],
+                    amounts: Sequence[float]) -> RampBand:
+    """The band of a ramp from units with rising friction; the last ones have Table 2's lesser FSS and a low FDS."""
+    rows, way = select_ramp_rows(s, period), np.sign(s.rate)
+    errors = [way * (com[rows] - x[:, rows]) for x in rubbing]
+    speeds = [way * compute_speed(x, period)[:, rows] - abs(s.rate) for x in rubbing]
     lesser, greater = (list(amounts).index(size) for size in (FRICTION.middle, FRICTION.most))
-    position, velocity = (_width(x[0], x[lesser], x[greater]) for x in (errors, speeds))
-    half = np.array([np.median(waver(e)) for e in errors])
-    slip, easier = (float(np.median(lasting_most(speeds[i]) / waver(errors[i]))) for i in (lesser, -1))
+    position, velocity = (_make_width(x[0], x[lesser], x[greater]) for x in (errors, speeds))
+    half = np.array([np.median(compute_half_range(e)) for e in errors])
+    slip, easier = (float(np.median(find_lasting_peak(speeds[i]) / compute_half_range(errors[i])))
+                    for i in (lesser, -1))
     lost = 1 - half[-1] / half[lesser]  # range ~ FSS (1 - ease slip), through both
     ease = lost / (easier - (1 - lost) * slip) if easier > slip and lost > 0.0 else 0.0
     return RampBand(number, position, velocity, np.maximum.accumulate(half[:-1]), slip, float(ease))
 
 
-def _width(healthy: Floats, middle: Floats, most: Floats) -> Width:
-    """Limits that all but RAMP_FAULT_MISSED_SHARE of the faulty units leave, from runs (units, rows).
+def _make_width(healthy: Floats, middle: Floats, most: Floats) -> Width:
+    """Limits that all but RAMP_FAULT_MISSED_SHARE of the faulty units leave, from runs (units, rows) each.
 
     A limit that is not clear of the healthy units is infinite.
     """
     centre = float(np.nanmean(healthy))
-    usual, lesser, greater = (lasting_most(np.abs(x - centre)) for x in (healthy, middle, most))
+    usual, lesser, greater = (find_lasting_peak(np.abs(x - centre)) for x in (healthy, middle, most))
     clear = float(usual.mean() + BAND_FAULT_CLEARANCE_SD * usual.std(ddof=1))
     limits = [float(np.quantile(x, RAMP_FAULT_MISSED_SHARE)) for x in (lesser, greater)]
     wide = [limit if limit > clear else np.inf for limit in limits]
     return Width(centre, float(np.quantile(usual, RAMP_HEALTHY_SHARE)), wide[0], max(wide))
 
 
-def _share(bands: Bands, com: Floats, units: Floats, most: bool) -> float:
-    """How much of the faulty shift nearly every faulty unit (m, n) shows, for three samples in a row.
+def _find_limit_share(bands: Bands, com: Floats, units: Floats, is_most: bool) -> float:
+    """The share of the faulty shift that nearly every faulty unit (m, n) shows, for three samples in a row.
 
-    By the mean and scatter of its logarithm: the lowest few of some hundred units are a rough guide to the lowest one.
+    From the mean and scatter of its logarithm: the lowest of some hundred units estimates the lowest of all poorly.
     """
     reached = []
     for x in units:
-        found, _, _ = excursions(com, x, bands.period, bands, list(bands.sections))
+        found, _, _ = find_excursions(com, x, bands.period, bands, list(bands.sections))
         own = [e for e in found if e.fault == CLOGGING.name and np.isfinite(e.departure).any()]
-        furthest = [float(lasting_most(e.departure / (e.most if most else e.middle))) for e in own]
+        furthest = [float(find_lasting_peak(e.departure / (e.most if is_most else e.middle))) for e in own]
         reached.append(max(furthest, default=1.0))
     logs = np.log(reached)
-    return float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[most] * logs.std(ddof=1)))
+    return float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[is_most] * logs.std(ddof=1)))
 
 
-def _sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, period: float, parts: Sequence[Section]
-                   ) -> dict[str, dict[str, float]]:
+def _measure_sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, period: float,
+                           parts: Sequence[Section]) -> dict[str, dict[str, float]]:
     """Mean and scatter of healthy units, and what a fault of Table 2's lesser size adds, by precursor."""
-    found = {word: features(com, x, period, parts) for word, x in tables.items()}
-    whole = features(com, healthy, period, parts)
-    return {name: {"healthy": _mean(whole[name]), "noise": float(np.nanstd(whole[name], ddof=1)),
-                   **{word: _mean(found[word][name]) - _mean(found["healthy"][name])
+    found = {word: compute_features(com, x, period, parts) for word, x in tables.items()}
+    whole = compute_features(com, healthy, period, parts)
+    return {name: {"healthy": _average_known(whole[name]), "noise": float(np.nanstd(whole[name], ddof=1)),
+                   **{word: _average_known(found[word][name]) - _average_known(found["healthy"][name])
                       for word in (CLOGGING.name, FRICTION.name)}} for name in whole}
 
 
-def _mean(values: Floats) -> float:
-    """Of what was shown; NaN where most units do not show it."""
+def _average_known(values: Floats) -> float:
+    """Mean over the units that show a precursor; NaN where most units do not show it."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if 2 * len(known) > len(values) else float("nan")
 
 
-def _facts(parts: Sequence[Section], period: float) -> dict[str, str]:
+def _describe_origin(parts: Sequence[Section], period: float) -> dict[str, str]:
     text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
     return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": software()}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From a fleet's own traces
+# ---------------------------------------------------------------------------------------------------------------------
+
+def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequence[str] = (),
+                progress: Progress = ignore_progress) -> Bands:
+    """Bands from healthy traces of one command.
+
+    The mean is the fleet's own. The scatter is the fleet's, too, joined with the simulated one as if that were of
+    FLEET_PRIOR_TRACES traces more, and widened for the small number of traces (Student's t). What the faults add is
+    simulated with `model`.
+
+    Args:
+        traces: at least FLEET_FEWEST_TRACES, without load.
+        model: default the nominal one.
+        names: of the traces, for refusals.
+        progress: called with each stage and the share done, 0 to 1.
+
+    Raises:
+        InputError: too few traces, another command or period in one, a load, or a position with holes.
+    """
+    names = names or [f"trace {i + 1}" for i in range(len(traces))]
+    if len(traces) < FLEET_FEWEST_TRACES:
+        raise InputError("--learn-bands", f"{len(traces)} traces",
+                         f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
+    com, _, _, period, _ = read_columns(traces[0])
+    base = choose_bands(com, np.zeros_like(com), period, model, progress)
+    rows = [_align_trace(base, trace, name) for trace, name in zip(traces, names, strict=True)]
+    fleet = _Fleet(np.array([x for _, x in rows]), np.mean([c for c, _ in rows], axis=0), base)
+    found = replace(base, steps=tuple(fleet.correct_step(s) for s in base.steps),
+                    ramps=tuple(fleet.correct_ramp(r) for r in base.ramps), precursors=fleet.correct_precursors(),
+                    provenance={**base.provenance, "made": f"from {len(traces)} healthy traces, faults simulated",
+                                "traces": ", ".join(names)})
+    doubtful = [name for (c, x), name in zip(rows, names, strict=True)
+                if any(level > Level.ACCEPTABLE for level in judge_position(c, x, period, base).levels.values())]
+    if doubtful:
+        words = "beyond MidBand of simulated healthy units: " + ", ".join(doubtful)
+        found = replace(found, provenance={**found.provenance, "doubtful": words})
+    return found
+
+
+def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
+    """Command and position of a trace on the rows of the base's command, gaps interpolated."""
+    com, xj, load, period, _ = read_columns(trace)
+    if is_loaded(load):
+        raise InputError(name, "load", "none: bands are learned from an unloaded ram")
+    missing = np.isnan(xj)
+    if missing.mean() > POSITION_MISSING_SHARE:
+        raise InputError(name, "xj", f"a whole position, not one with {100 * missing.mean():.0f} % missing")
+    if abs(period / base.period - 1) > 0.01:
+        raise InputError(name, "t", f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
+    parts = sections(com, period)
+    check_command(base, parts, period, name)
+    own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
+    n = base.sections[-1].stop
+    at = np.clip(np.arange(n) + own - usual, 0, len(xj) - 1)
+    rows = np.arange(len(xj))
+    return com[at], np.interp(rows, rows[~missing], xj[~missing])[at]
+
+
+class _Fleet:
+    """Positions of a fleet, (m, n) m, and the simulated bands that they correct."""
+
+    def __init__(self, x: Floats, com: Floats, base: Bands) -> None:
+        self.x, self.com, self.base, self.count = x, com, base, len(x)
+        from scipy.stats import norm, t
+
+        freedom = self.count - 1 + FLEET_PRIOR_TRACES
+        unsure = float(t.isf(norm.sf(BAND_NEAREST_LIMIT_SD), freedom)) / BAND_NEAREST_LIMIT_SD
+        self.wider = unsure * float(np.sqrt(1 + 1 / self.count))
+
+    def join_scatter(self, values: Floats, simulated: Floats) -> Floats:
+        """Standard deviation over the fleet, of (m, ..), shrunk to the simulated one and widened."""
+        freedom = self.count - 1
+        squares = FLEET_PRIOR_TRACES * simulated**2 + freedom * values.var(axis=0, ddof=1)
+        out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + freedom))
+        return out
+
+    def correct_step(self, s: StepBand) -> StepBand:
+        """The fleet's mean and scatter; friction and clogging add to them what they add to a simulated unit's."""
+        start = self.base.sections[s.section].start
+        rows = start + np.rint(s.t / self.base.period).astype(int)
+        own = self.join_scatter(self.x[:, rows], s.spread[0])
+        more = np.maximum(s.spread**2 - s.spread[0]**2, 0.0)
+        return s._replace(healthy=self.x[:, rows].mean(axis=0), spread=np.sqrt(own**2 + more))
+
+    def correct_ramp(self, r: RampBand) -> RampBand:
+        """The fleet's centres and healthy widths; a limit too near to them is dropped."""
+        s = self.base.sections[r.section]
+        rows, way = select_ramp_rows(s, self.base.period), np.sign(s.rate)
+        error = way * (self.com[rows] - self.x[:, rows])
+        fast = way * compute_speed(self.x, self.base.period)[:, rows] - abs(s.rate)
+        half = np.maximum.accumulate(np.r_[np.median(compute_half_range(error)), r.half_range[1:]])
+        return r._replace(position=self.correct_width(error, r.position), speed=self.correct_width(fast, r.speed),
+                          half_range=half)
+
+    def correct_width(self, values: Floats, simulated: Width) -> Width:
+        """Width of a signal (m, rows); `healthy` is three standard deviations above the fleet's mean."""
+        centre = float(np.nanmean(values))
+        usual = find_lasting_peak(np.abs(values - centre))
+        spread = self.join_scatter(usual, np.array((simulated.healthy - float(usual.mean())) / 3).clip(0.0))
+        clear = float(usual.mean() + BAND_FAULT_CLEARANCE_SD * spread)
+        middle = simulated.middle if simulated.middle > clear else np.inf
+        return Width(centre, float(usual.mean() + 3 * spread), middle, max(middle, simulated.most))
+
+    def correct_precursors(self) -> dict[str, dict[str, float]]:
+        """Mean and scatter of the fleet beside simulated sensitivities."""
+        found = compute_features(self.com, self.x, self.base.period, list(self.base.sections))
+        out = {}
+        for name, known in self.base.precursors.items():
+            values = found[name][~np.isnan(found[name])]
+            noise = self.join_scatter(values, np.array(known["noise"])) if len(values) > 1 else known["noise"]
+            out[name] = {**known, "healthy": float(values.mean()) if len(values) else known["healthy"],
+                         "noise": float(noise)}
+        return out

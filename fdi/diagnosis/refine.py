@@ -1,9 +1,12 @@
 """The sizes of the two faults from a replay of the measured current, with all that differs between healthy units.
 
 Free are the faults (Kintas, FSS and, as a nuisance, FDS), the base parameters with their tolerances as priors, and
-what else ages or is set up wrongly: jack friction, leakage, null bias, a load that nobody measured. What these do is
-then not blamed on the servovalve. A loss of pilot flow gain within its tolerance looks as a clogging filter does, so it
-is the tolerances that decide how wide the intervals are.
+suspects: what else ages or is set up wrongly, such as jack friction, leakage, a null bias, or a load that nobody
+measured. The effect of a suspect is then not blamed on the servovalve. A loss of pilot flow gain within its tolerance
+looks like a clogged filter, so the tolerances decide how wide the intervals are.
+
+All unknowns but the suspects that may be negative are logarithms: the plant's gains, forces and frictions scale, and
+what may be scaled together without changing a signal is a straight line in logarithms.
 """
 from __future__ import annotations
 
@@ -11,15 +14,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.fault_unknowns import MOST, SUSPECTS, free_parameters, start_of, values
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import Fit, misfit, typical
-from fdi.estimation.problem import Free, Problem, quiet
+from fdi.estimation.model_unknowns import free_of
+from fdi.estimation.problem import Free, Problem, quiet, unknowns
 from fdi.estimation.valley import descended, first_widths, flats
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
@@ -28,6 +32,7 @@ from fdi.thresholds import (
     RESIDUAL_HOPELESS,
     RESIDUAL_IS_NOISE,
     RESIDUAL_WORST,
+    UNIT_TOLERANCE,
 )
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
@@ -37,17 +42,134 @@ from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 
-FINE = 20  # steps a cycle of the last fit
-EASED = ((30.0, 4), (6.0, 4), (1.0, 8))  # times the noise, rounds
-AGAIN = ((3.0, 4), (1.0, 8))  # the same once more where that was not enough
-SETTLING = 4  # rounds of the last fit
-LONG = 8  # further ones, where these were not enough
-# where a fit begins again that has not come down to noise: parts of the way back to a unit without deviations, by turns
-BACK = ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25))
-FAULTY = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
-COARSE = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))  # starts beside the grid's
-CLOSER = ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03))  # steps of Kintas and factors of FSS around the best start
+SMALLEST_FSS, LARGEST_FSS = 0.05, 1000.0  # N, bounds of a fit
+LARGEST_KINTAS = 0.95  # bound of a fit
+FAULT_PARAMETERS = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
+# (Kintas, FSS in N) from which fits begin, beside the grid's answers
+COARSE_STARTS = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))
+# (factor on the noise, rounds): small stops of the ram count only once the fit is near
+NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
+FINE_STEPS = 20  # solver steps a cycle of the last fit
 
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a fit may change
+# ---------------------------------------------------------------------------------------------------------------------
+
+class Suspect(NamedTuple):
+    """Something else that ages or is set up wrongly: its parameter, and how far off it may be."""
+
+    effect: str
+    parameter: str
+    spread: float  # prior standard deviation, as wide as what is typical: SI, or of the logarithm
+    is_ratio: bool = False  # True: of the logarithm
+
+
+SUSPECTS = (
+    Suspect("jack_friction", "jack.dynamic_friction", 0.5, True),
+    Suspect("viscous_drag", "jack.damping", 0.7, True),
+    Suspect("moving_mass", "jack.mass", 0.5, True),
+    Suspect("internal_leakage", "jack.leakage", 2.0, True),
+    Suspect("null_bias", "null_bias.current", 1.6e-4),
+    Suspect("constant_load", "constant_load.force", 3e3),
+)
+
+
+class LogFree(Free):
+    """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units."""
+        return math.exp(super().value(x))
+
+
+class LogFrictionRatio(LogFree):
+    """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it."""
+
+    __slots__ = ()
+
+
+class LogOpenFilter(Free):
+    """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """Kintas."""
+        return 1.0 - math.exp(super().value(x))
+
+
+def compute_values(free: Sequence[Free], x: Floats) -> Floats:
+    """Parameters in SI units, (p,), of scaled unknowns (p,)."""
+    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
+    names = [f.name for f in free]
+    for k, f in enumerate(free):
+        if isinstance(f, LogFrictionRatio):
+            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
+    i, j = names.index("spool.static_friction"), names.index("spool.dynamic_friction")
+    found[j] = min(found[i], found[j])
+    return found
+
+
+def get_positive(model: Model, name: str) -> float:
+    """A parameter of the model, bounded below by 0.1 % of its nominal value, as a logarithm needs it."""
+    return max(model[name], 1e-3 * model.kind.nominal[name])
+
+
+def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]:
+    """What a fit may change: the faults first, then the suspects, then the tolerances.
+
+    `fault_spread` is the prior standard deviation of the faults in tolerances: they may be of any size, and where no
+    signal shows them, this is what is known.
+    """
+    clogging = LogOpenFilter(CLOGGING.parameter, 0.0, UNIT_TOLERANCE, fault_spread, math.log(1.0 - LARGEST_KINTAS), 0.0,
+                             1.0)
+    friction = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, fault_spread,
+                        math.log(SMALLEST_FSS), math.log(LARGEST_FSS), 1.0)
+                for name in ("spool.static_friction", "spool.dynamic_friction")]
+    suspects = [_make_suspect(s, model) for s in SUSPECTS]
+    usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
+    ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
+    taken = {f.name for f in (clogging, *friction, *suspects, ratio)}
+    tolerances = (_take_logarithm(f) for f in free_of(model) if f.name not in taken)
+    return (clogging, *friction, *suspects, ratio, *tolerances)
+
+
+def _make_suspect(s: Suspect, model: Model) -> Free:
+    own = next(u for u in unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
+    if s.is_ratio:
+        usual = get_positive(model, s.parameter)
+        return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),
+                       0.02)
+    usual = model.values.get(s.parameter, own.centre)
+    return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
+
+
+def _take_logarithm(f: Free) -> Free:
+    """A tolerance as one of the logarithm; unchanged if the parameter may be zero."""
+    if f.low <= 0.0:
+        return f
+    return LogFree(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
+
+
+def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None,
+               sliding: float = math.inf) -> Floats:
+    """Scaled unknowns, (p,), of a plant that has the two faults and `offsets`, and is nominal otherwise.
+
+    FDS goes with FSS, but not beyond `sliding` N.
+    """
+    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), LARGEST_KINTAS)),
+            FRICTION.parameter: math.log(max(fss, SMALLEST_FSS)),
+            "spool.dynamic_friction": math.log(min(max(fss, SMALLEST_FSS) / STATIC_OVER_DYNAMIC, sliding)),
+            **(offsets or {})}
+    return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The fit
+# ---------------------------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True, eq=False)
 class Refined:
@@ -59,46 +181,47 @@ class Refined:
     others: Mapping[str, Estimate]  # the suspects by parameter, SI
     fit: Fit
     errors: Mapping[str, float]  # RMS residual by signal, SI
-    floor: Mapping[str, float]  # what the sensors' noise leaves of it
+    floor: Mapping[str, float]  # RMS noise by signal, SI
     simulations: int
     method: str = "least squares"
 
     @property
     def ratio(self) -> dict[str, float]:
-        """Error over floor by signal; 1 where nothing but noise is left."""
+        """Error over noise by signal; 1 where nothing but noise is left."""
         return {name: self.errors[name] / self.floor[name] for name in self.errors}
 
     @property
     def reached(self) -> bool:
-        """True when nothing but noise is left, but for a few stops of the ram that were made or missed by a hair."""
+        """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
         usual = typical(self.fit.residuals)
         near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
         return near and max(self.ratio.values()) <= RESIDUAL_WORST
 
 
 @dataclass
-class Counted(Problem):
+class CountedProblem(Problem):
     """A problem that counts the runs it makes, and knows static friction by its ratio."""
 
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
 
     def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
-        return self.left(self.predict([f.name for f in free], np.array([values(free, row) for row in x])))
+        return self.left(self.predict([f.name for f in free], np.array([compute_values(free, row) for row in x])))
 
     def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
         return super().all_signals(names, values, trace)
 
 
-def problem_of(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2) -> Counted:
-    """The model with the suspects ready in it, and the run to hold it against; `floor` RMS noise by signal, SI."""
+def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2
+                 ) -> CountedProblem:
+    """The model with the suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI."""
     level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
     ready = quiet(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
-    return Counted(ready, trace, tuple(noises.white(level[name]) for name in trace.outputs), workers=workers)
+    return CountedProblem(ready, trace, tuple(noises.white(level[name]) for name in trace.outputs), workers=workers)
 
 
-def refine(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE,
-           floor: Mapping[str, float] | None = None, workers: int = 2) -> Refined:
+def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
+                 floor: Mapping[str, float] | None = None, workers: int = 2) -> Refined:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
@@ -108,130 +231,136 @@ def refine(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = C
         floor: RMS noise by signal, SI; default the model's sensors.
         workers: threads.
     """
-    problem = problem_of(model, trace, floor, workers)
-    free = free_parameters(model)
-    first = _first(problem, free, starts)
-    problem = _with_noise(problem, first)
-    return _refined(_last(problem, first), problem)
+    problem = make_problem(model, trace, floor, workers)
+    free = list_unknowns(model)
+    first = _fit_coarsely(problem, free, starts)
+    problem = _learn_noise(problem, first)
+    return _report_fit(_fit_finely(problem, first), problem)
 
 
-def _first(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
-    """A fit from the best start and, before a fault is blamed, from a healthy unit: whichever leaves less."""
+def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
+    """A fit from the best start and, if that blames a fault, one from a healthy unit: whichever leaves less."""
     alone = replace(problem, workers=1, _lanes={})
-    found = [_best_start(problem, free, starts)]
-    healthy = start_of(free, CLOGGING.healthy, FRICTION.healthy, offsets_of(problem))
-    if _blamed(free, found[0]):
-        found.append(healthy)
-    fits = mapped(lambda x: _eased(alone, free, x), found, problem.workers)
-    if len(fits) == 1 and (not _reached(problem, fits[0]) or _blamed(free, fits[0].x)):
-        fits.append(_eased(problem, free, healthy))
-    first = min(fits, key=lambda f: f.cost)
-    for factor, rounds in AGAIN if not _reached(problem, first) else ():
-        first = _further(problem, first, factor, rounds)
-    return first
+    begin = [_choose_start(problem, free, starts)]
+    healthy = make_start(free, CLOGGING.healthy, FRICTION.healthy, estimate_offsets(problem))
+    if _blames_a_fault(free, begin[0]):
+        begin.append(healthy)
+    fits = mapped(lambda x: _fit_in_stages(alone, free, x), begin, problem.workers)
+    if len(fits) == 1 and (not _is_explained(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
+        fits.append(_fit_in_stages(problem, free, healthy))
+    best = min(fits, key=lambda f: f.cost)
+    if not _is_explained(problem, best):
+        for factor, rounds in ((3.0, 4), (1.0, 8)):
+            best = _continue_fit(problem, best, factor, rounds)
+    return best
 
 
-def _last(problem: Counted, first: Fit) -> Fit:
-    """The fit with finer steps, as long as it takes to leave nothing but noise, or as there is hope."""
-    fine = replace(problem, steps=FINE, _lanes={})
+def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
+    """The fit with finer steps, until only noise is left or no start on the way to a healthy unit would help."""
+    fine = replace(problem, steps=FINE_STEPS, _lanes={})
     last = first
-    for rounds in (SETTLING, LONG):
+    for rounds in (4, 8):
         last = descended(fine, last, rounds, flats(problem, first.free, last.x))
-        if _reached(problem, last):
+        if _is_explained(problem, last):
             return last
     signals = problem.trace.outputs
-    for parts in BACK:
-        ratios = dict(zip(signals, _over(problem, last), strict=True))
-        if _reached(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
+    for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
+        ratios = dict(zip(signals, _residual_ratios(problem, last), strict=True))
+        if _is_explained(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
             break
-        last = _restarted(problem, last, parts)
+        last = _restart_fit(problem, last, parts)
     return last
 
 
-def _restarted(problem: Counted, found: Fit, parts: Sequence[float]) -> Fit:
-    """The best of a fit and some that begin on the way from it to a unit with these faults and no other deviation.
+def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], rounds: int = 8) -> Fit:
+    """The best of a fit and some that begin elsewhere on the line to a unit with these faults and no other deviation.
 
-    Stops of the ram make ridges: tolerances that lie behind one of them are found from the other side, or never.
+    `parts` of that line lie between the fit, 0, and the other unit, 1. Stops of the ram make ridges: tolerances that
+    lie behind one of them are found from the other side, or never.
     """
     free = found.free
-    home = start_of(free, 0.0, FRICTION.healthy, offsets_of(problem))
-    faults = [f.name in FAULTY for f in free]
+    home = make_start(free, 0.0, FRICTION.healthy, estimate_offsets(problem))
+    faults = [f.name in FAULT_PARAMETERS for f in free]
     home[faults] = found.x[faults]
     alone = replace(problem, workers=1, _lanes={})
 
-    def fitted(part: float) -> Fit:
-        begun = _eased(alone, free, found.x + part * (home - found.x))
-        return descended(replace(alone, steps=FINE, _lanes={}), begun, LONG, flats(alone, free, begun.x))
+    def fit_from(part: float) -> Fit:
+        begun = _fit_in_stages(alone, free, found.x + part * (home - found.x))
+        return descended(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flats(alone, free, begun.x))
 
-    return min(found, *mapped(fitted, parts, problem.workers), key=lambda f: f.cost)
+    return min(found, *mapped(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
 
-def _eased(problem: Counted, free: Sequence[Free], x: Floats) -> Fit:
-    """A fit from `x` (p,) that takes the noise for larger at first: small stops count late."""
-    found = begun(free, x)
-    for factor, rounds in EASED:
-        found = _further(problem, found, factor, rounds)
+def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Fit:
+    """A fit from `x` (p,) that takes the noise for larger at first: small stops of the ram count late."""
+    found = start_fit(free, x)
+    for factor, rounds in NOISE_SCHEDULE:
+        found = _continue_fit(problem, found, factor, rounds)
     return found
 
 
-def _further(problem: Counted, found: Fit, factor: float, rounds: int) -> Fit:
+def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
     start = replace(found, covariance=first_widths(found.free))
-    return descended(_louder(problem, factor), start, rounds, flats(problem, found.free, found.x))
+    return descended(_scale_noise(problem, factor), start, rounds, flats(problem, found.free, found.x))
 
 
-def _blamed(free: Sequence[Free], x: Floats) -> bool:
+def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
     """Whether scaled unknowns, (p,), hold one of the faults for far gone."""
     known = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
     kintas, fss = known[CLOGGING.parameter], known[FRICTION.parameter]
     return kintas > FAULT_BLAMED_SHARE * CLOGGING.middle or fss > FAULT_BLAMED_SHARE * FRICTION.middle
 
 
-def _reached(problem: Problem, found: Fit) -> bool:
-    return max(_over(problem, found)) <= RESIDUAL_IS_NOISE
+def _is_explained(problem: Problem, found: Fit) -> bool:
+    """Whether the fit leaves only noise."""
+    return max(_residual_ratios(problem, found)) <= RESIDUAL_IS_NOISE
 
 
-def _over(problem: Problem, found: Fit) -> list[float]:
-    """RMS residual over the noise, signal by signal."""
+def _residual_ratios(problem: Problem, found: Fit) -> list[float]:
+    """RMS residual over noise, signal by signal."""
     return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
 
 
-def _louder(problem: Counted, factor: float) -> Counted:
+def _scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
+    """The problem with its noise taken for `factor` times as large."""
     return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise))
 
 
-def begun(free: Sequence[Free], x: Floats) -> Fit:
-    """A fit that has not looked at anything yet."""
+def start_fit(free: Sequence[Free], x: Floats) -> Fit:
+    """A fit at `x` (p,) before its first round."""
     none = np.empty((0, 0))
     return Fit(tuple(free), x, np.inf, np.inf, first_widths(free), none, none, none)
 
 
-def _best_start(problem: Counted, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
-    """The start, (p,) scaled, that leaves least, looked at ever closer."""
-    loud, offsets = _louder(replace(problem, workers=1, _lanes={}), EASED[0][0]), offsets_of(problem)
+def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
+    """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
+    loud = _scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
+    offsets = estimate_offsets(problem)
     usual = problem.model["spool.dynamic_friction"]
 
-    def least(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
-        x = np.array([start_of(free, *s, offsets, sliding) for s in tried])
+    def try_starts(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
+        x = np.array([make_start(free, *s, offsets, sliding) for s in tried])
         costs = misfit(loud.whitened(loud.residuals(free, x)))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
-    def closest(sliding: float) -> tuple[float, Floats]:
-        best = least(starts, sliding)
-        for k, f in CLOSER:
-            best = least([(min(max(best[1][0] + i * k, 0.0), MOST), best[1][1] * f**j)
-                          for i, j in product(range(-2, 3), repeat=2)], sliding)
-        return best[0], best[2]
+    def search(sliding: float) -> tuple[float, Floats]:
+        cost, best, x = try_starts(starts, sliding)
+        for step, factor in ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03)):  # of Kintas, of FSS
+            around = [(min(max(best[0] + i * step, 0.0), LARGEST_KINTAS), best[1] * factor**j)
+                      for i, j in product(range(-2, 3), repeat=2)]
+            cost, best, x = try_starts(around, sliding)
+        return cost, x
 
     # dynamic friction goes with the static one, or has stayed what it was
-    return min(mapped(closest, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
+    return min(mapped(search, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
 
 
-def offsets_of(problem: Problem) -> dict[str, float]:
-    """What the means of current and pressure say of null bias, A, and load, N, as starts.
+def estimate_offsets(problem: Problem) -> dict[str, float]:
+    """Null bias, A, and load, N, from the means of current and pressure, as starts of a fit.
 
-    The mean opening is what the ram's way takes; what current is left makes up for a bias. The mean pressure carries
-    the load.
+    The mean opening is the one that moves the ram as far as it moved; the rest of the mean current makes up for a bias.
+    The mean pressure carries the load.
     """
     trace, p = problem.trace, problem.model.values
     x = trace.xj[~np.isnan(trace.xj)]
@@ -244,16 +373,16 @@ def offsets_of(problem: Problem) -> dict[str, float]:
     return found
 
 
-def _with_noise(problem: Counted, found: Fit) -> Counted:
-    """The problem with the noise of what a fit leaves, signal by signal, where that is noise."""
+def _learn_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
+    """The problem with the noise that a fit leaves, signal by signal, where only noise is left."""
     learnt = []
     for old, r in zip(problem.noise, found.residuals, strict=True):
-        calm = float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level
-        learnt.append(noises.fitted(r) if calm else old)
+        is_noise = float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level
+        learnt.append(noises.fitted(r) if is_noise else old)
     return replace(problem, noise=tuple(learnt), _lanes={})
 
 
-def _refined(last: Fit, problem: Counted) -> Refined:
+def _report_fit(last: Fit, problem: CountedProblem) -> Refined:
     outputs = problem.trace.outputs
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
@@ -261,14 +390,15 @@ def _refined(last: Fit, problem: Counted) -> Refined:
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
-    return Refined(estimate(last, CLOGGING.parameter), estimate(last, FRICTION.parameter, FSS_INTERVAL_FACTOR),
-                   correlation, {s.parameter: estimate(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+    return Refined(estimate_parameter(last, CLOGGING.parameter),
+                   estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
+                   {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
                    sum(problem.counts))
 
 
-def estimate(found: Fit, name: str, wider: float = 1.0) -> Estimate:
-    """A parameter with its 95 % interval, within what is possible; `wider` times what the fit's covariance says."""
+def estimate_parameter(found: Fit, name: str, factor: float = 1.0) -> Estimate:
+    """A parameter with its 95 % interval, `factor` times as wide as the fit's covariance says, within its bounds."""
     i = [f.name for f in found.free].index(name)
-    half = wider * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i]))
+    half = factor * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i]))
     low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
     return Estimate(found.free[i].value(float(found.x[i])), low, high)

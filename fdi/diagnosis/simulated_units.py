@@ -1,8 +1,7 @@
-"""Units of one design under test, simulated: tolerances, coloured sensor noise, mains hum, any phase of stick-slip.
+"""Simulated units of one design under test: tolerances, coloured sensor noise, mains hum, any phase of stick-slip.
 
-Noise enters the loop as it does on a bench: the controller sees Com - (XJ + noise), which is what it answers to
-Com - noise without any. So runs that share their noise share a command, and go through lanes together; their
-tolerances set them apart.
+Noise enters the loop as on a bench: the controller sees Com - (XJ + noise) and answers as it would to Com - noise
+without any. So runs that share their noise share a command, and go through lanes together; their tolerances differ.
 """
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION
+from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.tolerances import tolerances
 from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
@@ -24,75 +23,82 @@ from plant.threads import threads
 Floats = NDArray[np.float64]
 
 DYNAMIC = "spool.dynamic_friction"
-SLIDING = 1 / 1.5  # FDS over FSS (nominal.toml)
-COLOUR = 0.85  # largest correlation of the position sensor's noise from one cycle to the next
-HUM, HUM_HZ = 0.55, 50.0  # largest amplitude of mains hum, in standard deviations of the noise; Hz
-MOVED, RESTED, STROKE = 0.5, 0.3, 1e-3  # s, s, m: before a test
-STEPS = 20  # a cycle; the docs say what that leaves out
 
 
-class Kind(NamedTuple):
+class UnitKind(NamedTuple):
     """Which units to draw; NaN leaves a size as the model has it."""
 
     name: str
     clogging: float = float("nan")  # Kintas
     friction: float = float("nan")  # FSS, N
-    sliding: float = SLIDING  # FDS over FSS
+    sliding: float = 1 / STATIC_OVER_DYNAMIC  # FDS over FSS
 
 
-def runs(model: Model, com: Floats, load: Floats, kind: Kind, count: int, seed: int, steps: int = STEPS,
-         progress: Progress = ignore_progress) -> Floats:
-    """Sensed position, (count, n) m, of so many units over a command (n,) m with a known load (n,) N.
+def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, count: int, seed: int, steps: int = 20,
+                   progress: Progress = ignore_progress) -> Floats:
+    """Sensed position, (count, n) m, of units over a command (n,) m with a known load (n,) N.
 
-    The same seed gives the same units, whatever their faults.
+    The same seed gives the same units, whatever their faults. The solver takes `steps` a cycle; docs/accuracy.md says
+    what that leaves out. Every other block of units moved before its test and came to rest wherever friction left it;
+    the others start at rest at null, as a model does.
     """
     tolerance = tolerances(model)
     names = list(dict.fromkeys([*tolerance, CLOGGING.parameter, FRICTION.parameter, DYNAMIC]))
     lanes = Lanes(model, names, steps, workers=1)
     out = np.empty((count, len(com)))
 
-    def block(first: int) -> None:
+    def simulate_block(first: int) -> None:
         members = slice(first, min(first + NARROW, count))
         rng = np.random.default_rng([seed, first])
-        before = lead(com, model["controller.period"]) if com[0] != 0.0 or first // NARROW % 2 else com[:0]
-        noise = sensor_noise(rng, model, len(before) + len(com))
-        units = _units(rng, model, tolerance, names, kind)[:members.stop - first]
+        before = make_lead_in(com, model["controller.period"]) if com[0] != 0.0 or first // NARROW % 2 else com[:0]
+        noise = draw_sensor_noise(rng, model, len(before) + len(com))
+        units = _draw_parameters(rng, model, tolerance, names, kind)[:members.stop - first]
         asked, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
         out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
 
     starts = range(0, count, NARROW)
     with ThreadPoolExecutor(threads()) as pool:
-        for done, _ in enumerate(pool.map(block, starts)):
+        for done, _ in enumerate(pool.map(simulate_block, starts)):
             progress(f"simulating units, {kind.name}", (done + 1) / len(starts))
     return out
 
 
-def lead(com: Floats, period: float) -> Floats:
-    """What a unit did before its test: it moved, and came to rest at the test's first demand wherever friction left it.
+def make_lead_in(com: Floats, period: float, moving: float = 0.5, resting: float = 0.3, stroke: float = 1e-3) -> Floats:
+    """Command, m, of what a unit did before its test: a growing sine of `stroke` m for `moving` s, then rest.
 
-    Every other block of units has this behind it; the others rest at null, where a model starts.
+    It rests for `resting` s at the first demand of the test's command `com` (n,) m.
     """
-    moving, resting = round(MOVED / period), round(RESTED / period)
-    t = np.arange(moving) / moving
-    asked: Floats = np.r_[com[0] + STROKE * np.sin(2 * np.pi * t) * t, np.full(resting, com[0])]
+    rows = round(moving / period)
+    t = np.arange(rows) / rows
+    asked: Floats = np.r_[com[0] + stroke * np.sin(2 * np.pi * t) * t, np.full(round(resting / period), com[0])]
     return asked
 
 
-def sensor_noise(rng: np.random.Generator, model: Model, cycles: int) -> Floats:
-    """Noise of the position sensor, (cycles,) m: first order of any colour up to COLOUR, and hum."""
+def draw_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, most_colour: float = 0.85,
+                      most_hum: float = 0.55, hum_frequency: float = 50.0) -> Floats:
+    """Noise of the position sensor, (cycles,) m: first order of a random colour, and mains hum of a random size.
+
+    Args:
+        rng: random numbers.
+        model: its sensors.position_noise is the standard deviation without hum.
+        cycles: of the controller.
+        most_colour: largest correlation of the noise from one cycle to the next.
+        most_hum: largest amplitude of the hum, in standard deviations of the noise.
+        hum_frequency: Hz.
+    """
     from scipy.signal import lfilter
 
-    level, colour = model["sensors.position_noise"], rng.uniform(0.0, COLOUR)
+    level, colour = model["sensors.position_noise"], rng.uniform(0.0, most_colour)
     white = rng.standard_normal(cycles)
     white[1:] *= np.sqrt(1.0 - colour**2)
-    hum = rng.uniform(0.0, HUM) * np.sin(2 * np.pi * (HUM_HZ * model["controller.period"] * np.arange(cycles) +
-                                                       rng.uniform()))
+    hum = rng.uniform(0.0, most_hum) * np.sin(2 * np.pi * (hum_frequency * model["controller.period"] *
+                                                           np.arange(cycles) + rng.uniform()))
     coloured: Floats = level * (lfilter([1.0], [1.0, -colour], white) + hum)
     return coloured
 
 
-def _units(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str], kind: Kind
-           ) -> Floats:
+def _draw_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],
+                     kind: UnitKind) -> Floats:
     """Parameters of a block of units, (NARROW, len(names))."""
     table = np.tile([model[name] for name in names], (NARROW, 1))
     for name, size in tolerance.items():

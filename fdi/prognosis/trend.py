@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis import levels
-from fdi.diagnosis.faults import Estimate, Fault, Level
+from fdi.diagnosis.faults import Estimate, Fault, Level, classify_size, judge_size
 from fdi.prognosis import remaining_life
 from fdi.prognosis.breaks import Break, Cleaned, clean
 from fdi.prognosis.course import fitted
@@ -71,8 +70,8 @@ class Trend:
     @property
     def level(self) -> Level:
         """Of the size now, by the rule of `rig fdi`; where the interval cannot tell, by the value."""
-        found = levels.level(self.fault, self.now)
-        return levels.of_value(self.fault, self.now.value) if found is None else found
+        found = judge_size(self.fault, self.now)
+        return classify_size(self.fault, self.now.value) if found is None else found
 
 
 def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:

@@ -9,9 +9,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fdi.diagnosis.bands import Judged, columns
-from fdi.diagnosis.envelope import Bands, RampBand, StepBand, Width, judged_rows, lasting_most, speed, waver
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Event, Fault
+from fdi.diagnosis.bands import (
+    Bands,
+    Event,
+    Judged,
+    RampBand,
+    StepBand,
+    Width,
+    compute_half_range,
+    compute_speed,
+    find_lasting_peak,
+    read_columns,
+    select_ramp_rows,
+)
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
@@ -96,10 +107,10 @@ def ramps(trace: Trace, bands: Bands, judged: Judged) -> str:
 
 
 def _ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: Judged) -> None:
-    rows, way, xj = judged_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
+    rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
     error = way * (trace.com[rows] - xj[rows])
-    fast = way * speed(xj, trace.period)[rows] - abs(s.rate)
-    scale = ramp.scale(float(waver(error)), float(lasting_most(fast)))
+    fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
+    scale = ramp.scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
         _widths(ax, width, unit, nearer)
@@ -122,7 +133,7 @@ def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
 
 def _places(trace: Trace, bands: Bands) -> dict[int, Section]:
     """The trace's sections by their number in the bands."""
-    com = columns(trace)[0]
+    com = read_columns(trace)[0]
     own = [s for s in sections(com, trace.period) if s.kind in ("step", "ramp")]
     return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
 

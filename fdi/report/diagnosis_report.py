@@ -5,10 +5,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from fdi.diagnosis.bands import Event
 from fdi.diagnosis.diagnosis import Diagnosis
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Event, Fault, Level
-from fdi.diagnosis.levels import severity
-from fdi.diagnosis.precursors import shown
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
+from fdi.diagnosis.precursors import format_precursor
 from fdi.report.numbers import NO_NUMBER, SIGNAL_NAMES, format_digits, format_interval, format_ratio, join_words
 from fdi.report.report import (
     Cell,
@@ -291,9 +291,10 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
     rows: list[list[Cell | str]] = []
     for name, p in d.precursors.items():
         is_far = math.isfinite(p.departure) and abs(p.departure) > 4.0
-        rows.append([p.words, Cell(p.shown, is_strong=True), shown(p.healthy, name), shown(p.noise, name),
-                     Cell(_format_deviation(p.departure), "bad" if is_far else ""), shown(p.clogging, name),
-                     _format_deviation(p.clogging_ratio), shown(p.friction, name),
+        rows.append([p.words, Cell(p.shown, is_strong=True), format_precursor(p.healthy, name),
+                     format_precursor(p.noise, name),
+                     Cell(_format_deviation(p.departure), "bad" if is_far else ""), format_precursor(p.clogging, name),
+                     _format_deviation(p.clogging_ratio), format_precursor(p.friction, name),
                      _format_deviation(p.friction_ratio)])
 
     def draw() -> str:
@@ -333,7 +334,7 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "verdict": d.verdict, "sentence": describe_verdict(d),
         "level": {name: level.word if level is not None else None for name, level in d.levels.items()},
         "ruling": d.ruling,
-        "severity": {f.name: severity(f, d.sizes[f.name].value) for f in FAULTS},
+        "severity": {f.name: compute_severity(f, d.sizes[f.name].value) for f in FAULTS},
         "events": [e._asdict() for e in d.events],
         "bands": {"level": {name: level.word for name, level in d.judged.levels.items()}, "ruling": d.judged.ruling}
         if d.judged else None,

@@ -14,9 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fdi.diagnosis.bands import Excursion
-from fdi.diagnosis.envelope import Bands, StepBand
-from fdi.diagnosis.rms_grid import LEFT, RIGHT, Grid, Map
+from fdi.diagnosis.bands import Bands, Excursion, StepBand
+from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.trace.sections import Section
 from fdi.trace.trace import Trace
@@ -79,7 +78,7 @@ def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Tr
     A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
 
     Args:
-        excursions: of the trace, from `fdi.diagnosis.bands.excursions`; positive is towards the fault.
+        excursions: of the trace, from `fdi.diagnosis.bands.find_excursions`; positive is towards the fault.
         friction: N, that a step is allowed, from there too.
         bands: what they are excursions from.
         trace: their trace.
@@ -154,7 +153,7 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
     """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
 
     Args:
-        grid: from `fdi.diagnosis.rms_grid.search`.
+        grid: from `fdi.diagnosis.rms_grid.search_grid`.
         truth: the faults' sizes (Kintas, FSS in N), where they are known.
     """
     drawn = [(name, m, letter) for name, m, letter in (
@@ -172,7 +171,7 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
                 ax.plot(*truth, "x", color="white", ms=9, mew=1.6, label="injected")
         if grid.step and grid.ramp:
             for ax in axes[:2]:
-                ax.plot(*zip(LEFT, RIGHT, strict=True), color="white", lw=0.8, ls="--")
+                ax.plot(*zip(LOWER_CORNER, UPPER_CORNER, strict=True), color="white", lw=0.8, ls="--")
                 ax.plot(grid.merged.kintas, grid.merged.fss, "D", color="#ffd33d", ms=5, mec=INK, label="G")
         axes[0].set_ylabel("FSS [N]")
         for ax in axes:

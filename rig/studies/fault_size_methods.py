@@ -34,10 +34,9 @@ def optimisers(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
 
     trace, model = d.trace, d.model
     start = (d.grid.merged.kintas, d.grid.merged.fss) if d.grid else (0.1, 15.0)
-    for number, method in enumerate(ways.METHODS):
-        name = method.__name__.replace("_", " ")
+    for number, (name, method) in enumerate(ways.METHODS.items()):
         progress(name, number / len(ways.METHODS))
-        if not ways.available(method):
+        if not ways.is_available(name):
             continue
         found, seconds = timed(partial(method, model, trace, start, d.floor, seed))
         yield Row(found.method, found.kintas, found.fss, found.left, None, None, None, None, found.simulations, seconds)
@@ -51,14 +50,14 @@ def comparators(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
     """
     from fdi.diagnosis import comparators as learners
 
-    if not learners.available():
+    if not learners.is_available():
         raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
-    data, before = timed(lambda: learners.lesson(d.trace, d.model, seed, progress))
-    for learner in learners.LEARNERS:
-        progress(learner.__name__.replace("_", " "), 1.0)
+    data, before = timed(lambda: learners.simulate_lesson(d.trace, d.model, seed, progress))
+    for name, learner in learners.LEARNERS.items():
+        progress(name, 1.0)
         found, seconds = timed(partial(learner, data, seed))
         yield Row(found.method, _known(found.kintas), _known(found.fss), None, _known(found.error_kintas),
-                  _known(found.error_fss), found.right, {name: level.word for name, level in found.levels.items()},
+                  _known(found.error_fss), found.right, {fault: level.word for fault, level in found.levels.items()},
                   found.simulations, before + seconds)
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from rig.cli import options
 
 if TYPE_CHECKING:
+    from fdi.diagnosis.bands import Bands
     from fdi.diagnosis.diagnosis import Diagnosis
-    from fdi.diagnosis.envelope import Bands
     from fdi.progress import Progress
     from fdi.report.report import Report
     from rig.studies.fault_size_methods import Row
@@ -98,7 +98,7 @@ def write_answer(report: Report, out: Path) -> None:
 
 def learn_bands(args: argparse.Namespace) -> int:
     """Make bands for a command and write them; exit status 0."""
-    from fdi.diagnosis.learn_bands import run as learn
+    from fdi.diagnosis.learn_bands import make_bands_file
     from fdi.report.diagnosis_report import build_bands_report
     from plant import InputError
     from rig.cli.answer import show_answer
@@ -112,7 +112,7 @@ def learn_bands(args: argparse.Namespace) -> int:
     model = options.model_of(args)
     com, _, name = command_of(args.command_file, model["controller.period"])
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        made = learn(args.learn_bands, args.out, model, com, name, args.seed, progress)
+        made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress)
     show_answer(build_bands_report(made), args)
     return 0
 
@@ -121,9 +121,9 @@ def load_bands(args: argparse.Namespace) -> Bands | None:
     """The bands of --bands; None for the software's own."""
     if args.bands is None:
         return None
-    from fdi.diagnosis.bands_file import load
+    from fdi.diagnosis import bands_file
 
-    return load(Path(args.bands))
+    return bands_file.load_bands(Path(args.bands))
 
 
 def choose_output(args: argparse.Namespace) -> Path | None:

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level
-from fdi.diagnosis.levels import of_value
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
 from fdi.estimation.binomial import Share, measure_share
 from rig.studies.campaign.case import FAILED, OK, REFUSED
 from rig.studies.campaign.judge import CANNOT_TELL
@@ -216,7 +215,7 @@ def count_levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]
     for row in rows:
         if not has_other_fault(row):
             answer = row[f"level_{fault.name}"] if row["status"] == OK else row["status"]
-            table[of_value(fault, true_size(row, fault)).word][answer] += 1
+            table[classify_size(fault, true_size(row, fault)).word][answer] += 1
     return table
 
 
@@ -248,7 +247,7 @@ def _describe_faults(row: Row) -> str:
         return HEALTHY
     if len(names) == 1 and not has_other_fault(row):
         fault = next(fault for fault in FAULTS if fault.name == names[0])
-        return f"{names[0]}, {of_value(fault, true_size(row, fault)).word}"
+        return f"{names[0]}, {classify_size(fault, true_size(row, fault)).word}"
     return " and ".join(names)
 
 

@@ -10,12 +10,19 @@ import numpy as np
 import pytest
 
 from fdi.diagnosis import bands as judging
-from fdi.diagnosis.bands import Judged, judge, judge_columns
-from fdi.diagnosis.bands_file import default, load, parse, save, text
-from fdi.diagnosis.envelope import Bands, check_command, matches, stays
+from fdi.diagnosis.bands import (
+    Bands,
+    Judged,
+    check_command,
+    find_stays,
+    judge_position,
+    judge_trace,
+    matches_command,
+)
+from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands, parse_bands, save_bands
 from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import build
-from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.diagnosis.learn_bands import simulate_bands
+from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
@@ -41,11 +48,12 @@ def parts() -> list[Section]:
 @cache
 def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5, count: int = 16) -> np.ndarray:
     com = command()
-    return runs(load_model(), com, np.zeros_like(com), Kind("", clogging, friction, sliding), count, seed=4321)
+    kind = UnitKind("", clogging, friction, sliding)
+    return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
 
 
 def judged(x: np.ndarray, bands: Bands | None = None) -> Judged:
-    return judge_columns(command(), x, 1e-3, bands or default(), parts=parts())
+    return judge_position(command(), x, 1e-3, bands or load_default_bands(), parts=parts())
 
 
 def levels(found: list[Judged], fault: str) -> list[Level | None]:
@@ -120,9 +128,9 @@ def test_spikes_do_not_count() -> None:
 def test_the_debouncing_rule() -> None:
     """In after three in a row, out after three within; a sample back inside does not end a stay."""
     flags = np.array([0, 1, 1, 0, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 1, 0], bool)
-    assert stays(flags) == [(6, 13)]
-    assert stays(np.ones(2, bool)) == [] and stays(np.ones(3, bool)) == [(0, 2)]
-    assert stays(np.zeros(9, bool)) == []
+    assert find_stays(flags) == [(6, 13)]
+    assert find_stays(np.ones(2, bool)) == [] and find_stays(np.ones(3, bool)) == [(0, 2)]
+    assert find_stays(np.zeros(9, bool)) == []
 
 
 def test_entry_and_exit_times() -> None:
@@ -138,7 +146,7 @@ def test_as_the_bus_has_it_and_later() -> None:
     """Rounded to 1e-7 m, and with another rest before the first step, it is the same test."""
     x, com = np.round(units(0.4)[2], 7), np.round(command(), 7)
     whole = judged(x)
-    shorter = judge_columns(com[200:], x[200:], 1e-3, default(), t0=0.2)
+    shorter = judge_position(com[200:], x[200:], 1e-3, load_default_bands(), t0=0.2)
     assert shorter.levels == whole.levels and len(shorter.events) == len(whole.events) > 0
     assert [e.t_in for e in shorter.events] == pytest.approx([e.t_in for e in whole.events])
 
@@ -159,12 +167,13 @@ def test_bands_of_another_command_are_refused() -> None:
     other = command().copy()
     other[500:1500] = 4e-3
     with pytest.raises(InputError, match=r"the command of the bands, preflight \(4 steps, 2 ramps\)"):
-        judge_columns(other, other, 1e-3, default())
+        judge_position(other, other, 1e-3, load_default_bands())
     with pytest.raises(InputError, match="has 2 sections"):
-        judge_columns(command()[:2000], command()[:2000], 1e-3, default())
+        judge_position(command()[:2000], command()[:2000], 1e-3, load_default_bands())
     with pytest.raises(InputError, match="unloaded ram"):
-        judge_columns(command(), units()[0], 1e-3, default(), load=np.full(len(other), 5e3))
-    assert matches(default(), command(), 1e-3) and not matches(default(), other, 1e-3)
+        judge_position(command(), units()[0], 1e-3, load_default_bands(), load=np.full(len(other), 5e3))
+    assert matches_command(load_default_bands(), command(), 1e-3)
+    assert not matches_command(load_default_bands(), other, 1e-3)
 
 
 SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(time=0.2))
@@ -173,7 +182,7 @@ SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(
 @cache
 def short_bands(force: float = 0.0) -> Bands:
     com = profile(SHORT).command
-    return build(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
+    return simulate_bands(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
 
 
 def test_any_command() -> None:
@@ -181,9 +190,9 @@ def test_any_command() -> None:
     com = profile(SHORT).command
     made = short_bands()
     assert made.judges == (True, True)
-    for kind, ruling in ((Kind("", 0.4), CLOGGING), (Kind("", friction=60.0), FRICTION), (Kind(""), None)):
-        x = runs(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
-        assert {judge_columns(com, row, 1e-3, made).ruling for row in x} == {ruling}
+    for kind, ruling in ((UnitKind("", 0.4), CLOGGING), (UnitKind("", friction=60.0), FRICTION), (UnitKind(""), None)):
+        x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
+        assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
     check_command(made, sections(com), 1e-3, "")
 
 
@@ -192,8 +201,8 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     com = profile(SHORT).command
     force = np.full(len(com), 5e3)
     run = simulate(load_model(), com, force, seed=3)
-    monkeypatch.setattr(judging, "suited", lambda *a, **k: short_bands(5e3))
-    j = judge(Trace.of(run._asdict(), 1e-3, {}))
+    monkeypatch.setattr(judging, "choose_bands", lambda *a, **k: short_bands(5e3))
+    j = judge_trace(Trace.of(run._asdict(), 1e-3, {}))
     assert (j.ruling, j.events) == (None, ())
     assert "5000 N" in short_bands(5e3).provenance["load"]
 
@@ -201,38 +210,39 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_command_that_shows_nothing() -> None:
     """A hold has no band."""
     with pytest.raises(InputError, match="steps or slow ramps"):
-        build(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
+        simulate_bands(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
 
 
 def test_the_file(tmp_path: Path) -> None:
     """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed."""
-    save(default(), tmp_path / "b.toml")
-    again = load(tmp_path / "b.toml")
-    assert text(again) == text(default())
+    save_bands(load_default_bands(), tmp_path / "b.toml")
+    again = load_bands(tmp_path / "b.toml")
+    assert format_bands(again) == format_bands(load_default_bands())
     assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
-    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= default().provenance.keys()
+    facts = load_default_bands().provenance.keys()
+    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= facts
     assert (tmp_path / "b.toml").stat().st_size < 40_000
     some = short_bands()
-    assert text(parse(text(some), "")) == text(some)
+    assert format_bands(parse_bands(format_bands(some), "")) == format_bands(some)
 
 
 def test_a_file_of_any_command_is_read_again(tmp_path: Path) -> None:
     """A step of no whole number of mm, too."""
     some = short_bands()
     odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
-    save(odd, tmp_path / "b.toml")
-    assert load(tmp_path / "b.toml").precursors.keys() == odd.precursors.keys()
+    save_bands(odd, tmp_path / "b.toml")
+    assert load_bands(tmp_path / "b.toml").precursors.keys() == odd.precursors.keys()
 
 
 @pytest.mark.parametrize(("old", "new", "word"), [
     ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
     ("friction_N = [5.0, ", "friction_N = [500.0, ", "rising"),
-    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "no ramp of the command")])
+    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "not a ramp of the command")])
 def test_a_file_edited_wrongly_is_refused(old: str, new: str, word: str) -> None:
-    content = text(default())
+    content = format_bands(load_default_bands())
     assert old in content
     with pytest.raises(InputError, match=word):
-        parse(content.replace(old, new), "b.toml")
+        parse_bands(content.replace(old, new), "b.toml")
 
 
 @pytest.mark.parametrize(("wrong", "word"), [("[bands", "TOML"), ("x = 1\n", "bands"), (None, "of other lengths"),
@@ -240,13 +250,13 @@ def test_a_file_edited_wrongly_is_refused(old: str, new: str, word: str) -> None
 def test_a_wrong_file_is_refused(wrong: str | None, word: str, tmp_path: Path) -> None:
     """In one line."""
     if wrong is None:
-        wrong = text(default()).replace("friction_N = [5.0, ", "friction_N = [")
+        wrong = format_bands(load_default_bands()).replace("friction_N = [5.0, ", "friction_N = [")
     (tmp_path / "b.toml").write_text(wrong)
     with pytest.raises(InputError, match=word) as refused:
-        load(tmp_path / "b.toml")
+        load_bands(tmp_path / "b.toml")
     assert "\n" not in str(refused.value)
-    with pytest.raises(InputError, match="can be read"):
-        load(tmp_path / "none.toml")
+    with pytest.raises(InputError, match="a readable file"):
+        load_bands(tmp_path / "none.toml")
 
 
 @pytest.mark.slow

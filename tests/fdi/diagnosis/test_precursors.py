@@ -9,11 +9,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fdi.diagnosis.bands_file import default
+from fdi.diagnosis.bands_file import load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.diagnosis.features import MEANINGS, features, kind_of, smooth
-from fdi.diagnosis.precursors import measure, shown
-from fdi.diagnosis.simulated_units import Kind, runs
+from fdi.diagnosis.precursors import (
+    MEANINGS,
+    compute_features,
+    find_kind,
+    format_precursor,
+    measure_precursors,
+    smooth_spikes,
+)
+from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.report.diagnosis_figures import estimates, telling
 from fdi.trace.sections import Section, sections
 from fdi.trace.trace import Trace
@@ -47,7 +53,7 @@ def test_a_step_of_second_order(zeta: float, omega: float) -> None:
     """Overshoot exp(-pi zeta / root), its square back, peak at pi / omega_d; rise and settling as on a fine grid."""
     com = np.r_[np.zeros(300), np.full(700, 2e-3)]
     x = np.r_[np.zeros(300), second_order(zeta, omega, 700, 2e-3)]
-    found = {name: float(v[0]) for name, v in features(com, x[None], MS, sections(com)).items()}
+    found = {name: float(v[0]) for name, v in compute_features(com, x[None], MS, sections(com)).items()}
     root = math.sqrt(1 - zeta**2)
     over = math.exp(-math.pi * zeta / root)
     fine = np.arange(700_000) * 1e-6
@@ -69,20 +75,20 @@ def test_an_oscillation_on_a_ramp() -> None:
     way = np.zeros(len(com))
     for s in parts:
         way[s.start:s.stop] = np.sign(s.rate)
-    found = {name: float(v[0]) for name, v in features(com, (com - 7e-6 * way + wave)[None], MS, parts).items()}
+    found = {name: float(v[0]) for name, v in compute_features(com, (com - 7e-6 * way + wave)[None], MS, parts).items()}
     assert found["stick_slip_frequency"] == pytest.approx(8.0, abs=0.4)
     assert found["stick_slip_amplitude"] == pytest.approx(5e-5, rel=0.02)
     assert found["break_away"] == pytest.approx(5e-5, rel=0.02)
     assert found["mean_ramp_error"] == pytest.approx(7e-6, abs=1.5e-6)
     assert abs(found["ramp_asymmetry"]) < 2e-6
     assert found["speed_ripple"] == pytest.approx(2 * np.pi * 8 * 5e-5 / math.sqrt(2), rel=0.06)
-    loaded = features(com, (com - 7e-6 * way - 4e-5)[None], MS, parts)["ramp_asymmetry"][0]
+    loaded = compute_features(com, (com - 7e-6 * way - 4e-5)[None], MS, parts)["ramp_asymmetry"][0]
     assert loaded == pytest.approx(4e-5, rel=0.03)
 
 
 def test_closed_forms_of_the_plant() -> None:
     """Mean ramp error: rate/Kpos + FDJ 5.56e-9 m/N; break-away: 3.9 um per N of FSS, and 1/(1 - Kintas) of that."""
-    healthy, stuck, both = (measure(run(*f)) for f in ((0.0, 5.0), (0.0, 35.0), (0.35, 35.0)))
+    healthy, stuck, both = (measure_precursors(run(*f)) for f in ((0.0, 5.0), (0.0, 35.0), (0.35, 35.0)))
     kpos = 3.8 * 2.27 * 0.30 / (14.5 * 1.5e-3)
     assert healthy["mean_ramp_error"].value == pytest.approx(5e-4 / kpos + 500 * 5.56e-9, abs=1.5e-6)
     assert healthy["break_away"].value == pytest.approx(3.9e-6 * 5, rel=0.1)
@@ -92,7 +98,8 @@ def test_closed_forms_of_the_plant() -> None:
 
 def test_each_fault_where_it_shows() -> None:
     """Clogging in overshoot and settling, friction in break-away and slips; neither in the other's best sign."""
-    healthy, clogged, stuck = (measure(run(*f), default()) for f in ((0.0, 5.0), (0.35, 5.0), (0.0, 35.0)))
+    faults = (0.0, 5.0), (0.35, 5.0), (0.0, 35.0)
+    healthy, clogged, stuck = (measure_precursors(run(*f), load_default_bands()) for f in faults)
     assert all(abs(p.departure) < 4.5 for p in healthy.values() if math.isfinite(p.departure))
     assert clogged["settling_time_1mm"].departure > 5 and clogged["overshoot_5mm"].departure > 2
     assert stuck["break_away"].departure > 100 and stuck["slip_speed"].departure > 20
@@ -101,12 +108,12 @@ def test_each_fault_where_it_shows() -> None:
 
 def test_the_table_tells_what_tells() -> None:
     """Break-away is worth a hundred scatters of friction, the mean ramp error hardly three; fresh units say so."""
-    table = measure(run(), default())
+    table = measure_precursors(run(), load_default_bands())
     assert table["break_away"].friction_ratio > 100 and abs(table["mean_ramp_error"].friction_ratio) < 4
     assert abs(table["mean_ramp_error"].clogging_ratio) < 1 < abs(table["settling_time_5mm"].clogging_ratio)
     com = command()
-    x = runs(load_model(), com, np.zeros_like(com), Kind(""), 64, seed=77)
-    fresh = features(com, x, MS, sections(com))
+    x = simulate_units(load_model(), com, np.zeros_like(com), UnitKind(""), 64, seed=77)
+    fresh = compute_features(com, x, MS, sections(com))
     for name in ("overshoot_5mm", "break_away", "mean_ramp_error", "speed_ripple"):
         assert float(fresh[name].mean()) == pytest.approx(table[name].healthy, abs=0.5 * table[name].noise)
         assert float(fresh[name].std()) == pytest.approx(table[name].noise, rel=0.4)
@@ -117,33 +124,34 @@ def test_spikes_and_holes() -> None:
     clean = run()
     xj = clean.xj.copy()
     xj[[535, 1540, 2528, 4700, 7000]] += 4e-3
-    spiked = measure(Trace.of({"com": clean.com, "xj": xj, "cor": clean.cor}, MS, {}))
+    spiked = measure_precursors(Trace.of({"com": clean.com, "xj": xj, "cor": clean.cor}, MS, {}))
     for name in ("overshoot_5mm", "overshoot_1mm", "break_away", "settling_time_5mm", "slip_speed"):
-        assert spiked[name].value == pytest.approx(measure(clean)[name].value, rel=0.05)
+        assert spiked[name].value == pytest.approx(measure_precursors(clean)[name].value, rel=0.05)
     few, many = clean.xj.copy(), clean.xj.copy()
     few[2000:2030], many[2000:2500] = np.nan, np.nan
-    assert measure(Trace.of({"com": clean.com, "xj": few, "cor": clean.cor}, MS, {})).keys() == measure(clean).keys()
-    assert measure(Trace.of({"com": clean.com, "xj": many, "cor": clean.cor}, MS, {})) == {}
+    holed = measure_precursors(Trace.of({"com": clean.com, "xj": few, "cor": clean.cor}, MS, {}))
+    assert holed.keys() == measure_precursors(clean).keys()
+    assert measure_precursors(Trace.of({"com": clean.com, "xj": many, "cor": clean.cor}, MS, {})) == {}
 
 
 def test_what_a_command_does_not_show() -> None:
     """No ramps, no stick-slip; no steps, no overshoot; an oscillation that goes on has no settling time."""
     com = np.r_[np.zeros(200), np.full(800, 1e-3)]
     x = com + 2e-4 * np.sin(2 * np.pi * 10 * np.arange(1000) * MS)
-    found = features(com, x[None], MS, sections(com))
+    found = compute_features(com, x[None], MS, sections(com))
     assert "break_away" not in found and math.isnan(found["settling_time_1mm"][0])
-    assert shown(math.nan, "settling_time_1mm") == "-"
-    assert features(np.zeros(500), np.zeros((1, 500)), MS, [Section("hold", 0, 500, 0.0, 0.0, 0.0)]) == {}
+    assert format_precursor(math.nan, "settling_time_1mm") == "-"
+    assert compute_features(np.zeros(500), np.zeros((1, 500)), MS, [Section("hold", 0, 500, 0.0, 0.0, 0.0)]) == {}
 
 
 def test_words_and_units() -> None:
     """Every precursor has a name that a person reads, and a unit; JSON can carry them."""
-    found = measure(run(), default())
-    assert {kind_of(name) for name in found} == set(MEANINGS)
+    found = measure_precursors(run(), load_default_bands())
+    assert {find_kind(name) for name in found} == set(MEANINGS)
     assert found["overshoot_5mm"].words == "first overshoot, 5 mm"
     assert {p.unit for p in found.values()} == {"%", "s", "m", "m/s", "Hz"}
     json.dumps({name: p._asdict() for name, p in found.items()})
-    assert smooth(np.array([[0.0, 0, 0, 9, 0, 0, 0]])).max() == 0.0
+    assert smooth_spikes(np.array([[0.0, 0, 0, 9, 0, 0, 0]])).max() == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -170,5 +178,5 @@ def test_pictures_without_bands() -> None:
     """Sizes can be drawn without grid and bands; precursors without a table are not."""
     sizes = {CLOGGING.name: Estimate(0.9, 0.8, 0.97), FRICTION.name: Estimate(150.0, 140.0, 170.0)}
     assert estimates(sizes, None, None).startswith("<svg")
-    assert telling(measure(run())) == ""
+    assert telling(measure_precursors(run())) == ""
 

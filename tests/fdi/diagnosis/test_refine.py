@@ -6,10 +6,16 @@ import pytest
 from noisy_traces import recorded
 
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.fault_unknowns import LARGEST, MOST, free_parameters, start_of
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level
-from fdi.diagnosis.levels import level, ruling, severity
-from fdi.diagnosis.refine import Refined, problem_of, refine
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level, compute_severity, find_ruling_fault, judge_size
+from fdi.diagnosis.refine import (
+    LARGEST_FSS,
+    LARGEST_KINTAS,
+    Refined,
+    list_unknowns,
+    make_problem,
+    make_start,
+    refine_sizes,
+)
 from fdi.estimation.preparation import hold_inputs
 from fdi.estimation.valley import flats, relaxed, sloped
 from plant import Model, load_model
@@ -26,7 +32,7 @@ def faulty(kintas: float, fss: float, **more: float) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def off_grid() -> Refined:
-    return refine(MODEL, hold_inputs(recorded(faulty(0.17, 45.0))))
+    return refine_sizes(MODEL, hold_inputs(recorded(faulty(0.17, 45.0))))
 
 
 def test_a_pair_between_the_cells_of_a_grid(off_grid: Refined) -> None:
@@ -51,7 +57,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
     run = cases.measure_case(case, "est").trace
     trace = recorded({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
-    found = refine(MODEL, hold_inputs(trace))
+    found = refine_sizes(MODEL, hold_inputs(trace))
     true = case.effects[0].value
     assert found.reached and found.fss.low * 0.98 < true < found.fss.high * 1.02
     assert found.kintas.low == pytest.approx(0.0, abs=0.03) and found.kintas.high < 0.2
@@ -62,17 +68,17 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     ({"constant_load.force": -1e3}, "constant_load.force", -1e3),
     ({"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}, "jack.dynamic_friction", 1000.0)])
 def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], name: str, value: float) -> None:
-    found = refine(MODEL, hold_inputs(recorded(settings)))
+    found = refine_sizes(MODEL, hold_inputs(recorded(settings)))
     assert found.reached
-    assert level(CLOGGING, found.kintas) == level(FRICTION, found.fss) == Level.ACCEPTABLE
+    assert judge_size(CLOGGING, found.kintas) == judge_size(FRICTION, found.fss) == Level.ACCEPTABLE
     other = found.others[name]
     assert other.value == pytest.approx(value, rel=0.05) and abs(other.high - other.low) < 0.5 * abs(value)
 
 
 def test_flat_directions_change_no_signal() -> None:
     """Scaled together, they are another plant and the same run; along any one of their parameters the run changes."""
-    problem, free = problem_of(MODEL, hold_inputs(recorded({}))), free_parameters(MODEL)
-    x = start_of(free, 0.2, 20.0)
+    problem, free = make_problem(MODEL, hold_inputs(recorded({}))), list_unknowns(MODEL)
+    x = make_start(free, 0.2, 20.0)
     flat = flats(problem, free, x)
     assert flat.shape == (len(free), 4)
     white = problem.whitened(problem.residuals(free, np.vstack([x, x + 0.01 * flat.T, x + 0.01 * np.diag(flat[:, 0])])))
@@ -81,7 +87,7 @@ def test_flat_directions_change_no_signal() -> None:
 
 
 def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
-    problem, found = problem_of(MODEL, hold_inputs(recorded({}))), off_grid.fit
+    problem, found = make_problem(MODEL, hold_inputs(recorded({}))), off_grid.fit
     flat = flats(problem, found.free, found.x)
     here = sloped(problem, found.free, found.x, found.covariance, flat)
     along = np.abs(np.tensordot(flat.T, here.jacobian, 1)).max()
@@ -94,7 +100,7 @@ def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
 def test_sizes_are_within_what_is_possible() -> None:
     """Also where a lag that no fault explains makes the intervals wide."""
     sizes = diagnose(recorded({"sensor_lag.time": 3e-3})).sizes
-    for size, most in zip(sizes.values(), (MOST, LARGEST), strict=True):
+    for size, most in zip(sizes.values(), (LARGEST_KINTAS, LARGEST_FSS), strict=True):
         assert 0.0 <= size.low <= size.value <= size.high <= most
 
 
@@ -104,22 +110,22 @@ def test_sizes_are_within_what_is_possible() -> None:
     ((0.2, 0.155, 0.243), Level.ACCEPTABLE), ((0.2, 0.155, 0.247), Level.MAINTENANCE),  # by the margin
     ((0.31, 0.24, 0.38), Level.MAINTENANCE), ((0.5, 0.4, 0.6), Level.NON_NOMINAL), ((0.2, 0.0, 0.4), None)])
 def test_levels(size: tuple[float, float, float], expected: Level | None) -> None:
-    assert level(CLOGGING, Estimate(*size)) == expected
+    assert judge_size(CLOGGING, Estimate(*size)) == expected
 
 
 def test_the_ruling_fault_is_further_along_its_own_limits() -> None:
     sizes = {CLOGGING.name: Estimate(0.3, 0.26, 0.34), FRICTION.name: Estimate(69.0, 66.0, 72.0)}
     both = dict.fromkeys(sizes, Level.MAINTENANCE)
-    assert severity(CLOGGING, 0.3) == pytest.approx(1.5) and severity(FRICTION, 69.0) > 1.9
-    assert ruling(sizes, both) == FRICTION.name
-    assert ruling(sizes, {**both, FRICTION.name: Level.ACCEPTABLE}) == CLOGGING.name
-    assert ruling(sizes, dict.fromkeys(sizes, Level.ACCEPTABLE)) is None
+    assert compute_severity(CLOGGING, 0.3) == pytest.approx(1.5) and compute_severity(FRICTION, 69.0) > 1.9
+    assert find_ruling_fault(sizes, both) == FRICTION.name
+    assert find_ruling_fault(sizes, {**both, FRICTION.name: Level.ACCEPTABLE}) == CLOGGING.name
+    assert find_ruling_fault(sizes, dict.fromkeys(sizes, Level.ACCEPTABLE)) is None
 
 
 def test_a_model_with_a_known_effect_keeps_it() -> None:
     model: Model = MODEL.replace({"null_bias.current": 5e-5})
-    assert "null_bias.current" in {f.name for f in free_parameters(model)}
-    assert next(f for f in free_parameters(model) if f.name == "null_bias.current").centre == 5e-5
+    assert "null_bias.current" in {f.name for f in list_unknowns(model)}
+    assert next(f for f in list_unknowns(model) if f.name == "null_bias.current").centre == 5e-5
 
 
 @pytest.mark.parametrize("seed", [8, 10])

@@ -10,7 +10,15 @@ import pytest
 from rig_command import rig
 
 from fdi import Trace
-from fdi.diagnosis.rms_grid import FSS, KINTAS, Map, Point, bisector, merge, search
+from fdi.diagnosis.rms_grid import (
+    FSS_AXIS,
+    KINTAS_AXIS,
+    Map,
+    Point,
+    measure_bisector_distance,
+    merge_minima,
+    search_grid,
+)
 from fdi.estimation.preparation import read_cycles
 from plant import InputError, Model, simulate
 from plant.monitor import Monitor
@@ -42,10 +50,10 @@ def map_of(kintas: float, fss: float) -> Map:
 def test_maps_are_rms_of_the_monitor() -> None:
     """One cell by hand."""
     measured = trace(0.25, 30.0)
-    grid = search(measured, sliding=(1.0,))
+    grid = search_grid(measured, sliding=(1.0,))
     row, column = 7, 5
     c = read_cycles(measured, Model())[0]
-    run = Monitor(Model()).replay(np.array([[KINTAS[row], FSS[column]]]), c.cor, c.xj, 20.0)[0, 0]
+    run = Monitor(Model()).replay(np.array([[KINTAS_AXIS[row], FSS_AXIS[column]]]), c.cor, c.xj, 20.0)[0, 0]
     step = np.r_[500:4001]  # the sections of the preflight
     ramp = np.r_[4001:6001, 6501:8501]
     assert grid.step and grid.ramp
@@ -59,7 +67,7 @@ def test_maps_are_rms_of_the_monitor() -> None:
         assert made.rms.shape == (21, 21)
         assert made.minimum.rms == made.rms.min()
         where = np.argwhere(made.rms == made.rms.min())[0]
-        assert made.minimum[:2] == (KINTAS[where[0]], FSS[where[1]])
+        assert made.minimum[:2] == (KINTAS_AXIS[where[0]], FSS_AXIS[where[1]])
     assert grid.simulations == 441 + 21 * 13
 
 
@@ -67,7 +75,7 @@ def test_maps_are_rms_of_the_monitor() -> None:
 @pytest.mark.parametrize(("kintas", "fss"), [(0.25, 30.0), (0.17, 45.0), (0.0, 70.0), (0.35, 5.0)])
 def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
     """Within the width of the valley: Kintas is weak, FSS is not."""
-    grid = search(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
+    grid = search_grid(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
     for found in (grid.joint.minimum, grid.best):
         assert found.kintas == pytest.approx(kintas, abs=0.176 if scatter else 0.051)
         assert found.fss == pytest.approx(fss, abs=9.0)
@@ -81,7 +89,7 @@ def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
     settings = [word for name, value in faults.items() for word in ("--set", f"{name}={value!r}")]
     rig("run", "--quiet", "--seed", "3", *settings, "--out", tmp_path)
     for measured in (Trace.read(tmp_path), trace(kintas, fss)):  # and with another noise
-        grid = search(measured)
+        grid = search_grid(measured)
         assert grid.step and grid.ramp
         for point in (grid.step.minimum, grid.joint.minimum, grid.best, grid.merged):
             assert point.kintas == pytest.approx(kintas, abs=0.051)
@@ -92,14 +100,14 @@ def test_both_worked_cases(kintas: float, fss: float, tmp_path: Path) -> None:
 def test_friction_that_is_static_alone() -> None:
     """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
     measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
-    found, paper = search(measured), search(measured, sliding=(1.0,))
+    found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
     assert found.joint.minimum.fss == pytest.approx(70.0, abs=9.0) and found.sliding < 0.1
     assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
 
 
 def test_closed_loop_misleads() -> None:
     """With spool friction the loop oscillates in a phase of its own; the calmest monitor wins."""
-    looped, driven = (search(trace(0.17, 45.0), drive=drive) for drive in ("command", "current"))
+    looped, driven = (search_grid(trace(0.17, 45.0), drive=drive) for drive in ("command", "current"))
     assert looped.joint.minimum.fss < 10.0
     assert looped.joint.minimum.rms > 4.0 * driven.joint.minimum.rms
 
@@ -109,7 +117,7 @@ def test_a_command_with_one_kind_of_section(which: str) -> None:
     piece = Step(to=2e-3, time=0.8) if which == "step" else Ramp(to=1e-3, time=1.5)
     com = build([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     model = Model().replace({"spool.static_friction": 40.0, "spool.dynamic_friction": 80.0 / 3.0})
-    grid = search(of(simulate(model, com)))
+    grid = search_grid(of(simulate(model, com)))
     there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
     assert there is not None and absent is None
     np.testing.assert_allclose(there.rms, grid.joint.rms, rtol=1e-12)
@@ -124,7 +132,8 @@ def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: floa
                "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
     faults = {"filter.clogging": kintas, "spool.static_friction": fss, "spool.dynamic_friction": fss / 1.5}
     load = np.full(len(PREFLIGHT.command), 3e3 * (other == "load"))
-    found = search(of(simulate(Model().replace(faults | changed), PREFLIGHT.command, load)), sliding=(2.0 / 3.0,)).best
+    measured = of(simulate(Model().replace(faults | changed), PREFLIGHT.command, load))
+    found = search_grid(measured, sliding=(2.0 / 3.0,)).best
     assert found.kintas == pytest.approx(kintas, abs=0.126)
     assert found.fss == pytest.approx(fss, abs=4.5)
 
@@ -134,7 +143,7 @@ def test_gaps_are_left_out() -> None:
     holes = {name: whole.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs", "load")}
     holes["xj"][700:760] = np.nan
     holes["cor"][2000:2002] = np.nan
-    grid = search(Trace.of(holes, 1e-3, {}))
+    grid = search_grid(Trace.of(holes, 1e-3, {}))
     assert not np.isnan(grid.joint.rms).any()
     assert grid.joint.minimum.fss == pytest.approx(30.0, abs=9.0)
 
@@ -142,9 +151,9 @@ def test_gaps_are_left_out() -> None:
 def test_refusals() -> None:
     com = build([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     with pytest.raises(InputError, match="steps or ramps"):
-        search(of(simulate(Model(), com)))
+        search_grid(of(simulate(Model(), com)))
     with pytest.raises(InputError, match="drive"):
-        search(trace(0.25, 30.0), drive="position")
+        search_grid(trace(0.25, 30.0), drive="position")
 
 
 @pytest.mark.parametrize(("kintas", "fss", "distance"), [
@@ -153,20 +162,20 @@ def test_refusals() -> None:
     (0.15, 70.0, -1.0), (0.15, 35.0, -1.0), (0.0, 5.0, -1.0),  # left edge and beyond
     (0.30, 35.0, 0.5), (0.20, 35.0, -0.5)])
 def test_first_bisector(kintas: float, fss: float, distance: float) -> None:
-    assert bisector(kintas, fss) == pytest.approx(distance, abs=1e-12)
+    assert measure_bisector_distance(kintas, fss) == pytest.approx(distance, abs=1e-12)
 
 
 def test_centre_of_gravity() -> None:
-    merged = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
+    merged = merge_minima(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
     assert merged == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
-    assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
-    assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
-    assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
+    assert merge_minima(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
+    assert merge_minima(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
+    assert merge_minima(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
 
 
 def test_fast_enough() -> None:
     """21x21 cells, everything included, under 2 s of both cores; processor time, as others may be at work here."""
-    search(trace(0.25, 30.0))  # compiled and loaded
+    search_grid(trace(0.25, 30.0))  # compiled and loaded
     begin = time.process_time()
-    search(trace(0.25, 30.0))
+    search_grid(trace(0.25, 30.0))
     assert time.process_time() - begin < 4.0

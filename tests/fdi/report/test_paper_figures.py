@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fdi import Trace
-from fdi.diagnosis.bands import excursions, suited
-from fdi.diagnosis.rms_grid import search
+from fdi.diagnosis.bands import choose_bands, find_excursions
+from fdi.diagnosis.rms_grid import search_grid
 from fdi.report import paper_figures as figures
 from plant import Model, simulate
 from plant.profile import build
@@ -42,8 +42,8 @@ def test_either_fault_alone() -> None:
 
 def test_a_trace_in_its_bands() -> None:
     faulty = trace(0.4, 45.0)
-    bands = suited(faulty.com, faulty.load, 1e-3, None, lambda *_: None)
-    found, friction, _ = excursions(faulty.com, faulty.xj, 1e-3, bands, faulty.sections())
+    bands = choose_bands(faulty.com, faulty.load, 1e-3, None, lambda *_: None)
+    found, friction, _ = find_excursions(faulty.com, faulty.xj, 1e-3, bands, faulty.sections())
     for kind, signal, first in (("step", "position", "step of +5 mm at 0.5 s"),
                                 ("ramp", "position", "ramp of +1 mm at 4.001 s"),
                                 ("ramp", "speed", "ramp of -1 mm at 6.501 s")):
@@ -53,7 +53,7 @@ def test_a_trace_in_its_bands() -> None:
 
 
 def test_the_maps() -> None:
-    grid = search(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
+    grid = search_grid(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
     said = texts(figures.maps(grid, truth=(0.25, 30.0)))
     assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
     assert any(text.startswith("step sections: ") for text in said)
@@ -64,6 +64,6 @@ def test_the_maps() -> None:
 def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
     com = build([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     measured = Trace.of(simulate(Model(), com)._asdict(), 1e-3, {})
-    grid = search(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
+    grid = search_grid(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
     said = texts(figures.maps(grid))
     assert {"A", "C"} <= said and not {"B", "G"} & said
