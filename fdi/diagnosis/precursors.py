@@ -110,7 +110,7 @@ def _make_precursor(name: str, value: float, known: Mapping[str, float]) -> Prec
 def format_precursor(value: float, name: str) -> str:
     """A value of a precursor in the unit that people use.
 
-    >>> format_precursor(1.905e-05, "break_away"), format_precursor(7.41, "overshoot_5mm")
+    >>> format_precursor(1.912e-05, "break_away"), format_precursor(7.41, "overshoot_5mm")
     ('19.1 um', '7.41 %')
     """
     kind = MEANINGS[find_kind(name)]
