@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from plant.errors import InputError
 
@@ -36,10 +35,3 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
-
-
-def rendered(template: str, **content: Any) -> str:
-    """A page of this package, `template` on top of page.html, as text; what is put in is escaped."""
-    from fdi.report.html import load_templates
-
-    return load_templates().get_template(template).render(**content)

@@ -23,6 +23,23 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 # The project's packages that each package may import. dbc is data only.
 MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"}}
+# Inside fdi and rig: the folders, and single modules, that each folder may import beside itself. All may import SHARED.
+SHARED = {"fdi.output", "fdi.progress", "fdi.sources", "fdi.thresholds"}
+BENCH = {f"rig.{part}" for part in ("network", "device", "nodes", "run", "sequences", "recorder", "view", "doctor")}
+ESTIMATOR = {"fdi.trace", "fdi.estimation", "fdi.comparison"}
+FOLDER_MAY_IMPORT = {
+    **{module: set() for module in SHARED},
+    "fdi.trace": set(),
+    "fdi.estimation": {"fdi.trace"},
+    "fdi.comparison": {"fdi.trace", "fdi.estimation"},
+    "fdi.discovery": ESTIMATOR,
+    "fdi.diagnosis": ESTIMATOR,
+    "fdi.prognosis": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis"},
+    "fdi.report": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis", "fdi.prognosis"},
+    **dict.fromkeys(BENCH, BENCH),
+    "rig.studies": BENCH,
+    "rig.cli": {*BENCH, "rig.studies"},
+}
 # Modules of others that only some files may import (prefixes of paths).
 ONLY_IN = {
     "numba": ("plant/compile.py",),
@@ -106,6 +123,33 @@ def test_imports_point_one_way(package: str) -> None:
         if name(path).startswith(f"{package}/"):
             ours = {module.partition(".")[0] for module in imported(path)} & set(PACKAGES)
             assert ours <= MAY_IMPORT[package], name(path)
+
+
+def folder(module: str) -> str:
+    """The folder, or the single module, of fdi or rig that a module is in: `fdi.trace.csv_table` -> `fdi.trace`."""
+    return ".".join(module.split(".")[:2])
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if name(p).startswith(("fdi/", "rig/"))], ids=name)
+def test_folders_import_only_lower_ones(path: Path) -> None:
+    """In fdi: trace, estimation, comparison, then discovery and diagnosis, which do not know each other, prognosis,
+    report. In rig: the bench, studies, command line.
+    """
+    own = folder(name(path).removesuffix(".py").replace("/", "."))
+    if own.endswith(".__init__"):
+        return  # a package's face hands on what its folders have
+    assert own in FOLDER_MAY_IMPORT, f"{own} has no place in the order of folders"
+    package = own.partition(".")[0]
+    others = {folder(module) for module in imported(path) if module.startswith(f"{package}.")} - {own}
+    assert others <= FOLDER_MAY_IMPORT[own] | (SHARED if package == "fdi" and own not in SHARED else set()), name(path)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name)
+def test_private_names_stay_in_their_module(path: Path) -> None:
+    """What another module needs is public there, and has a docstring."""
+    found = [alias.name for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom) for alias in node.names
+             if alias.name.startswith("_")]
+    assert found == [], name(path)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name)

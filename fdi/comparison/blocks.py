@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.noise_floor import floors, from_data
+from fdi.estimation.noise import floors, from_data
 from fdi.estimation.preparation import BRIDGED_ROWS
 from fdi.estimation.repeats import align_columns
 from fdi.estimation.replay import Columns, derivative

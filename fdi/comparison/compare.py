@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from fdi.comparison import blocks, controller_block
 from fdi.comparison.localisation import Motion, Place, condition, motion, places, whole
 from fdi.comparison.residual_tests import Diagnosis, diagnose
-from fdi.estimation.noise_floor import Floor, floors, read_noise, sensor_floors
+from fdi.estimation.noise import Floor, floors, read_noise, sensor_floors
 from fdi.estimation.preparation import match_period, prepare_trace
 from fdi.estimation.repeats import Repeat, align_columns, find_repeat
 from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, measure_misfit, open_loop, residuals
-from fdi.estimation.tolerances import Scatter, scatter
+from fdi.estimation.scatter import Scatter, scatter
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS

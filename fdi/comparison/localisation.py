@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fdi.estimation.replay import Columns, derivative
 from fdi.trace.columns import hold_last
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import describe_section, sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -94,24 +94,10 @@ def places(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
         chosen[rows] = True
         share = float(np.nansum(inside)) / total
         said = condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
-        words = name(section, float(np.abs(trace.com[rows]).max()))
+        words = describe_section(section, float(np.abs(trace.com[rows]).max()))
         t0, t1 = float(trace.t[section.start]), float(trace.t[section.stop - 1] + trace.period)
         out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), said))
     return sorted(out, key=lambda place: -place.share)
-
-
-def name(section: Section, furthest: float = 0.0) -> str:
-    """A section in words; `furthest` m, how far its demand goes.
-
-    >>> name(Section("step", 500, 1500, 0.0, 5e-3, 0.0))
-    'step to 5 mm'
-    """
-    level = f"{1e3 * section.last:.4g} mm"
-    if section.kind == "ramp":
-        return f"ramp at {1e3 * section.rate:.3g} mm/s"
-    if section.kind == "dynamic":
-        return f"motion within {1e3 * furthest:.4g} mm"
-    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
 
 
 def condition(z2: Floats, m: Motion, limit: float) -> str:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.comparison.localisation import name
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Level
 from fdi.diagnosis.simulated_units import DYNAMIC
 from fdi.progress import Progress, ignore_progress
@@ -31,7 +30,7 @@ from fdi.thresholds import (
     SECTION_MEASURED_SHARE,
 )
 from fdi.trace.columns import hold_last
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, describe_section, sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -439,7 +438,7 @@ def _is_lost(x: Floats, s: Section, notes: list[str]) -> bool:
     lost = float(np.isnan(x).mean()) if len(x) else 1.0
     too_much = lost > 1.0 - SECTION_MEASURED_SHARE
     if too_much:
-        notes.append(f"{name(s)} is not judged: {100 * lost:.0f} % of its position is missing")
+        notes.append(f"{describe_section(s)} is not judged: {100 * lost:.0f} % of its position is missing")
     return too_much
 
 
@@ -476,5 +475,6 @@ def _find_events(e: Excursion, t0: float, period: float) -> list[Event]:
             rows = slice(stay.first, stay.last + 1)
             excess = float(np.nanmax(e.departure[rows] - limit[rows]))
             begin = t0 + (e.start + stay.first) * period
-            out.append(Event(band, e.signal, name(e.section), begin, t0 + (e.start + stay.last + 1) * period, excess))
+            end = t0 + (e.start + stay.last + 1) * period
+            out.append(Event(band, e.signal, describe_section(e.section), begin, end, excess))
     return out

@@ -13,7 +13,7 @@ from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, fi
 from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import COARSE_STARTS, LARGEST_FSS, LARGEST_KINTAS, Refined, get_positive, refine_sizes
 from fdi.diagnosis.rms_grid import Grid, search_grid
-from fdi.estimation.noise_floor import sensor_floors
+from fdi.estimation.noise import sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (

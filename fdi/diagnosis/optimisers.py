@@ -22,7 +22,7 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.fit import misfit
+from fdi.estimation.likelihood import misfit
 from fdi.trace.trace import Trace
 from plant.model import Model
 

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
-from fdi.estimation.fit import Fit, misfit, typical
-from fdi.estimation.model_unknowns import free_of
-from fdi.estimation.problem import Free, Problem, quiet, unknowns
-from fdi.estimation.valley import descended, first_widths, flats
+from fdi.estimation.final_rounds import descended, first_widths
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Problem, misfit, typical
+from fdi.estimation.unidentifiable import flats
+from fdi.estimation.unknowns import Free, effect_unknowns, free_of, quiet
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
@@ -138,7 +139,7 @@ def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
-    own = next(u for u in unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
+    own = next(u for u in effect_unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
     if s.is_ratio:
         usual = get_positive(model, s.parameter)
         return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),

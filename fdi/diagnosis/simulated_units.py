@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
-from fdi.estimation.tolerances import tolerances
+from fdi.estimation.unknowns import limit_dynamic_friction, tolerances
 from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
 from plant.lanes import Lanes
@@ -108,8 +108,4 @@ def _draw_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[
     if np.isfinite(kind.friction):
         table[:, names.index(FRICTION.parameter)] = kind.friction
         table[:, names.index(DYNAMIC)] = kind.friction * kind.sliding
-    for body in ("jack", "spool"):
-        slides, sticks = (f"{body}.{word}_friction" for word in ("dynamic", "static"))
-        if slides in names and sticks in names:  # dynamic friction stays below static friction
-            table[:, names.index(slides)] = np.minimum(table[:, names.index(slides)], table[:, names.index(sticks)])
-    return table
+    return limit_dynamic_friction(names, table)

@@ -13,8 +13,8 @@ from fdi.discovery.fingerprints import Fingerprint, resolution
 from fdi.discovery.search import REACHED, Hypothesis
 from fdi.discovery.significance import p_value, smallest_visible
 from fdi.estimation.fit import Fit
-from fdi.estimation.model_unknowns import UNREPLAYED
-from fdi.report.numbers import SIGNAL_NAMES
+from fdi.estimation.unknowns import UNREPLAYED, limit_friction_values
+from fdi.trace.signals import SIGNALS
 from plant.effects import CATALOGUE
 from plant.model import Model, meaning, offered
 
@@ -127,7 +127,7 @@ def told(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str
 def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
     found = {}
-    values, entry = friction_sorted(fit.values), CATALOGUE[effect]
+    values, entry = limit_friction_values(fit.values), CATALOGUE[effect]
     for f in fit.free:
         if f.name in entry.fitted:
             value = values[f.name]
@@ -139,16 +139,6 @@ def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
         static = found.get(name.replace("dynamic", "static"), v)
         found[name] = v._replace(high=max(min(v.high, static.high), v.value))
     return found
-
-
-def friction_sorted(values: Mapping[str, float]) -> dict[str, float]:
-    """Values in which no dynamic friction is above the static one, as replays take them."""
-    out = dict(values)
-    for body in ("spool", "jack"):
-        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
-        if static in out and dynamic in out:
-            out[dynamic] = min(out[static], out[dynamic])
-    return out
 
 
 def suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
@@ -245,7 +235,7 @@ def to_json(a: Answer) -> dict[str, Any]:
                       "usual": b.usual} for b in a.blind],
         "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
         "separate": dict(a.separate), "pattern": a.pattern,
-        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor}}
+        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNALS[s].symbol for s in e.floor}}
     if several:
         found["ledger"] = [{"effect": effect, "error": error, "holdout": held} for effect, error, held in a.ledger]
     return dict(plain(found))

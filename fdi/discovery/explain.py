@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from fdi.discovery.fingerprints import Fingerprint, comb, firmware
 from fdi.discovery.search import Hypothesis, Search
 from fdi.discovery.significance import SEEN, Sensitivity, sensitivity
-from fdi.estimation.fit import typical
-from fdi.estimation.problem import Problem
+from fdi.estimation.likelihood import Problem, typical
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE

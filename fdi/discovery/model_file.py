@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.discovery.candidates import Value, friction_sorted
+from fdi.discovery.candidates import Value
 from fdi.discovery.runs import Source
+from fdi.estimation.unknowns import limit_friction_values
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, parse_model
@@ -115,7 +116,7 @@ def without(model: Model, p: Provenance, name: str) -> tuple[Model, Provenance]:
         found = replace(model, values=values, effects=tuple(e for e in model.effects if e != name))
     elif entry.base and (name in p.effects or any(model[n] != model.kind.nominal[n] for n in entry.fitted)):
         usual = {n: (p.before or {}).get(n, model.kind.nominal[n]) for n in entry.fitted}
-        found = replace(model, values=friction_sorted({**model.values, **usual}))
+        found = replace(model, values=limit_friction_values({**model.values, **usual}))
     else:
         has = [*dict.fromkeys([*p.effects, *model.effects])]
         raise InputError("effect", name, f"one that the model has ({', '.join(has) or 'it has none'})")

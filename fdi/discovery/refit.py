@@ -7,15 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.candidates import friction_sorted
 from fdi.discovery.explain import gain, held_out
 from fdi.discovery.fingerprints import comb, firmware
 from fdi.discovery.scan import Prospect, scan
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.final_rounds import settled
-from fdi.estimation.fit import Fit, improved, linearised, misfit
-from fdi.estimation.model_unknowns import UNREPLAYED, effects_of, free_of
-from fdi.estimation.problem import Free, quiet, unknowns, whole
+from fdi.estimation.fit import Fit, improved, linearised
+from fdi.estimation.likelihood import misfit
+from fdi.estimation.unknowns import (
+    UNREPLAYED,
+    Free,
+    effect_unknowns,
+    effects_of,
+    free_of,
+    limit_friction_values,
+    quiet,
+    whole,
+)
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -148,7 +156,7 @@ def lean(model: Model, effects: Sequence[str]) -> Model:
 
 def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
-    own = [u for name in effects for u in unknowns(CATALOGUE[name], search.model)]
+    own = [u for name in effects for u in effect_unknowns(CATALOGUE[name], search.model)]
     taken = {u.name for u in own}
     free = (*(f for f in free_of(search.model) if f.name not in taken), *own)
     x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
@@ -246,7 +254,7 @@ def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hy
 def values_of(r: Refit) -> dict[str, float]:
     """What was fitted, "group.field" to SI value, to six digits."""
     values = {name: float(f"{v:.6g}") for name, v in r.last.hypothesis.fit.values.items()}
-    return friction_sorted(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
+    return limit_friction_values(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
 
 
 def model_of(r: Refit) -> Model:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.estimation.fit import Fit, misfit, weights
-from fdi.estimation.problem import Free, Problem, ends, unknowns
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Problem, misfit, weights
 from fdi.estimation.unidentifiable import powers, scaled
+from fdi.estimation.unknowns import Free, effect_unknowns, ends
 from plant.effects import CATALOGUE
 from plant.threads import mapped
 
@@ -72,7 +73,7 @@ def scan(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -
 
 
 def _prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
-    mine = {u.name: u for u in unknowns(CATALOGUE[t.effect], problem.model)}
+    mine = {u.name: u for u in effect_unknowns(CATALOGUE[t.effect], problem.model)}
     kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
     own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
     found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
@@ -83,7 +84,7 @@ def _prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
 
 def _near(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
-    free = unknowns(CATALOGUE[t.effect], problem.model)
+    free = effect_unknowns(CATALOGUE[t.effect], problem.model)
     units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
     starts = []
     for unit in units:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fdi.discovery.scan import Prospect, scan
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import settled
-from fdi.estimation.fit import Fit, fit, improved, linearised, misfit
-from fdi.estimation.model_unknowns import free_of
+from fdi.estimation.fit import Fit, fit, improved, linearised
+from fdi.estimation.likelihood import Problem, misfit
 from fdi.estimation.noise import Noise
-from fdi.estimation.problem import Free, Problem, quiet, whole
+from fdi.estimation.unknowns import Free, free_of, quiet, whole
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE

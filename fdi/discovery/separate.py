@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import fit
+from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import Noise
 from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.problem import Problem
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes

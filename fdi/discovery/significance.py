@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from fdi.estimation.fit import Fit
-from fdi.estimation.problem import Problem
+from fdi.estimation.likelihood import Problem
 from plant.effects import CATALOGUE
 
 Floats = NDArray[np.float64]

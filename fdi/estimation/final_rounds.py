@@ -17,9 +17,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import DAMPINGS, ENOUGH, Fit, _stepped, misfit, weights
-from fdi.estimation.problem import Free, Problem, ends
-from fdi.estimation.unidentifiable import relaxed, tangents, without_slope
+from fdi.estimation.fit import DAMPINGS, ENOUGH, Fit, cut_at_bounds, step_within_bounds
+from fdi.estimation.likelihood import Problem, misfit, weights
+from fdi.estimation.unidentifiable import across, relaxed, relaxed_along, tangents, without_slope
+from fdi.estimation.unknowns import Free
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | 
     _, flat = tangents(slopes or problem, now.free, now.x)
     for _ in range(rounds):
         here = along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
-        there = _better(problem, here)
+        there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
         now = there
         if idle >= PATIENCE:
@@ -52,7 +53,7 @@ def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats,
     Along `flat` (p, k) there is no slope.
     """
     directions = _principal(covariance)
-    moves = np.array([_inside(free, x, d) for d in directions.T])
+    moves = np.array([cut_at_bounds(free, x, d) for d in directions.T])
     near = slopes.whitened(slopes.residuals(free, np.vstack([x, x + moves])))
     residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
@@ -73,19 +74,12 @@ def _principal(covariance: Floats) -> Floats:
     return wide
 
 
-def _inside(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
-    """The move, or its opposite, cut off at the bounds: whichever is longer then."""
-    low, high = ends(free)
-    ways = [np.clip(x + way, low, high) - x for way in (move, -move)]
-    return max(ways, key=lambda way: float(way @ way))
-
-
-def _better(problem: Problem, fit: Fit) -> Fit:
+def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
     prior = np.diag([f.prior**-2 for f in fit.free])
     flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * weights(fit.white)))
     gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
-    trials = np.array([_stepped(fit, hessian, gradient, damping) for damping in DAMPINGS])
+    trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
     residuals = problem.residuals(fit.free, trials)
     white = problem.whitened(residuals)
     held = misfit(white)
@@ -95,3 +89,45 @@ def _better(problem: Problem, fit: Fit) -> Fit:
         return fit
     return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]), residuals=residuals[k],
                    white=white[k])
+
+
+def descended(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> Fit:
+    """A fit after so many rounds of damped Gauss-Newton steps, fewer if some of them gain nothing.
+
+    `flat` (p, k) are the directions that the data do not see.
+    """
+    now, idle = begun, 0
+    for _ in range(rounds):
+        here = sloped(problem, now.free, now.x, now.covariance, flat)
+        there = take_best_step(problem, here)
+        idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
+        now = replace(there, covariance=here.covariance)
+        if idle >= PATIENCE:
+            break
+    return replace(relaxed_along(now, flat), converged=True)
+
+
+def sloped(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
+    """The model at `x` (p,), its Jacobian by differences across the valley, along principal directions there."""
+    places = across(free, flat)
+    basis = np.column_stack([np.eye(len(free))[:, places], flat])
+    inverse = np.linalg.inv(basis)[:len(places)]  # of the coordinates across by all unknowns
+    variances, vectors = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    wide = WIDTH * vectors * np.sqrt(np.clip(variances, 1e-12, 9.0))
+    moves = np.zeros((len(places), len(free)))
+    moves[:, places] = wide.T
+    moves = np.array([cut_at_bounds(free, x, way) for way in moves])
+    white = problem.whitened(residuals := problem.residuals(free, np.vstack([x, x + moves])))
+    steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
+    jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
+    prior = np.diag([f.prior**-2 for f in free])
+    flat_rows = jacobian.reshape(len(free), -1)
+    heavy = (jacobian * weights(white[0])).reshape(len(free), -1)
+    held = float(misfit(white[:1])[0])
+    return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ flat_rows.T + prior),
+               residuals[0], white[0], jacobian)
+
+
+def first_widths(free: Sequence[Free], across: float = 1e-3) -> Floats:
+    """A covariance, (p, p), that gives differences across the valley their first width."""
+    return np.diag([min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4 for f in free])

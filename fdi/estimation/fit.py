@@ -1,9 +1,4 @@
-"""Fits to measured runs: Levenberg-Marquardt on whitened residuals with priors; its trials run side by side in lanes.
-
-What is minimised is the likelihood of blocks of residuals whose noise may be larger than known: a block that is fitted
-counts by its squares, one that is not by the logarithm of its mean square. So no single stop of the ram, made or
-missed, outweighs a whole run, and what is missing is not made up for by parameters that no healthy unit has.
-"""
+"""Fits of a model's unknowns to measured runs: Levenberg-Marquardt with priors, its trials side by side in lanes."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -13,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.estimation.problem import Free, Problem, ends
+from fdi.estimation.likelihood import Problem, misfit, weights
+from fdi.estimation.unknowns import Free, ends
 
 Floats = NDArray[np.float64]
 
-BLOCK = 100  # cycles
-FITTED = 2.0  # mean square of a block up to which it counts as fitted: noise alone gives 1 +- 0.14
-TYPICAL = 0.85  # of the blocks
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 WIDTH = 3.0  # of a difference, in standard deviations of a parameter: wide enough for stick-slip, narrow at the end
 NARROWEST = 0.01  # times the first width
@@ -53,39 +46,6 @@ class Fit:
         return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
 
 
-def blocks(white: Floats) -> Floats:
-    """Sums of squares of whitened residuals (.., n) over blocks: (.., b)."""
-    n = white.shape[-1]
-    padded = np.concatenate([white, np.zeros((*white.shape[:-1], -n % BLOCK))], axis=-1)
-    cut = padded.reshape(*white.shape[:-1], -1, BLOCK)
-    sums: Floats = np.einsum("...i,...i->...", cut, cut)
-    return sums
-
-
-def misfit(white: Floats) -> Floats:
-    """-2 log likelihood of whitened residuals (m, s, n), up to a constant: (m,)."""
-    sums = blocks(white)
-    limit = FITTED * BLOCK
-    beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
-    total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
-    return total
-
-
-def weights(white: Floats) -> Floats:
-    """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
-    sums = blocks(white)
-    each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
-    return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
-
-
-def typical(residuals: Floats) -> Floats:
-    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
-    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
-    kept = squares[:, :max(1, round(TYPICAL * squares.shape[1]))]
-    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
-    return rms
-
-
 def fit(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
     """The most likely parameters near `start` (p,), scaled (default: the centres)."""
     x = np.zeros(len(free)) if start is None else np.array(start, float)
@@ -96,7 +56,7 @@ def improved(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
         gradient, hessian = _normal(now)
-        trials = np.array([_stepped(now, hessian, gradient, damping) for damping in DAMPINGS])
+        trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
         white = problem.whitened(problem.residuals(now.free, trials))
         costs = misfit(white) + (trials**2) @ _prior(now.free)
         k = int(np.argmin(costs))
@@ -157,7 +117,7 @@ def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
     return widths
 
 
-def _stepped(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
+def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
     """A damped Gauss-Newton step within the bounds: what runs into one stays there, and the rest is solved again."""
     low, high = ends(fit.free)
     damped = hessian + np.diag(damping * np.diag(hessian) + 1e-12 * np.trace(hessian) + 1e-12)
@@ -174,3 +134,10 @@ def _stepped(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Flo
         if not open_.any():
             break
     return x
+
+
+def cut_at_bounds(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
+    """The move, or its opposite, cut off at the bounds: whichever is longer then."""
+    low, high = ends(free)
+    ways = [np.clip(x + way, low, high) - x for way in (move, -move)]
+    return max(ways, key=lambda way: float(way @ way))

@@ -1,23 +1,234 @@
-"""The noise of measured signals: how large, of what colour, and the filter that makes it white.
+"""The noise of measured signals: its floor in a residual, its level, its colour, and the filter that makes it white.
 
-Two runs of one command have the model's error in common and the noise not: what differs between their residuals is
-noise. Its level is taken block by block, as a stick-slip event that came a little later also differs.
+Two runs of one command have the model's error in common and the noise not, so rms(r_est - r_repeat)/sqrt 2 is the
+noise, whatever its colour. Only where the model is wrong does it take in more: stick-slip comes a little earlier in one
+run than in the other, and then the model's error differs too. So the floor is built from below: short windows of the
+difference, the quietest first, and on upward as long as they are as large as the quiet ones let expect. Hum that has
+the same phase in every run (the mains start the test, or the test waits for them) is in the difference no more;
+its lines are measured in the quiet windows of each run and added.
 """
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
+from scipy.special import gammainc, gammaincinv, ndtri
+
+from fdi.trace.columns import rms
+from fdi.trace.signals import SIGNALS
+from fdi.trace.trace import Trace
+from plant.effects import CATALOGUE, at
+from plant.model import Model
+from plant.state import Input
 
 Floats = NDArray[np.float64]
 
-BLOCK = 100  # cycles; shorter than most stick-slip events are apart, longer than a period of hum
+WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
+QUIET = 0.2  # the part of all windows that the first guess rests on
+BELIEVED = 0.995  # a window belongs to the noise if noise is as large as that in at most 0.5 % of all windows
+LAGS = 40  # samples, of the noise's autocorrelation
+MAINS = (50.0, 60.0, 400.0)  # Hz, and what is an odd or even multiple of them below half the sampling rate
+HARMONICS = 4
+NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it would look without hum
+LINE = 5.0  # times its neighbours' power; chance does that in one line of 150
+FEWEST = 10  # windows that a search for hum needs
+WHITE_DIFFERENCE = 6.0  # variance of the second difference of white noise, over its own
+FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
+NOISIER = 1.3  # times the noise that the model gives: a signal with more shows its own
+SWEEP = 4000  # positions
 ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
 PARSIMONY = 4.0  # gain in -2 log likelihood that a further coefficient has to bring (Akaike asks for 2)
 CALM = 1.8  # times the median block's variance, up to which a block holds noise alone
 CONSISTENT = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
+
+
+class Floor(NamedTuple):
+    """RMS that the noise alone leaves of a residual, in the residual's unit, and how it is known."""
+
+    value: float
+    source: str  # "repeats", "model" (its sensors.* noise), "data" (second differences), "none"
+    lower_bound: bool = False  # True: the noise is at least that large
+    share: float = 1.0  # of the windows, those that hold noise alone
+    difference: float = float("nan")  # rms(r - r_repeat)/sqrt 2 over all rows: noise, and what did not repeat
+    hum: float = 0.0  # RMS of the mains' lines within `value`
+    freedom: float = 1.0  # independent samples in one, of the noise's square: 1 for white noise, less for coloured
+
+
+def floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats]],
+           period: float = 1e-3) -> dict[str, Floor]:
+    """The floor of each signal from the residuals (n,) of the same model on repeats of one command.
+
+    Rows correspond; NaN is a missing sample. Signals that no repeat has are left out. Lengths may differ at the end.
+    """
+    out = {}
+    for name, r in residual.items():
+        others = [other[name] for other in repeats if name in other]
+        if others:
+            out[name] = from_repeats(r, others, period)
+    return out
+
+
+def from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
+    """The floor of one signal from its residuals (n,), (m,).. under one model."""
+    n = min(len(residual), *(len(r) for r in repeats))
+    runs = [residual[:n], *(r[:n] for r in repeats)]
+    pairs = [(a - b) / np.sqrt(2.0) for a, b in combinations(runs, 2)]
+    difference = float(np.sqrt(np.nanmean(np.concatenate(pairs) ** 2)))
+    lines = hum_lines(runs, period)
+    steady = [_without(r, lines, period) for r in runs]
+    level, share, freedom = quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])
+    hum = float(np.sqrt(sum(power for _, power in lines)))
+    return Floor(float(np.hypot(level, hum)), "repeats", False, share, difference, hum, freedom)
+
+
+def from_data(signal: Floats) -> Floor:
+    """A lower bound from one signal's own second differences, (n,): noise that is not white has less in them."""
+    second = np.abs(np.diff(signal, 2))
+    second = second[~np.isnan(second)]
+    if not len(second):
+        return Floor(0.0, "none", True)
+    # the median, scaled to a standard deviation, does not see the few samples in which the signal itself bends
+    spread = float(np.median(second)) / float(ndtri(0.75))
+    return Floor(spread / np.sqrt(WHITE_DIFFERENCE), "data", True)
+
+
+def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
+    """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
+    out = {}
+    for name in trace.outputs:
+        given, seen = model[SIGNALS[name].noise], from_data(trace.measured(name))
+        given = read_noise(model, trace.xj) if name == "xj" else given
+        found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER * given else seen
+        out[name] = found._replace(value=max(found.value, FINEST[name]))
+    return out
+
+
+def read_noise(model: Model, xj: Floats) -> float:
+    """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
+
+    A sweep through it, as neither is in a replay.
+    """
+    level = model["sensors.position_noise"]
+    law, memory = at("reading", model.effects)
+    if not any(CATALOGUE[name].port == "reading" for name in model.effects):
+        return level
+    noise = level * np.random.default_rng(0).standard_normal(SWEEP)
+    true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
+    s, p, out = model.state(), model.record()[0], np.empty(SWEEP)
+    for k, x in enumerate((true + noise).tolist()):
+        u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
+        out[k], memory = law(x, memory, s, u, p)
+    return rms(out - true)
+
+
+def quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[float, float, float]:
+    """Standard deviation of stationary noise, (n,) each, in which at times something larger happens.
+
+    Also the share of windows that were taken for noise, and their degrees of freedom per sample. A window's mean square
+    is chi-squared with as many degrees of freedom as the noise's autocorrelation leaves it; that says what the quietest
+    windows are to be divided by, and which windows are too large to belong.
+    """
+    pieces = np.concatenate([_windows(x, window) for x in noise])
+    pieces = pieces[np.isnan(pieces).mean(axis=1) < 0.5]
+    if not len(pieces):
+        x = np.concatenate(list(noise))
+        return (float(np.sqrt(np.nanmean(x**2))), 1.0, 1.0) if len(x) and not np.isnan(x).all() else (0.0, 0.0, 1.0)
+    power = np.nanmean(pieces**2, axis=1)
+    order = np.argsort(power)
+    kept = order[:max(1, round(QUIET * len(order)))]
+    level, freedom = float(np.quantile(power, QUIET)), float(window)
+    for _ in range(30):
+        freedom = _freedom(pieces[kept])
+        if not len(kept) or level == 0.0:
+            break
+        if len(kept) == max(1, round(QUIET * len(order))):
+            level = float(np.quantile(power, QUIET)) / _mean_square(QUIET, freedom)
+        limit = _mean_square(BELIEVED, freedom)
+        now = np.flatnonzero(power <= limit * level)
+        below = float(gammainc(freedom / 2 + 1, freedom * limit / 2)) / BELIEVED  # mean of what the limit leaves
+        if len(now) == 0 or np.array_equal(now, kept):
+            break
+        kept, level = now, float(power[now].mean()) / below
+    return float(np.sqrt(level)), len(kept) / len(power), freedom / window
+
+
+def _mean_square(part: float, freedom: float) -> float:
+    """The mean square that this part of all windows stays below: chi-squared over its degrees of freedom."""
+    half: float = gammaincinv(freedom / 2, part)
+    return 2.0 * float(half) / freedom
+
+
+def _windows(x: Floats, window: int) -> Floats:
+    n = len(x) // window * window
+    out: Floats = x[:n].reshape(-1, window)
+    return out
+
+
+def _freedom(pieces: Floats) -> float:
+    """Degrees of freedom of a window's mean square: samples over the sum of the squared autocorrelation."""
+    x = np.nan_to_num(pieces)
+    size = pieces.shape[1]
+    power = float((x**2).sum())
+    if power == 0.0:
+        return float(size)
+    lags = min(LAGS, size - 1)
+    rho = np.array([float((x[:, k:] * x[:, :size - k]).sum()) / power for k in range(1, lags + 1)])
+    fade = 1.0 - np.arange(1, lags + 1) / size
+    alike = float((fade * np.maximum(rho**2 - 1.0 / x.size, 0.0)).sum())
+    return max(1.0, float(size) / (1.0 + 2.0 * alike))
+
+
+def hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, float]]:
+    """(Hz, mean square) of the mains' lines that stand out in the quiet half of the windows of the runs (n,)."""
+    mains = sorted({f * k for f in MAINS for k in range(1, HARMONICS + 1) if f * k < 0.45 / period})
+    grid = np.array([[f, *(f + d for d in NEIGHBOURS)] for f in mains])
+    power = np.zeros(grid.shape)
+    for r in runs:
+        loud = _loudness(r)
+        if np.isfinite(loud).sum() < FEWEST or not grid.size:
+            return []
+        rows = loud <= np.nanquantile(loud, 0.5)
+        power += np.abs(_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
+    line, beside = power[:, 0], power[:, 1:].mean(axis=1)
+    return [(f, float(a - b)) for f, a, b in zip(mains, line, beside, strict=True) if a > LINE * b > 0.0]
+
+
+def _loudness(x: Floats) -> Floats:
+    pieces = _windows(x, WINDOW)
+    if not len(pieces):
+        return np.empty(0)
+    out: Floats = np.mean(pieces**2, axis=1)
+    return out
+
+
+def _phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: float) -> NDArray[np.complex128]:
+    """Amplitude and phase of sines in the chosen windows of x, which are freed of their mean and slope first."""
+    t = np.arange(WINDOW) - (WINDOW - 1) / 2
+    pieces = _windows(x, WINDOW)
+    chosen = np.flatnonzero(rows[:len(pieces)] & ~np.isnan(pieces).any(axis=1))
+    if not len(chosen):
+        return np.zeros(len(frequencies), complex)
+    level = pieces[chosen] - pieces[chosen].mean(axis=1, keepdims=True)
+    level = level - np.outer(np.einsum("ij,j->i", level, t) / np.sum(t**2), t)
+    turn = -2j * np.pi * period * frequencies
+    inside = np.einsum("ij,jk->ik", level, np.exp(np.outer(np.arange(WINDOW), turn)))
+    out: NDArray[np.complex128] = 2.0 / WINDOW * (inside * np.exp(np.outer(chosen * WINDOW, turn))).mean(axis=0)
+    return out
+
+
+def _without(x: Floats, lines: Sequence[tuple[float, float]], period: float) -> Floats:
+    """x without the lines as they stand in it."""
+    if not lines:
+        return x
+    frequencies = np.array([f for f, _ in lines])
+    rows = np.ones(len(x) // WINDOW, bool)
+    wave = np.exp(2j * np.pi * period * np.outer(np.arange(len(x)), frequencies))
+    out: Floats = x - np.einsum("ij,j->i", wave, _phasors(x, rows, frequencies, period)).real
+    return out
 
 
 class Noise(NamedTuple):
@@ -56,7 +267,7 @@ def rounded(noise: Noise, step: float) -> Noise:
     return noise._replace(innovation=float(np.hypot(noise.innovation, step)))
 
 
-def level(difference: Floats, block: int = BLOCK) -> float:
+def level(difference: Floats, block: int = WINDOW) -> float:
     """Standard deviation of noise, (n,), in which now and then something else happens: the median block's."""
     n = len(difference) // block * block
     if n == 0:
@@ -73,8 +284,8 @@ def fitted(residual: Floats, order: int = ORDER) -> Noise:
     sigma = level(x)
     if sigma == 0.0:
         return white(float(np.finfo(float).tiny))
-    size = BLOCK * (len(x) // BLOCK) or len(x)
-    blocks = x[:size].reshape(-1, min(BLOCK, size))
+    size = WINDOW * (len(x) // WINDOW) or len(x)
+    blocks = x[:size].reshape(-1, min(WINDOW, size))
     calm = blocks[(blocks**2).mean(axis=1) <= CALM * sigma**2]  # the others hold a stop that came a little later
     n = calm.size
     pairs = [np.einsum("ij,ij->", calm[:, k:], calm[:, :calm.shape[1] - k]) for k in range(order + 1)]

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.noise_floor import WINDOW
+from fdi.estimation.noise import WINDOW
+from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction
 from fdi.trace.columns import bridge_gaps, rms
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
@@ -32,7 +33,6 @@ FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_fric
 KNIFE = 1e-3  # of a friction level; no simulator, no oil and no seal is known as well as that
 EDGE = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}  # less than that is moved by a little friction without any edge
 SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
-QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
 
 
 class Replay(NamedTuple):
@@ -48,7 +48,7 @@ class Replay(NamedTuple):
 
 def open_loop(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
-    lanes = Lanes(model.replace(QUIET), (), steps)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
     out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if known_start(trace) else None, anchor)
     return {name: out[0, :, i] for i, name in enumerate(OUTPUTS)}
 
@@ -67,7 +67,7 @@ def known_start(trace: Trace) -> bool:
 def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     values = edges(model)
-    lanes = Lanes(model.replace(QUIET), frictions(model), STEPS)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), frictions(model), STEPS)
     position = trace.xj if known_start(trace) else None
     runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
     others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR) for cor in guesses(trace)]
@@ -79,7 +79,7 @@ def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
             undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(trace.measured(name))
     coarse, steps = runs[0], STEPS
     while True:
-        finer = Lanes(model.replace(QUIET), frictions(model), 2 * steps)
+        finer = Lanes(model.replace(WITHOUT_NOISE), frictions(model), 2 * steps)
         fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
         small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
@@ -126,11 +126,7 @@ def edges(model: Model) -> Floats:
     base = np.array([model[name] for name in names])
     shifts = KNIFE * np.eye(len(names))
     values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
-    for static, dynamic in (FRICTIONS[:2], FRICTIONS[2:]):
-        if static in names and dynamic in names:
-            a, b = names.index(static), names.index(dynamic)
-            values[:, b] = np.minimum(values[:, a], values[:, b])
-    return values
+    return limit_dynamic_friction(names, values)
 
 
 def _windows_above(moved: Floats, floor: float) -> Flags:
@@ -156,7 +152,7 @@ def closed_loop(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
     before = round(SETTLED / trace.period)
     com = np.concatenate([np.full(before, trace.com[0]), trace.com])
     load = np.concatenate([np.full(before, trace.load[0]), trace.load])
-    lanes = Lanes(model.replace(QUIET), (), steps)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), com, load)[0, before:]
     whole = {"xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3]}
     left = {name: trace.measured(name) - whole[name] for name in trace.outputs}

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import Fit, misfit
-from fdi.estimation.problem import Free, Problem, ends
+from fdi.estimation.fit import Fit, cut_at_bounds
+from fdi.estimation.likelihood import Problem, misfit
+from fdi.estimation.unknowns import Free, ends
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +32,9 @@ FLAT: tuple[Mapping[str, float], ...] = (
     {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.mass": 1.0, "jack.damping": 1.0, "jack.static_friction": 1.0,
      "jack.dynamic_friction": 1.0, "jack.leakage": 1.0},
 )
+# static friction of the jack is known here by its ratio to the dynamic one, which stays
+FLAT_BY_RATIO = tuple({name: power for name, power in flat.items() if name != "jack.static_friction"}
+             for flat in FLAT)
 
 
 def powers(problem: Problem) -> list[Mapping[str, float]]:
@@ -114,3 +118,50 @@ def relaxed(problem: Problem, found: Fit) -> Fit:
     if cost >= found.cost:
         return found
     return replace(found, x=x, cost=cost, misfit=held, residuals=residuals[0], white=white[0])
+
+
+def flats(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
+    """Directions of `FLAT_BY_RATIO` that hold at `x` (p,) of scaled unknowns in logarithms, as columns (p, k)."""
+    law = problem.model["filter.law"]
+    load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
+    said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
+            {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT_BY_RATIO]
+    ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in said])
+    trials = np.array([cut_at_bounds(free, x, TRIED * way) for way in ways])
+    full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)
+    white = problem.whitened(problem.residuals(free, np.vstack([x, x + trials])))
+    moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
+    found: Floats = ways[full & (moved < LEVEL)].T
+    return found
+
+
+def across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
+    """Places of the unknowns that, with the flat directions (p, k), span all: one of each direction is left out."""
+    left_out = {int(np.argmax(np.abs(column) * [f.name in [next(iter(v)) for v in FLAT_BY_RATIO] for f in free]))
+                for column in flat.T}
+    return np.array([k for k in range(len(free)) if k not in left_out])
+
+
+def relaxed_along(found: Fit, flat: Floats) -> Fit:
+    """The fit moved along the flat directions to where the priors want it, within the bounds: no residual changes."""
+    prior = np.array([f.prior**-2 for f in found.free])
+    low, high = ends(found.free)
+    x = found.x
+    for _ in range(len(flat.T) + 1):
+        pull = flat.T @ (prior * x)
+        way = -flat @ np.linalg.solve(flat.T @ (prior[:, None] * flat), pull) if flat.size else np.zeros(len(x))
+        room = np.where(way > 0.0, high - x, x - low) / np.maximum(np.abs(way), 1e-300)
+        x = np.clip(x + min(1.0, float(room.min())) * way, low, high)
+        if room.min() >= 1.0:
+            break
+        flat = _keep_still(flat, int(np.argmin(room)))
+    cost = found.misfit + float(x**2 @ prior)
+    return replace(found, x=x, cost=cost) if cost < found.cost else found
+
+
+def _keep_still(flat: Floats, k: int) -> Floats:
+    """The directions within the flat ones along which unknown k does not move."""
+    row = flat[k:k + 1]
+    _, _, rows = np.linalg.svd(row)
+    within: Floats = flat @ rows[1:].T
+    return within

@@ -4,9 +4,9 @@ from __future__ import annotations
 from typing import Any
 
 from fdi.comparison.compare import Comparison
-from fdi.output import rendered
 from fdi.report import compare_figures as figures
 from fdi.report.compare_text import SHOWN, amount, block_word, digits, lines, sentence
+from fdi.report.html import load_templates
 
 MOODS = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 ELSEWHERE = ("where", "note")  # labels of lines that have a place of their own on the page
@@ -14,8 +14,7 @@ ELSEWHERE = ("where", "note")  # labels of lines that have a place of their own 
 
 def render(found: Comparison) -> str:
     """The page as text."""
-    return rendered(
-        "compare.html",
+    return load_templates().get_template("compare.html").render(
         title=found.source, verdict=found.verdict, mood=MOODS[found.verdict], why=sentence(found),
         facts=_facts(found), signals=[_signal(found, name) for name in found.signals],
         blocks=[_block(found, name) for name in found.blocks],

@@ -9,8 +9,8 @@ from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit
 from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.runs import Source
-from fdi.output import rendered
 from fdi.report import explain_figures, explain_text
+from fdi.report.html import load_templates
 from fdi.report.numbers import (
     SIGNAL_NAMES,
     SIGNAL_UNITS,
@@ -76,7 +76,7 @@ def ledger(r: Refit, p: Provenance, intervals: Mapping[str, Value], title: str, 
 
 
 def _page(**content: Any) -> str:
-    return rendered("story.html", **{"rows": [], **content})
+    return load_templates().get_template("story.html").render(**{"rows": [], **content})
 
 
 def _runs(sources: Sequence[Source], held: bool) -> list[tuple[str, str]]:

@@ -24,6 +24,20 @@ class Section(NamedTuple):
     rate: float  # m/s, of a ramp; 0 otherwise
 
 
+def describe_section(section: Section, furthest: float = 0.0) -> str:
+    """A section in words; `furthest` m, how far its demand goes.
+
+    >>> describe_section(Section("step", 500, 1500, 0.0, 5e-3, 0.0))
+    'step to 5 mm'
+    """
+    level = f"{1e3 * section.last:.4g} mm"
+    if section.kind == "ramp":
+        return f"ramp at {1e3 * section.rate:.3g} mm/s"
+    if section.kind == "dynamic":
+        return f"motion within {1e3 * furthest:.4g} mm"
+    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
+
+
 def sections(command: Floats, period: float = 1e-3) -> list[Section]:
     """Cut a command, shape (n,) in m, one row per `period` s, into sections that cover it without overlap.
 

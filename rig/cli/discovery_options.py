@@ -58,8 +58,7 @@ def prepare(runs: Runs, progress: Progress, effects: Sequence[str] | None = None
         InputError: a user's law that cannot be compiled and run.
     """
     from fdi.discovery.refit import lean
-    from fdi.estimation.model_unknowns import UNREPLAYED
-    from fdi.estimation.problem import whole
+    from fdi.estimation.unknowns import UNREPLAYED, whole
     from plant.effects import CATALOGUE
     from plant.lanes import warm
     from plant.model import offered

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import NORMAL, ROUGH, Suspicious, Value, fitted, friction_sorted, suspicious
+from fdi.discovery.candidates import NORMAL, ROUGH, Suspicious, Value, fitted, suspicious
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, model_of, refit
 from fdi.discovery.runs import Runs
+from fdi.estimation.unknowns import limit_friction_values
 from fdi.output import write_text
 from fdi.progress import Progress
 from fdi.sources import software
@@ -152,7 +153,7 @@ def _intervals(done: Done) -> dict[str, Value]:
     if done.refit is None:
         return {}
     fit = done.refit.last.hypothesis.fit
-    values = friction_sorted(fit.values)
+    values = limit_friction_values(fit.values)
     halves = {f.name: NORMAL * ROUGH * fit.spread(f.name) for f in fit.free}
     return {name: Value(v, v - halves[name], v + halves[name], "") for name, v in values.items()} | dict(done.effects)
 

@@ -16,8 +16,9 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
+from fdi.estimation.final_rounds import sloped
 from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.valley import flats, relaxed, sloped
+from fdi.estimation.unidentifiable import flats, relaxed_along
 from plant import Model, load_model
 from rig.studies.campaign.case import simulate_case
 from rig.studies.campaign.matrix import build_matrix
@@ -92,7 +93,7 @@ def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
     here = sloped(problem, found.free, found.x, found.covariance, flat)
     along = np.abs(np.tensordot(flat.T, here.jacobian, 1)).max()
     assert along < 1e-6 * np.abs(here.jacobian).max() * np.abs(flat).max()
-    away = relaxed(here, flat)
+    away = relaxed_along(here, flat)
     pull = flat.T @ (np.array([f.prior**-2 for f in found.free]) * away.x)
     assert np.abs(pull).max() < 1e-6 * np.abs(flat).max()
 

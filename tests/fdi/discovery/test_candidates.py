@@ -7,7 +7,7 @@ import numpy as np
 
 from fdi.discovery.candidates import Answer, Candidate, Value, fitted
 from fdi.estimation.fit import Fit
-from fdi.estimation.problem import Free
+from fdi.estimation.unknowns import Free
 from plant import Model
 
 

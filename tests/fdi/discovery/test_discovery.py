@@ -14,7 +14,7 @@ from fdi.discovery.residual_pattern import Pattern, curve, wave, write_effect
 from fdi.discovery.scan import tones
 from fdi.discovery.search import Search, common
 from fdi.discovery.significance import Sensitivity, p_value, smallest_visible
-from fdi.estimation.fit import BLOCK, FITTED, misfit, weights
+from fdi.estimation.likelihood import BLOCK, FITTED, misfit, weights
 from fdi.estimation.noise import fitted, level
 from fdi.estimation.preparation import hold_inputs
 from fdi.trace.trace import Trace

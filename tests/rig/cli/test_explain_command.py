@@ -11,7 +11,7 @@ from effect_files import HEAD, restored_catalogue
 from rig_command import Said, rig
 from short_runs import HIDDEN, command, measured, words
 
-from fdi.estimation.model_unknowns import effects_of, free_of, unknowns_of
+from fdi.estimation.unknowns import effects_of, free_of, unknowns_of
 from fdi.report import numbers as spoken
 from plant import Model
 from plant.effects import CATALOGUE

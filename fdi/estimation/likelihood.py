@@ -1,76 +1,32 @@
-"""A model with parameters to be found, held against measured runs: many trial values at once."""
+"""The likelihood of measured runs under a model: replays of many trial values at once, whitened, counted by blocks.
+
+Blocks of residuals may hold more noise than is known: a block that is fitted counts by its squares, one that is not by
+the logarithm of its mean square. So no single stop of the ram, made or missed, outweighs a whole run, and physics that
+is missing is not made up for by parameters that no healthy unit has.
+"""
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise import Noise
+from fdi.estimation.replay import ANCHOR
+from fdi.estimation.unknowns import Free, limit_dynamic_friction
 from fdi.trace.trace import Trace
-from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
-from plant.model import Model, meaning, offered
+from plant.model import Model
 from plant.threads import mapped
 
 Floats = NDArray[np.float64]
 
 STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
-ANCHOR = 20.0  # 1/s; a free replay adds up every bias for ever, this one forgets within 50 ms
-FURTHEST = 5.0  # tolerances that a healthy unit may be off; beyond, something is wrong with it
-TURNING = 2e-3  # Hz, first difference of a frequency: a small part of a turn over a test
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
-QUIET = {f"sensors.{q}_noise": 0.0 for q in ("position", "pressure", "spool")}
-
-
-class Free(NamedTuple):
-    """A parameter that a fit may change. Fits work on x = (value - centre) / scale."""
-
-    name: str
-    centre: float
-    scale: float
-    prior: float  # standard deviation of x that is known beforehand; inf: nothing is
-    low: float
-    high: float
-    step: float  # of x, for differences
-
-    def value(self, x: float) -> float:
-        """The parameter in SI units, within what is possible."""
-        return min(max(self.centre + self.scale * x, self.low), self.high)
-
-
-def ends(free: Sequence[Free]) -> tuple[Floats, Floats]:
-    """The least and the most that scaled unknowns, (p,), can be."""
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
-    return low, high
-
-
-def tolerances(model: Model) -> tuple[Free, ...]:
-    """The parameters in which one healthy unit differs from another, each with its tolerance as prior."""
-    usual = model.kind.nominal
-    free = []
-    for name, value in model.values.items():
-        q = meaning(name, plant=model.plant)
-        if (tolerance := model.kind.tolerance(name, q)) > 0.0:
-            scale = tolerance * (abs(usual.get(name, value)) or 1.0)
-            low, high = value - FURTHEST * scale, value + FURTHEST * scale
-            free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
-    return tuple(free)
-
-
-def unknowns(effect: Effect, model: Model) -> tuple[Free, ...]:
-    """The parameters of an effect that is to be fitted: nothing is known of them but the possible range."""
-    usual, free = model.kind.nominal, []
-    for name in effect.fitted:
-        q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
-        sizes = sorted(abs(start[name] - off) for start in effect.starts)
-        scale = sizes[len(sizes) // 2] or 1.0
-        step = TURNING / scale if q.unit == "Hz" else 0.05
-        free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), step))
-    return tuple(free)
+BLOCK = 100  # cycles
+FITTED = 2.0  # mean square of a block up to which it counts as fitted: noise alone gives 1 +- 0.14
 
 
 @dataclass
@@ -110,7 +66,8 @@ class Problem:
     def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
         values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])
-        return self.left(self.predict([f.name for f in free], _sorted_friction(free, values)))
+        names = [f.name for f in free]
+        return self.left(self.predict(names, limit_dynamic_friction(names, values)))
 
     def left(self, predicted: Floats) -> Floats:
         """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
@@ -139,23 +96,34 @@ def mains(n: int, period: float) -> Floats:
     return waves
 
 
-def _sorted_friction(free: Sequence[Free], values: Floats) -> Floats:
-    """Dynamic friction is never above static friction: trial values of a fit are made so."""
-    names = [f.name for f in free]
-    for body in ("spool", "jack"):
-        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
-        if static in names and dynamic in names:
-            i, j = names.index(static), names.index(dynamic)
-            values[:, j] = np.minimum(values[:, i], values[:, j])
-    return values
+def blocks(white: Floats) -> Floats:
+    """Sums of squares of whitened residuals (.., n) over blocks: (.., b)."""
+    n = white.shape[-1]
+    padded = np.concatenate([white, np.zeros((*white.shape[:-1], -n % BLOCK))], axis=-1)
+    cut = padded.reshape(*white.shape[:-1], -1, BLOCK)
+    sums: Floats = np.einsum("...i,...i->...", cut, cut)
+    return sums
 
 
-def whole(model: Model) -> Model:
-    """The model without sensor noise and with all effects that its plant may have, at their off values."""
-    return quiet(model.having(e.name for e in offered(model.plant) if not e.disturbance))
+def misfit(white: Floats) -> Floats:
+    """-2 log likelihood of whitened residuals (m, s, n), up to a constant: (m,)."""
+    sums = blocks(white)
+    limit = FITTED * BLOCK
+    beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
+    total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
+    return total
 
 
-def quiet(model: Model) -> Model:
-    """The model without sensor noise and rounding: these are what fits allow for."""
-    readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
-    return model.replace(QUIET | {name: value for e in readings for name, value in e.off.items()})
+def weights(white: Floats) -> Floats:
+    """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
+    sums = blocks(white)
+    each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
+    return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
+
+
+def typical(residuals: Floats, share: float = 0.85) -> Floats:
+    """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
+    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
+    kept = squares[:, :max(1, round(share * squares.shape[1]))]
+    rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
+    return rms

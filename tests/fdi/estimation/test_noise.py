@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from noisy_traces import LEVELS, noise
 
-from fdi.estimation.noise_floor import floors, from_data, from_repeats, hum_lines, quiet_level
+from fdi.estimation.noise import floors, from_data, from_repeats, hum_lines, quiet_level
 
 ROWS = 13_500
 

@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.replay import ANCHOR, QUIET, known_start
+from fdi.estimation.replay import ANCHOR, known_start
+from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerances
 from fdi.trace.columns import rms
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
-from plant.model import Model, meaning
+from plant.model import Model
 
 Floats = NDArray[np.float64]
 
@@ -38,19 +39,12 @@ class Scatter(NamedTuple):
     enough: bool  # within reach of the floor
 
 
-def tolerances(model: Model) -> dict[str, float]:
-    """The parameters that scatter from unit to unit, with one tolerance in SI units."""
-    known = {name: model.kind.tolerance(name, meaning(name, plant=model.plant)) * abs(model[name])
-             for name in model.names()}
-    return {name: size for name, size in known.items() if size > 0.0}
-
-
 def scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
     known = tolerances(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
-    lanes = Lanes(model.replace(QUIET), list(known), STEPS)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), STEPS)
     measured = np.array([trace.measured(name) for name in trace.outputs])
     columns = [OUTPUTS.index(name) for name in trace.outputs]
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
@@ -58,7 +52,8 @@ def scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
 
     def residual(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
-        out = lanes.replay(_possible(list(known), base + x * size), trace.cor, trace.load, position, ANCHOR)
+        values = limit_dynamic_friction(list(known), base + x * size)
+        out = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
         left: Floats = np.nan_to_num((measured - out.transpose(0, 2, 1)[:, columns]) / scale)
         return left.reshape(len(x), -1)
 
@@ -80,13 +75,3 @@ def scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     error = {name: ratio[name] * floor[name] for name in ratio}
     moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
     return Scatter(error, ratio, moved, max(ratio.values()) < SCATTER)
-
-
-def _possible(names: list[str], values: Floats) -> Floats:
-    """Dynamic friction stays below static friction."""
-    for body in ("jack", "spool"):
-        pair = [f"{body}.{kind}_friction" for kind in ("static", "dynamic")]
-        if all(name in names for name in pair):
-            a, b = (names.index(name) for name in pair)
-            values[:, b] = np.minimum(values[:, a], values[:, b])
-    return values

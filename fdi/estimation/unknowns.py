@@ -1,0 +1,136 @@
+"""What a fit may change: the tolerances of a unit, the parameters of effects, and what is known of them beforehand."""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.effects import CATALOGUE, Effect
+from plant.model import Model, meaning, offered
+
+Floats = NDArray[np.float64]
+
+FURTHEST = 5.0  # tolerances that a healthy unit may be off; beyond, something is wrong with it
+UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
+WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
+
+
+class Free(NamedTuple):
+    """A parameter that a fit may change. Fits work on x = (value - centre) / scale."""
+
+    name: str
+    centre: float
+    scale: float
+    prior: float  # standard deviation of x that is known beforehand; inf: nothing is
+    low: float
+    high: float
+    step: float  # of x, for differences
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units, within what is possible."""
+        return min(max(self.centre + self.scale * x, self.low), self.high)
+
+
+def ends(free: Sequence[Free]) -> tuple[Floats, Floats]:
+    """The least and the most that scaled unknowns, (p,), can be."""
+    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    return low, high
+
+
+def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
+    """Of the named parameters those that differ from one healthy unit to the next, with one tolerance as a fraction."""
+    found = {name: model.kind.tolerance(name, meaning(name, plant=model.plant)) for name in names}
+    return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
+
+
+def tolerances(model: Model) -> dict[str, float]:
+    """The parameters that differ from one healthy unit to the next, with one tolerance in SI units."""
+    found = relative_tolerances(model, model.names())
+    sizes = {name: tolerance * abs(model[name]) for name, tolerance in found.items()}
+    return {name: size for name, size in sizes.items() if size > 0.0}
+
+
+def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
+    """The same as unknowns of a fit, each with its tolerance as prior.
+
+    The tolerance is a fraction of the nominal value, so that it does not depend on the model's own.
+    """
+    usual = model.kind.nominal
+    free = []
+    for name, tolerance in relative_tolerances(model, model.values).items():
+        value, q = model.values[name], meaning(name, plant=model.plant)
+        scale = tolerance * (abs(usual.get(name, value)) or 1.0)
+        low, high = value - FURTHEST * scale, value + FURTHEST * scale
+        free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
+    return tuple(free)
+
+
+def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tuple[Free, ...]:
+    """The parameters of an effect that is to be fitted: nothing is known of them but the possible range.
+
+    `turning`, Hz, is the first difference of a frequency: a small part of a turn over a test.
+    """
+    usual, free = model.kind.nominal, []
+    for name in effect.fitted:
+        q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
+        sizes = sorted(abs(start[name] - off) for start in effect.starts)
+        scale = sizes[len(sizes) // 2] or 1.0
+        step = turning / scale if q.unit == "Hz" else 0.05
+        free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), step))
+    return tuple(free)
+
+
+def effects_of(model: Model) -> tuple[str, ...]:
+    """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
+    return tuple(e.name for e in offered(model.plant)
+                 if (_off_nominal(e, model) if e.base else e.name in model.effects and e.acts(model.values)))
+
+
+def unknowns_of(model: Model) -> tuple[Free, ...]:
+    """The parameters of these effects, to be fitted from the values they have; nothing else is known of them."""
+    replayed = [CATALOGUE[name] for name in effects_of(model) if CATALOGUE[name].port not in UNREPLAYED]
+    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in effect_unknowns(e, model))
+
+
+def free_of(model: Model) -> tuple[Free, ...]:
+    """All that is free in a model: tolerances, and the parameters of the effects that it has."""
+    own = unknowns_of(model)
+    taken = {u.name for u in own}
+    return (*(f for f in tolerance_unknowns(model) if f.name not in taken), *own)
+
+
+def _off_nominal(e: Effect, model: Model) -> bool:
+    usual = model.kind.nominal
+    tolerance = model.kind.tolerance
+    return any(abs(model[name] - usual[name]) > (FURTHEST * tolerance(name, q) + 1e-12) * abs(usual[name])
+               for name, q in e.parameters.items())
+
+
+def limit_dynamic_friction(names: Sequence[str], values: Floats) -> Floats:
+    """Values (.., p) of named parameters, changed in place: dynamic friction is at most the static friction."""
+    for body in ("jack", "spool"):
+        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
+        if static in names and dynamic in names:
+            i, j = names.index(static), names.index(dynamic)
+            values[..., j] = np.minimum(values[..., i], values[..., j])
+    return values
+
+
+def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
+    """Parameters by name, in which dynamic friction is at most the static friction."""
+    names = [name for name in values if name.endswith("_friction")]
+    limited = limit_dynamic_friction(names, np.array([values[name] for name in names]))
+    return {**values, **dict(zip(names, limited.tolist(), strict=True))}
+
+
+def whole(model: Model) -> Model:
+    """The model without sensor noise and with all effects that its plant may have, at their off values."""
+    return quiet(model.having(e.name for e in offered(model.plant) if not e.disturbance))
+
+
+def quiet(model: Model) -> Model:
+    """The model without sensor noise and rounding: these are what fits allow for."""
+    readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
+    return model.replace(WITHOUT_NOISE | {name: value for e in readings for name, value in e.off.items()})
