@@ -25,7 +25,7 @@ from fdi.estimation.final_rounds import descended, first_widths
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem, misfit, typical
 from fdi.estimation.unidentifiable import flats
-from fdi.estimation.unknowns import Free, effect_unknowns, free_of, quiet
+from fdi.estimation.unknowns import Free, effect_unknowns, free_of, limit_dynamic_friction, quiet
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
@@ -109,9 +109,7 @@ def compute_values(free: Sequence[Free], x: Floats) -> Floats:
     for k, f in enumerate(free):
         if isinstance(f, LogFrictionRatio):
             found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
-    i, j = names.index("spool.static_friction"), names.index("spool.dynamic_friction")
-    found[j] = min(found[i], found[j])
-    return found
+    return limit_dynamic_friction(names, found)
 
 
 def get_positive(model: Model, name: str) -> float:
