@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
 import re
@@ -113,11 +114,21 @@ def test_every_link_has_a_target() -> None:
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_names_in_the_text_exist(page: Path) -> None:
+    text = page.read_text()
+    for path in re.findall(r"`((?:plant|fdi|rig|dbc|tests|docs)/[\w./]*)`", text):
+        assert (ROOT / path).exists(), path
+    for dotted in re.findall(r"`((?:plant|fdi|rig)(?:\.\w+)+)", text):
+        module, _, attribute = dotted.rpartition(".")
+        assert hasattr(importlib.import_module(module), attribute), dotted
+
+
 def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= 150
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_figure_has_a_caption(page: Path) -> None:
     """A line in italics below the figure that says what to see in it."""
     lines = page.read_text().splitlines()
