@@ -1,7 +1,7 @@
 """Cases of the blind trial: `python -m rig.studies.trial.cases --out DIR --count N --seed S` writes traces.
 
-A case is a folder with est.csv.gz (preflight command), repeat.csv.gz (the same, other noise) and holdout.csv.gz
-(another command); truth.toml says what is hidden. Everything follows from the seed.
+A case is a folder with the traces est.csv.gz (the preflight command), repeat.csv.gz (the same command, other noise) and
+holdout.csv.gz (another command), and with truth.toml (the hidden effects). Everything follows from the seed.
 """
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from rig.studies.trial.truth import PERIOD, Run, nominal_symbols, simulate_truth
 Array = NDArray[np.float64]
 
 KINDS = {"nothing": 0.20, "one": 0.50, "two": 0.12, "outside": 0.18}
+"""What is hidden, with its probability: nothing, effects of the catalogue, or one outside the catalogue."""
 SIGNALS = {"xj": 0.25, "xj,p12": 0.25, "xj,p12,xs": 0.5}
+"""The measured signals, with their probability."""
 FLOORS = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
 """RMS noise of the sensors: m, Pa, m."""
 SCATTERED_SYMBOLS = ("GM", "JF", "BF", "KF", "KSF", "GQF", "GPF", "GQ", "GP", "PSR", "AJ", "MJ", "CJ", "FSJ", "FDJ",
                      "CLK")
-BETWEEN = 20  # cycles over which positions are compared when their slow drift shall not count
-HUM_HZ, HUM_PHASE = 50.0, 1.0
-LOADED = 0.1  # of the cases that do not need a known load have one
+"""The parameters with a tolerance."""
 
 
 class BenchLevel(NamedTuple):
-    """How far the bench is from ideal."""
+    """How far plant and bench are from ideal."""
 
     scatter: float  # standard deviation of the plant's parameters, relative
     colour: float  # correlation of the position sensor's noise from one cycle to the next
-    hum: float  # m, amplitude of the mains on the position sensor
+    hum: float  # m, amplitude of the mains hum on the position sensor
 
 
 LEVELS = {"exact": BenchLevel(0.0, 0.0, 0.0), "bench": BenchLevel(0.015, 0.8, 0.7e-6)}
 
 
 class Case(NamedTuple):
-    """What is hidden in a case, and all else that makes its traces."""
+    """The hidden effects of a case, and everything else that its traces depend on."""
 
     seed: int
     kind: str
@@ -52,42 +52,51 @@ class Case(NamedTuple):
     signals: str
     level: BenchLevel
     plant: dict[str, float]  # symbols of the healthy plant that differ from nominal
-    load: float  # N, of the known load
+    load: float  # N, known load
 
 
 def draw_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
               sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
-    """The case of a seed; `kind`, the effects' names and the level ("exact", "bench") leave the rest to chance.
+    """The case of a seed.
 
-    `sizes` are fractions of the logarithmic range that a size is drawn from; of two effects both are in its upper half.
+    Args:
+        seed: what the random numbers follow from.
+        kind: one of KINDS; default: random.
+        effects: names of the hidden effects; default: random.
+        level: one of LEVELS; default: random.
+        sizes: the fractions of an effect's logarithmic range that its size is drawn from. Of two effects both are in
+            the upper half of their range.
     """
     rng = np.random.default_rng([seed, 3])
     kind = kind or ("one" if effects else str(rng.choice(list(KINDS), p=list(KINDS.values()))))
-    drawn = _draw_level(rng)
-    quality = LEVELS[level] if level else drawn
+    random_level = _draw_level(rng)
+    bench = LEVELS[level] if level else random_level
     signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
-    plant = draw_healthy_plant(quality.scatter, rng)
+    plant = draw_healthy_plant(bench.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
-    found = tuple(hidden.draw_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
+    drawn = tuple(hidden.draw_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
                   for name in effects or _draw_effect_names(kind, rng))
-    needed = max((effect.known_load for effect in found), default=0.0)
-    chance = float(rng.uniform(2000, 8000)) if rng.random() < LOADED and quality.scatter > 0 else 0.0
-    return Case(seed, kind, found, signals, quality, plant, needed or chance)
+    load = max((effect.known_load for effect in drawn), default=0.0)
+    is_loaded = rng.random() < 0.1 and bench.scatter > 0  # one in ten of the cases that do not need a known load
+    random_load = float(rng.uniform(2000, 8000)) if is_loaded else 0.0
+    return Case(seed, kind, drawn, signals, bench, plant, load or random_load)
 
 
 def draw_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
-    """The symbols of a healthy plant, each off its nominal value by the standard deviation `spread`, relative."""
-    return {symbol: nominal_symbols()[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED_SYMBOLS}
+    """The parameters of a healthy plant, by symbol; `spread` is their relative standard deviation about nominal."""
+    nominal = nominal_symbols()
+    return {symbol: nominal[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED_SYMBOLS}
 
 
 def _draw_level(rng: np.random.Generator) -> BenchLevel:
-    """Scatter 0 to 2 %; noise white in one case of three, else coloured and with hum."""
+    """A scatter of 0 to 2 %; white noise in one case of three, otherwise coloured noise with hum."""
     scatter, white = float(rng.uniform(0, 0.02)), rng.random() < 1 / 3
     colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
     return BenchLevel(scatter, 0.0, 0.0) if white else BenchLevel(scatter, colour, hum)
 
 
 def _draw_effect_names(kind: str, rng: np.random.Generator) -> list[str]:
+    """The names of a kind's hidden effects, without pairs that cannot be hidden together."""
     if kind == "nothing":
         return []
     if kind == "outside":
@@ -99,7 +108,7 @@ def _draw_effect_names(kind: str, rng: np.random.Generator) -> list[str]:
 
 
 def list_changed_symbols(case: Case, without: Iterable[str] = ()) -> dict[str, float]:
-    """The plant's symbols that differ from nominal, some of the hidden effects left out."""
+    """The plant's symbols that differ from nominal; the effects `without` are left out."""
     changes = dict(case.plant)
     for effect in case.effects:
         if effect.name not in without:
@@ -108,14 +117,14 @@ def list_changed_symbols(case: Case, without: Iterable[str] = ()) -> dict[str, f
 
 
 class Measured(NamedTuple):
-    """A trace, and the noise in it, both one row a cycle."""
+    """A trace and the noise in it, one row per cycle."""
 
     trace: Run
     noise: dict[str, Array]
 
 
 def measure_case(case: Case, name: str) -> Measured:
-    """Trace `name` ("est", "repeat" or "holdout") of a case as its bench records it."""
+    """The trace `name` ("est", "repeat" or "holdout") of a case as its bench records it."""
     turn = ("est", "repeat", "holdout").index(name)
     rng = np.random.default_rng([case.seed, 5, turn])
     com = np.round(command.draw_holdout_command(rng) if name == "holdout" else command.preflight_command(), 12)
@@ -127,38 +136,41 @@ def measure_case(case: Case, name: str) -> Measured:
 
 
 def draw_position_noise(n: int, level: BenchLevel, rng: np.random.Generator) -> Array:
-    """Noise of the position sensor, (n,) m: first order, of the floor's RMS, and hum."""
+    """Noise of the position sensor, (n,) m: first-order noise with the RMS of the noise floor, and hum of 50 Hz."""
     white, colour = FLOORS["xj"] * rng.standard_normal(n), level.colour
-    out, last = np.empty(n), float(white[0])
-    for k, x in enumerate((np.sqrt(1 - colour**2) * white).tolist()):
-        out[k] = last = colour * last + x if k else last
-    out += level.hum * np.sin(2 * np.pi * HUM_HZ * PERIOD * np.arange(n) + HUM_PHASE)
-    return out
+    noise, last = np.empty(n), float(white[0])
+    noise[0] = last
+    for k, innovation in enumerate((np.sqrt(1 - colour**2) * white).tolist()[1:], start=1):
+        noise[k] = last = colour * last + innovation
+    noise += level.hum * np.sin(2 * np.pi * 50.0 * PERIOD * np.arange(n) + 1.0)
+    return noise
 
 
 def measure_effect_ratios(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, float]:
-    """What an effect does to a trace, over the sensors' floors: replay from the measured Cor of the same plant without.
+    """The RMS effect on each signal in noise floors: the trace against a replay of the plant `without` the effects.
 
-    `xj_drift` counts the position as it drifts off, `xj` its differences over 20 cycles; `cor` is the answer's
-    departure from the control law, over what the position's floor does to it.
+    The replay is driven by the measured current. `xj_drift` is the whole difference in position, which drifts; `xj` is
+    its change over 20 cycles. `cor` is the difference between the controller's answer and the control law, in units of
+    what the position's noise floor does to the answer.
     """
-    run, noise, floor = measured.trace, measured.noise, FLOORS
+    run, noise = measured.trace, measured.noise
     bare = simulate_truth(run.com, list_changed_symbols(case, without), None, run.load, run.cor)
-    xj = run.xj - noise["xj"] - bare.xj
+    xj, lag = run.xj - noise["xj"] - bare.xj, 20
     p = nominal_symbols()
     law = np.clip(p["GAP"] * (run.com - run.xj), -p["Imax"], p["Imax"])
-    return {"xj": _rms(xj[BETWEEN:] - xj[:-BETWEEN]) / (floor["xj"] * 2**0.5), "xj_drift": _rms(xj) / floor["xj"],
-            "p12": _rms(run.p12 - noise["p12"] - bare.p12) / floor["p12"],
-            "xs": _rms(run.xs - noise["xs"] - bare.xs) / floor["xs"],
-            "cor": _rms(run.cor - law) / (p["GAP"] * floor["xj"])}
+    return {"xj": _measure_rms(xj[lag:] - xj[:-lag]) / (FLOORS["xj"] * 2**0.5),
+            "xj_drift": _measure_rms(xj) / FLOORS["xj"],
+            "p12": _measure_rms(run.p12 - noise["p12"] - bare.p12) / FLOORS["p12"],
+            "xs": _measure_rms(run.xs - noise["xs"] - bare.xs) / FLOORS["xs"],
+            "cor": _measure_rms(run.cor - law) / (p["GAP"] * FLOORS["xj"])}
 
 
-def _rms(x: Array) -> float:
+def _measure_rms(x: Array) -> float:
     return float(np.sqrt((x**2).mean()))
 
 
 def write_case(case: Case, folder: Path) -> None:
-    """The case's traces and truth.toml into `folder`, made if need be."""
+    """Write the traces and truth.toml of a case into `folder`, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("est", "repeat", "holdout"):
         measured = measure_case(case, name)
@@ -171,11 +183,12 @@ def _write_trace(run: Run, path: Path) -> None:
     rows = np.column_stack([run.com, run.xj, run.cor, run.p12, run.xs, run.load]).tolist()
     lines = [f"{k / 1000:.3f},%.9g,%.9g,%.9g,%.9g,%.9g,%.9g" % tuple(row) for k, row in enumerate(rows)]
     text = "\n".join(["t,com,xj,cor,p12,xs,load", *lines, ""])
-    path.write_bytes(gzip.compress(text.encode(), compresslevel=4, mtime=0))  # no time: repeats to the byte
+    # without a time stamp: the same case gives the same bytes
+    path.write_bytes(gzip.compress(text.encode(), compresslevel=4, mtime=0))
 
 
 def _format_truth(case: Case, est: Measured) -> str:
-    """What is hidden, as TOML."""
+    """The hidden effects and the plant of a case, as TOML."""
     names = [effect.name for effect in case.effects]
     lines = [f"seed = {case.seed}", f"kind = {json.dumps(case.kind)}", f"effects = {json.dumps(names)}",
              f"signals = {json.dumps(case.signals)}", f"known_load = {case.load:.6g}", "", "[level]",
@@ -197,15 +210,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Write cases to a folder; see --help."""
     parser = argparse.ArgumentParser(prog="python -m rig.studies.trial.cases",
                                      description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder to make the cases' folders in")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the folders of the cases")
     parser.add_argument("--count", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0, help="of the first case; the next has the next")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first case; each case uses the next seed")
     parser.add_argument("--kind", choices=list(KINDS))
     parser.add_argument("--effect", action="append", default=[], choices=[*hidden.CATALOGUE, *hidden.OUTSIDE],
-                        help="the hidden effect; twice for two")
-    parser.add_argument("--level", choices=list(LEVELS), help="default: scatter and noise drawn, too")
+                        help="the hidden effect; give it twice to hide two")
+    parser.add_argument("--level", choices=list(LEVELS), help="scatter and noise of the bench (default: random)")
     parser.add_argument("--sizes", type=float, nargs=2, default=(0.0, 1.0), metavar=("LOW", "HIGH"),
-                        help="part of the logarithmic range of sizes, 0 to 1")
+                        help="fractions of the logarithmic range of sizes (default: 0 1)")
     args = parser.parse_args(arguments)
     for seed in range(args.seed, args.seed + args.count):
         kind = args.kind or ("two" if len(args.effect) > 1 else None)

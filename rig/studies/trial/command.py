@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MM = 1e-3
-CYCLES_PER_SECOND = 1000  # a second
+CYCLES_PER_SECOND = 1000
 
 
 def _hold(level: float, seconds: float) -> Array:
@@ -20,7 +20,7 @@ def _ramp(start: float, end: float, seconds: float) -> Array:
 
 
 def preflight_command() -> Array:
-    """The preflight command, (13500,) m, one value a cycle."""
+    """The command of the preflight check, (13500,) m, one value per cycle."""
     t = np.arange(2 * CYCLES_PER_SECOND) / CYCLES_PER_SECOND
     chirp = MM * np.sin(2 * np.pi * (t + 4.75 * t**2)) * (1 - np.exp(-20 * t))
     return np.concatenate([
@@ -49,6 +49,6 @@ def draw_holdout_command(rng: np.random.Generator) -> Array:
 
 
 def known_load_profile(n: int, force: float) -> Array:
-    """The force of a loaded trace, (n,) N: on from 30 % of the time, reversed at 50, off at 70."""
+    """The force of a loaded trace, (n,) N: on at 30 % of the time, reversed at 50 %, off at 70 %."""
     part = np.arange(n) / n
     return force * (((part > 0.3) & (part < 0.5)).astype(float) - ((part >= 0.5) & (part < 0.7)))

@@ -1,7 +1,7 @@
-"""What the trial hides: the catalogue's effects as docs/physics.md lists them, and some that no catalogue has.
+"""The effects that the trial hides: those of the catalogue as docs/physics.md lists them, and some outside it.
 
-Written from the table alone, in the symbols of truth.c. A size is drawn log-uniformly from about the sensors' floor to
-the large end of what is typical.
+They are written from that table alone, in the symbols of truth.c. Sizes are drawn log-uniformly, from about the noise
+floor of the sensors to the large end of the typical range.
 """
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 Symbols = Mapping[str, float]
-CHAMBERS = 1.5e-4  # m3, V of compressibility
-KNOWN_LOAD = 6000.0  # N, without which a leak across the piston cannot be seen
+CHAMBERS = 1.5e-4  # m3, volume V of compressibility
+KNOWN_LOAD = 6000.0  # N; without a load, leakage across the piston is not detectable
 
 
 class HiddenLaw(NamedTuple):
-    """An effect to hide: sizes from `low` to `high`, and what a size does to the plant's symbols.
+    """An effect to hide: its sizes from `low` to `high`, and how a size changes the plant's symbols.
 
-    `shown` is the symbol, among what `apply` gives, that has the meaning of the first parameter that a fit frees.
+    `shown` is the changed symbol that means the same as the effect's first fitted parameter.
     """
 
     low: float
@@ -26,13 +26,13 @@ class HiddenLaw(NamedTuple):
     apply: Callable[[float, Symbols], dict[str, float]]
     shown: str = ""
     signed: bool = False
-    extra: Mapping[str, tuple[float, float]] = {}  # further symbols, drawn log-uniformly from low to high
-    choices: Mapping[str, tuple[float, ...]] = {}  # further symbols, one of the values: what the table leaves open
-    known_load: float = 0.0  # N, what such a case needs to show
+    extra: Mapping[str, tuple[float, float]] = {}  # further symbols, log-uniform from low to high
+    choices: Mapping[str, tuple[float, ...]] = {}  # further symbols, one of the values (open in the table)
+    known_load: float = 0.0  # N, needed to detect the effect
 
 
 class Hidden(NamedTuple):
-    """One effect of one size."""
+    """An effect with a size."""
 
     name: str
     size: float
@@ -57,17 +57,18 @@ def draw_hidden_effect(name: str, plant: Symbols, rng: np.random.Generator, low:
     return Hidden(name, size, changes, value, law.known_load)
 
 
-def _set_symbol(symbol: str, factor: float = 1.0) -> Callable[[float, Symbols], dict[str, float]]:
-    return lambda x, p: {symbol: factor * x}
+def _set_symbol(symbol: str) -> Callable[[float, Symbols], dict[str, float]]:
+    """The symbol set to x."""
+    return lambda x, p: {symbol: x}
 
 
 def _grow_symbols(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
-    """The symbols grown by the fraction x."""
+    """Each symbol times 1 + x."""
     return lambda x, p: {symbol: p[symbol] * (1.0 + x) for symbol in symbols}
 
 
 def _scale_symbols(*symbols: str) -> Callable[[float, Symbols], dict[str, float]]:
-    """The symbols times exp(x): as far down as up."""
+    """Each symbol times exp(x), which is symmetric in the sign of x."""
     return lambda x, p: {symbol: p[symbol] * float(np.exp(x)) for symbol in symbols}
 
 
@@ -130,12 +131,12 @@ OUTSIDE: dict[str, HiddenLaw] = {
     "drag quadratic in speed": HiddenLaw(1e5, 2e6, _set_symbol("drag2")),
     "transducer quadratic in position": HiddenLaw(3, 20, _set_symbol("sensor_square"), signed=True),
 }
-"""Effects that the catalogue does not have. Some need a size at which no catalogue effect can take their place."""
+"""Effects outside the catalogue, of sizes at which no effect of the catalogue can replace them."""
 NOT_SIMULATED = ("soft", "mu", "deflection")
-"""Entries of `changes` that only say a size in the unit a fit reports."""
+"""Entries of `changes` that the simulator does not have: they give the size in the unit of the fit."""
 EXCLUDES = (
     {"stribeck", "presliding"}, {"jack_friction", "presliding"}, {"compressibility", "orifice_root"},
     {"spool_overlap", "spool_underlap"}, {"viscous_drag", "viscosity_drift"}, {"friction_asymmetry", "presliding"},
     {"internal_leakage", "viscosity_drift"},
 )
-"""Pairs that cannot be hidden together: they set the same thing."""
+"""Pairs that cannot be hidden together, because they change the same quantity."""

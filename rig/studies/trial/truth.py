@@ -1,6 +1,6 @@
-"""The simulator behind the trial's cases: truth.c, built with gcc, on numpy columns.
+"""The simulator of the blind trial: truth.c, compiled with gcc, on numpy columns.
 
-It shares no physics with `plant`: only the nominal numbers. Symbols are those of the paper, given as keyword changes.
+It shares the nominal numbers with `plant`, and no physics. Its parameters have the symbols of the paper.
 """
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from plant.parameters import nominal
 Array = NDArray[np.float64]
 
 PERIOD = 1e-3  # s, one cycle
-STEPS = 1000  # steps a cycle: 1 us
 FLAGS = ("-O2", "-shared", "-fPIC")
 SYMBOLS = {
     "GAP": "controller.proportional_gain", "Imax": "controller.current_limit", "GM": "torque_motor.gain",
@@ -35,14 +34,14 @@ SYMBOLS = {
     "GP": "valve.pressure_gain", "PSR": "supply.pressure", "AJ": "jack.area", "MJ": "jack.mass", "CJ": "jack.damping",
     "FSJ": "jack.static_friction", "FDJ": "jack.dynamic_friction", "CLK": "jack.leakage", "XJM": "jack.travel",
 }
-"""Where nominal.toml keeps what the paper calls so."""
+"""Symbols of the paper and their names in nominal.toml."""
 
 
 class Run(NamedTuple):
-    """What a run leaves, one row a cycle: (n,) columns, SI."""
+    """The columns of a run, (n,) each, one row per cycle, SI."""
 
     com: Array
-    xj: Array  # as sensed, with the noise that was given
+    xj: Array  # measured, with the given noise
     cor: Array
     p12: Array  # without noise
     xs: Array
@@ -56,16 +55,16 @@ def nominal_symbols() -> dict[str, float]:
 
 
 def has_compiler() -> bool:
-    """Whether there is a compiler to build the simulator with."""
+    """Whether the C compiler that builds the simulator is installed."""
     return shutil.which("gcc") is not None
 
 
 @cache
 def _load_library() -> ctypes.CDLL:
-    """The compiled simulator, kept under a hash of its source.
+    """The compiled simulator, cached under a hash of its source.
 
     Raises:
-        InputError: no gcc.
+        InputError: gcc is not installed.
     """
     gcc = shutil.which("gcc")
     if gcc is None:
@@ -75,7 +74,7 @@ def _load_library() -> ctypes.CDLL:
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"truth-{hashlib.sha256(source + ' '.join(FLAGS).encode()).hexdigest()[:16]}.so"
     if not target.exists():
-        part = target.with_suffix(f".{os.getpid()}")  # several processes may build at once: the last rename wins
+        part = target.with_suffix(f".{os.getpid()}")  # several processes may build it at once; the last one replaces it
         subprocess.run([gcc, *FLAGS, "-x", "c", "-", "-o", str(part), "-lm"], input=source, check=True)
         part.replace(target)
     library = ctypes.CDLL(str(target))
@@ -85,19 +84,24 @@ def _load_library() -> ctypes.CDLL:
 
 @cache
 def parameter_names() -> tuple[str, ...]:
-    """Names of the simulator's parameters, in its order."""
+    """The names of the simulator's parameters, in the order of its C structure."""
     return tuple(_load_library().trial_fields().decode().split())
 
 
 def simulate_truth(com: Array, changes: Mapping[str, float], noise: Array | None = None, load: Array | None = None,
-             cor: Array | None = None, steps: int = STEPS) -> Run:
-    """The plant over `com` (n,) m, at rest at first.
+                   cor: Array | None = None, steps: int = 1000) -> Run:
+    """A run of the plant over `com` (n,) m, from rest.
 
-    `changes` are symbols that differ from nominal; `noise` (n,) m is what the position transducer adds; `load` (n,) N
-    is the known force; `cor` (n,) A, if given, drives the plant in place of the controller.
+    Args:
+        com: command, (n,) m.
+        changes: symbols to the values that differ from nominal.
+        noise: noise of the position transducer, (n,) m; default: none.
+        load: known force, (n,) N; default: none.
+        cor: current, (n,) A, that drives the plant in place of the controller; default: the controller's.
+        steps: integration steps per cycle; 1000 are steps of 1 us.
 
     Raises:
-        InputError: a parameter it does not have; no gcc.
+        InputError: an unknown parameter, or gcc is not installed.
         ValueError: columns of different lengths.
     """
     n = len(com)
@@ -117,10 +121,11 @@ def simulate_truth(com: Array, changes: Mapping[str, float], noise: Array | None
 
 
 def _make_column(column: Array | None, n: int) -> Array:
-    wide = np.zeros(n) if column is None else np.ascontiguousarray(column, dtype=float)
-    if wide.shape != (n,):
-        raise ValueError(f"a column of {wide.shape} beside {n} cycles")
-    return wide
+    """The column as C reads it, zeros if there is none. Raises ValueError for another shape than (n,)."""
+    values = np.zeros(n) if column is None else np.ascontiguousarray(column, dtype=float)
+    if values.shape != (n,):
+        raise ValueError(f"a column of shape {values.shape} for {n} cycles")
+    return values
 
 
 def _point_to(array: Array) -> ctypes._Pointer[ctypes.c_double]:
