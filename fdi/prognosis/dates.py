@@ -1,6 +1,6 @@
 """When a trace was recorded: by a table dates.csv, the log itself, or an ISO date in the name of file or folder.
 
-An axis other than the calendar (operating hours, flights) comes from the table alone. No clock is looked at.
+An axis other than the calendar (operating hours, flights) comes from the table alone. The age of a file does not count.
 """
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)$")
 
 
 class Row(NamedTuple):
-    """What the table says of a file; NaN where it says nothing."""
+    """The table's entries for a file; NaN where it has none."""
 
     date: float  # days since 1970-01-01, UTC
     hours: float
     flights: float
 
 
-def days(text: str) -> float:
-    """An ISO date or time, UTC unless it names an offset, as days since 1970-01-01; NaN for what is none.
+def parse_date(text: str) -> float:
+    """An ISO date or time, UTC unless it names an offset, as days since 1970-01-01; NaN for any other text.
 
-    >>> days("1970-01-02"), days("1970-01-01T12:00:00+00:00"), days("1970-01-01T12:00:00-12:00"), days("soon")
-    (1.0, 0.5, 1.0, nan)
+    >>> parse_date("1970-01-02"), parse_date("1970-01-01T12:00:00-12:00"), parse_date("soon")
+    (1.0, 1.0, nan)
     """
     text = text.strip().removesuffix("Z")
     offset = _OFFSET.search(text) if "T" in text or " " in text else None
@@ -49,35 +49,35 @@ def days(text: str) -> float:
     return math.nan if np.isnat(found) else float(found.astype(float)) / 86400 - late
 
 
-def iso(day: float) -> str:
+def format_day(day: float) -> str:
     """The date of a day since 1970-01-01.
 
-    >>> iso(20454.7)
+    >>> format_day(20454.7)
     '2026-01-01'
     """
     return str(np.datetime64(math.floor(day), "D"))
 
 
-def in_name(path: Path) -> float:
+def find_date_in_name(path: Path) -> float:
     """The date in a file's name, or in that of the nearest folder that has one, days since 1970-01-01; else NaN.
 
-    >>> in_name(Path("unit7/2026-01-02/trace.mcap")) - days("2026-01-01")
+    >>> find_date_in_name(Path("unit7/2026-01-02/trace.mcap")) - parse_date("2026-01-01")
     1.0
     """
     for part in reversed(path.parts):
         for y, m, d, *clock in _DATE.findall(part):
             hour = "T" + ":".join(word or "00" for word in clock) if clock[0] else ""
-            found = days(f"{y}-{m}-{d}{hour}")
+            found = parse_date(f"{y}-{m}-{d}{hour}")
             if not math.isnan(found):
                 return found
     return math.nan
 
 
-def read_table(path: Path) -> dict[str, Row]:
+def read_dates_table(path: Path) -> dict[str, Row]:
     """The table FILE,date[,hours][,flights] with a header: file, as written there, to its row.
 
     Raises:
-        InputError: no such columns, a date or number that is none, a file that stands there twice.
+        InputError: columns missing, an invalid date or number, or a file listed twice.
     """
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
@@ -94,15 +94,15 @@ def read_table(path: Path) -> dict[str, Row]:
             continue
         if name in found:
             raise InputError(f"{path}: line {number}", "file", f"each file once, not {name} again")
-        found[name] = Row(*(_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES))
+        found[name] = Row(*(_read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES))
     return found
 
 
-def _cell(where: str, axis: str, text: str) -> float:
+def _read_cell(where: str, axis: str, text: str) -> float:
     if not text:
         return math.nan
     try:
-        value = days(text) if axis == "date" else float(text)
+        value = parse_date(text) if axis == "date" else float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
@@ -111,7 +111,7 @@ def _cell(where: str, axis: str, text: str) -> float:
     return value
 
 
-def row_of(table: Mapping[str, Row], name: str) -> Row | None:
+def find_row(table: Mapping[str, Row], name: str) -> Row | None:
     """The table's row of a trace by its path in the folder, POSIX; its folder, file name or stem will do, too."""
     path = Path(name)
     for key in (name, str(path.parent), path.name, path.name.partition(".")[0]):

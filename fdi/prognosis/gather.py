@@ -1,4 +1,4 @@
-"""The sizes of both faults in each dated trace of a folder, kept so that no trace is diagnosed twice."""
+"""The sizes of both faults in each dated trace of a folder; answers are stored, so no trace is diagnosed twice."""
 from __future__ import annotations
 
 import hashlib
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.faults import FAULTS, Estimate
-from fdi.prognosis.dates import AXES, TABLE, Row, days, in_name, read_table, row_of
+from fdi.prognosis.dates import AXES, TABLE, Row, find_date_in_name, find_row, parse_date, read_dates_table
 from fdi.progress import Progress
 from fdi.sources import digest
 from fdi.trace.trace import Trace
@@ -17,8 +17,6 @@ from plant.compile import cache_folder
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model
-
-Keep = Path | None
 
 ENDINGS = (".mcap", ".csv", ".csv.gz")
 
@@ -44,49 +42,53 @@ class Gathered(NamedTuple):
 class Options(NamedTuple):
     """How to gather."""
 
-    axis: str | None = None  # default: the first that all traces have
+    axis: str | None = None  # default: the first on which all traces have a place
     table: Path | None = None  # default: dates.csv in the folder, if there is one
-    again: bool = False  # diagnose even what is known
+    again: bool = False  # diagnose again what has been diagnosed before
 
 
-def gather(folder: Path, model: Model, options: Options, progress: Progress) -> Gathered:
+def gather_sizes(folder: Path, model: Model, options: Options, progress: Progress) -> Gathered:
     """Diagnose all traces of a folder and below.
 
     Raises:
-        InputError: no folder, no traces, no axis on which all of them stand, or none that can be judged.
+        InputError: no folder, no traces, no axis on which all of them have a place, or none that can be judged.
     """
     place = options.table or folder / TABLE
-    table = read_table(place) if options.table or place.is_file() else {}
+    table = read_dates_table(place) if options.table or place.is_file() else {}
     notes: list[str] = []
     rows: dict[Path, Row] = {}
-    for file in traces(folder):
+    for file in list_traces(folder):
         name = file.relative_to(folder).as_posix()
         try:
-            rows[file] = _row(folder, name, started(file, model, options.again), row_of(table, name))
+            rows[file] = _date_trace(folder, name, read_start_time(file, model, options.again), find_row(table, name))
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
-    axis = _axis(folder, rows, options.axis)  # before the work: a trace without a date is refused at once
-    notes += [f"{key} stands in {place.name}, but there is no such trace" for key, row in table.items()
-              if row not in [row_of(table, file.relative_to(folder).as_posix()) for file in rows]]
+    axis = _choose_axis(folder, rows, options.axis)  # before the work: a trace without a date is refused at once
+    notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in table.items()
+              if row not in [find_row(table, file.relative_to(folder).as_posix()) for file in rows]]
     points = []
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
         name = file.relative_to(folder).as_posix()
         try:
-            told = diagnosed(file, model, options.again)
+            answer = diagnose_once(file, model, options.again)
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
-        sizes = {f.name: Estimate(*told["sizes"][f.name]) for f in FAULTS}
-        points.append(Point(name, row[list(AXES).index(axis)], sizes, told["note"]))
+        sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in FAULTS}
+        points.append(Point(name, row[list(AXES).index(axis)], sizes, answer["note"]))
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
     return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes))
 
 
-def traces(folder: Path) -> list[Path]:
-    """All files that may be traces. Raises InputError where there are none."""
+def list_traces(folder: Path) -> list[Path]:
+    """All files of a folder and below that may be traces.
+
+    Raises:
+        InputError: no folder, or no such file.
+    """
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of dated traces, or the JSON file of an earlier answer")
     found = sorted(path for path in folder.rglob("*") if path.name.endswith(ENDINGS) and path.name != TABLE
@@ -96,17 +98,17 @@ def traces(folder: Path) -> list[Path]:
     return found
 
 
-def _row(folder: Path, name: str, own: str, row: Row | None) -> Row:
-    """Where a trace stands: by the table, else by its own start time, else by its name."""
+def _date_trace(folder: Path, name: str, own: str, row: Row | None) -> Row:
+    """The place of a trace on each axis: by the table, else by its own start time, else by its name."""
     row = row or Row(math.nan, math.nan, math.nan)
     if not math.isnan(row.date):
         return row
-    day = days(own)
-    return row._replace(date=day if not math.isnan(day) else in_name(Path(folder.resolve().name) / name))
+    day = parse_date(own)
+    return row._replace(date=day if not math.isnan(day) else find_date_in_name(Path(folder.resolve().name) / name))
 
 
-def _axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
-    """The axis asked for, or the first on which every trace stands."""
+def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
+    """The axis asked for, or the first on which every trace has a place."""
     without = {axis: [file for file, row in rows.items() if math.isnan(row[i])] for i, axis in enumerate(AXES)}
     for axis in (wanted,) if wanted else AXES:
         if not without[axis]:
@@ -118,25 +120,25 @@ def _axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
     raise InputError(missing, str(wanted), f"a line in {folder / TABLE} with a column {wanted}")
 
 
-def started(file: Path, model: Model, again: bool = False) -> str:
-    """When the log says that it began, "" if it does not say.
+def read_start_time(file: Path, model: Model, again: bool = False) -> str:
+    """Start time in the log; "" if there is none.
 
     Raises:
-        InputError: a file that is no trace.
+        InputError: a file that is not a trace.
     """
-    place = _kept(file, model)
+    place = _find_answer_file(file, model)
     if place.is_file() and not again:
         return str(json.loads(place.read_text(encoding="utf-8"))["started"])
     return Trace.read(file).provenance.get("started", "")
 
 
-def diagnosed(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
-    """Start time and sizes of a trace, by `diagnose` or from what was kept of an earlier call.
+def diagnose_once(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
+    """Start time and sizes of a trace, by `diagnose` or from the answer stored by an earlier call.
 
     Raises:
-        InputError: a trace that cannot be judged; that is not kept.
+        InputError: a trace that cannot be judged; this answer is not stored.
     """
-    place = _kept(file, model)
+    place = _find_answer_file(file, model)
     if place.is_file() and not again:
         found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
         return found
@@ -154,8 +156,8 @@ def diagnosed(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
     return found
 
 
-def _kept(file: Path, model: Model) -> Path:
-    """Where the answer of a trace is kept: under a hash of the trace, the model and the code that judges."""
+def _find_answer_file(file: Path, model: Model) -> Path:
+    """File for the answer of a trace: its name is a hash of the trace, the model and the code."""
     try:
         content = file.read_bytes()
     except OSError as error:

@@ -2,11 +2,11 @@
 
     size_i = offset + steps + rise * shape(u_i) + wander(u_i) + error_i          rise >= 0
 
-`shape` runs over all laws, onsets and bends (laws.py). `wander` is what no law foresees: nothing, a Wiener process, or
-an integrated one, of several strengths. `error` has the variances of the intervals, which may be too small, or of which
-a part is the same in all traces of one unit, by its tolerances. That part goes into the offset, and no size can tell it
-from one: it is taken off what is foretold (life.py). Offset and steps are Gaussian and go into the covariance, the rise
-is solved in closed form, all else is a sum over a grid: exact but for the grid, and the same every time.
+`shape` runs over all laws, onsets and bends (growth_laws.py). `wander` is growth that follows no law: none, a Wiener
+process, or an integrated one, of several strengths. `error` has the variances of the intervals, which may be too small,
+or of which a part is the same in all traces of one unit, by its tolerances. That part cannot be told from the offset:
+it is added to the forecast (remaining_life.py). Offset and steps are Gaussian and go into the covariance, the rise is
+solved in closed form, and the rest is a sum over a grid: exact up to the grid, and the same every time.
 """
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import log_ndtr
 
-from fdi.prognosis.growth_laws import Shape, basis, shapes
-from fdi.thresholds import OFFSET_PRIOR_SD, STEP_PRIOR_SD
+from fdi.prognosis.growth_laws import Shape, evaluate_shapes, list_shapes
+from fdi.thresholds import INTERVAL_95_SD, OFFSET_PRIOR_SD, STEP_PRIOR_SD
 
 Floats = NDArray[np.float64]
 
@@ -28,8 +28,6 @@ NOISE_PRIOR = (0.18, 0.18, 0.18, 0.18, 0.18, 0.1)
 WANDERS = (("still", 0.0), ("wiener", 0.03), ("wiener", 0.1), ("wiener", 0.3),
            ("integrated", 0.03), ("integrated", 0.1), ("integrated", 0.3))  # kind, deviation at u = 1
 WANDER_PRIOR = (0.22, 0.13, 0.13, 0.13, 0.13, 0.13, 0.13)
-LOOSE = 10.0  # deviation of a size that says nothing
-GRAIN = 1e-4  # no interval is taken for narrower than this deviation
 
 
 class Scaled(NamedTuple):
@@ -39,8 +37,8 @@ class Scaled(NamedTuple):
     y: Floats
     sigma: Floats
     steps: tuple[int, ...] = ()  # rows at which the size jumped for good
-    loose: tuple[int, ...] = ()  # rows out of line, which say nothing
-    bounded: tuple[int, ...] = ()  # rows that only say "not more than": the estimate stopped at what is possible at all
+    loose: tuple[int, ...] = ()  # rows out of line, which carry no information
+    bounded: tuple[int, ...] = ()  # rows that only give an upper limit: the estimate stopped at the parameter's bound
 
 
 class Part(NamedTuple):
@@ -57,7 +55,7 @@ class Part(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """All parts."""
+    """The posterior under every noise and wander."""
 
     shapes: tuple[Shape, ...]
     parts: tuple[Part, ...]
@@ -71,7 +69,7 @@ class Posterior(NamedTuple):
 
     @property
     def evidence(self) -> float:
-        """Log of the probability of the data."""
+        """Log probability of the data."""
         return float(np.logaddexp.reduce([part.evidence for part in self.parts], axis=None))
 
     def laws(self) -> dict[str, float]:
@@ -82,29 +80,33 @@ class Posterior(NamedTuple):
         return found
 
 
-def regress(data: Scaled) -> Posterior:
+def fit_growth(data: Scaled) -> Posterior:
     """The posterior of a series of at least two times."""
-    every, _ = shapes()
-    g = basis(every, data.u)
-    return Posterior(every, tuple(_part(data, g, noise, wander)
+    every, _ = list_shapes()
+    g = evaluate_shapes(every, data.u)
+    return Posterior(every, tuple(_fit_part(data, g, noise, wander)
                                   for noise in range(len(NOISES)) for wander in range(len(WANDERS))))
 
 
-def covariance(data: Scaled, noise: int, wander: int) -> Floats:
-    """Of the sizes about rise * shape, (n, n)."""
+def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.0, narrowest: float = 1e-4) -> Floats:
+    """Covariance of the sizes about rise * shape, (n, n).
+
+    A size out of line has a standard deviation of `loose`, so it says nothing; no interval is taken for narrower than
+    `narrowest`.
+    """
     common, factor = NOISES[noise]
-    sigma = factor * np.maximum(data.sigma, GRAIN)
-    jumps = _jumps(data)
+    sigma = factor * np.maximum(data.sigma, narrowest)
+    jumps = _make_step_columns(data)
     own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
     out: Floats = (np.diag(own * sigma ** 2) + OFFSET_PRIOR_SD ** 2
-                   + STEP_PRIOR_SD ** 2 * jumps.T @ jumps + wandering(wander, data.u, data.u))
-    out[data.loose, data.loose] += LOOSE ** 2
+                   + STEP_PRIOR_SD ** 2 * jumps.T @ jumps + compute_wander_covariance(wander, data.u, data.u))
+    out[data.loose, data.loose] += loose ** 2
     return out
 
 
-def odds(noise: int, wander: int) -> Floats:
-    """Log of the prior of each shape under a noise and a wander: a level that wanders is a trend, not `none`."""
-    every, prior = shapes()
+def compute_log_prior(noise: int, wander: int) -> Floats:
+    """Log prior of each shape under a noise and a wander; a level that wanders is a trend, not `none`."""
+    every, prior = list_shapes()
     constant = np.array([shape.law == "none" for shape in every])
     chance = WANDER_PRIOR[wander] * np.ones(len(every))
     chance[constant] = WANDERS[wander][0] == "still"
@@ -113,13 +115,13 @@ def odds(noise: int, wander: int) -> Floats:
     return out
 
 
-def _jumps(data: Scaled) -> Floats:
+def _make_step_columns(data: Scaled) -> Floats:
     """A row for each step, (steps, n): 1 from the step on."""
     return np.array([np.arange(len(data.u)) >= row for row in data.steps], dtype=float).reshape(-1, len(data.u))
 
 
-def wandering(wander: int, a: Floats, b: Floats) -> Floats:
-    """Covariance of the wander at times a with that at times b, (len(a), len(b))."""
+def compute_wander_covariance(wander: int, a: Floats, b: Floats) -> Floats:
+    """Covariance of the wander at times a with the wander at times b, (len(a), len(b))."""
     kind, strength = WANDERS[wander]
     first = np.minimum(a[:, None], b)
     if kind == "integrated":
@@ -128,28 +130,30 @@ def wandering(wander: int, a: Floats, b: Floats) -> Floats:
     return out
 
 
-def _part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
+def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     kind, strength = WANDERS[wander]
-    factor = np.linalg.cholesky(covariance(data, noise, wander))
-    white = solve_triangular(factor, np.column_stack([data.y, g, end_with(data, data.u, wander).T]), lower=True,
-                             check_finite=False)
+    factor = np.linalg.cholesky(compute_covariance(data, noise, wander))
+    end = compute_end_covariance(data, data.u, wander)
+    white = solve_triangular(factor, np.column_stack([data.y, g, end.T]), lower=True, check_finite=False)
     y, g, s = white[:, 0], white[:, 1:-2], white[:, -2:]
-    every, _ = shapes()
+    every, _ = list_shapes()
     usual = np.array([shape.rise for shape in every])
     precision = (g * g).sum(axis=0) + usual ** -2
     rise, deviation = (g.T @ y) / precision, precision ** -0.5
-    evidence = odds(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y + truncated(rise, deviation, usual)
+    evidence = (compute_log_prior(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
+                + compute_rise_evidence(rise, deviation, usual))
     own = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
-    return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, own + _end(kind, strength) - s.T @ s)
+    spread = own + _compute_end_prior(kind, strength) - s.T @ s
+    return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, spread)
 
 
-def truncated(rise: Floats, deviation: Floats, usual: Floats) -> Floats:
-    """Log of what a rise >= 0, half-normal beforehand, adds to the evidence, from its mean and deviation uncut."""
+def compute_rise_evidence(rise: Floats, deviation: Floats, usual: Floats) -> Floats:
+    """Log evidence that a rise >= 0 with a half-normal prior adds, from its mean and deviation before truncation."""
     out: Floats = (0.5 * (rise / deviation) ** 2 + np.log(deviation / usual) + np.log(2.0) + log_ndtr(rise / deviation))
     return out
 
 
-def end_with(data: Scaled, u: Floats, wander: int) -> Floats:
+def compute_end_covariance(data: Scaled, u: Floats, wander: int) -> Floats:
     """Covariance of the level and of the wander's slope at u = 1 with the levels at times u, (2, m)."""
     kind, strength = WANDERS[wander]
     counted = np.sum([u >= data.u[row] for row in data.steps], axis=0) if data.steps else 0.0
@@ -159,8 +163,33 @@ def end_with(data: Scaled, u: Floats, wander: int) -> Floats:
     return np.array([level + strength ** 2 * u, np.zeros_like(u)])
 
 
-def _end(kind: str, strength: float) -> Floats:
+def _compute_end_prior(kind: str, strength: float) -> Floats:
     """Prior covariance of the wander and its slope at u = 1."""
     if kind == "integrated":
         return strength ** 2 * np.array([[1.0, 1.5], [1.5, 3.0]])
     return strength ** 2 * np.array([[1.0, 0.0], [0.0, 0.0]])
+
+
+def estimate_level(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
+    """Low, mean and high of the level under the traces at times u from 0 to 1, shape (3, m), by the likeliest law."""
+    best, shape = np.unravel_index(posterior.weights.argmax(), posterior.weights.shape)
+    part = posterior.parts[best]
+    g = evaluate_shapes((posterior.shapes[shape],), np.concatenate([data.u, u]))[:, 0]
+    here, there = g[:len(data.u)], g[len(data.u):]
+    rise = max(float(part.rise[shape]), 0.0)
+    solver = cho_factor(compute_covariance(data, part.noise, part.wander))
+    cross = _compute_cross_covariance(data, part.wander, u, data.u)
+    mean = rise * there + cross @ cho_solve(solver, data.y - rise * here)
+    pull = there - cross @ cho_solve(solver, here)
+    own = _compute_cross_covariance(data, part.wander, u, u).diagonal()
+    left = own - (cross * cho_solve(solver, cross.T).T).sum(axis=1)
+    half = INTERVAL_95_SD * np.sqrt(np.maximum(left + (pull * part.deviation[shape]) ** 2, 0.0))
+    return np.array([mean - half, mean, mean + half])
+
+
+def _compute_cross_covariance(data: Scaled, wander: int, a: Floats, b: Floats) -> Floats:
+    """Covariance of the level without the rise at times a with that at times b, (len(a), len(b))."""
+    out = OFFSET_PRIOR_SD ** 2 + compute_wander_covariance(wander, a, b)
+    for row in data.steps:
+        out = out + STEP_PRIOR_SD ** 2 * np.outer(a >= data.u[row], b >= data.u[row])
+    return out

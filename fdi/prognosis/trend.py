@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import Estimate, Fault, Level, classify_size, judge_size
 from fdi.prognosis import remaining_life
-from fdi.prognosis.breaks import Break, Cleaned, clean
-from fdi.prognosis.course import fitted
-from fdi.prognosis.regression import Posterior, Scaled, regress
+from fdi.prognosis.breaks import Break, Cleaned, find_breaks
+from fdi.prognosis.regression import Posterior, Scaled, estimate_level, fit_growth
 from fdi.thresholds import (
     INTERVAL_95_SD,
     INTERVAL_SLOPE_RANGE,
@@ -52,7 +51,7 @@ class Curve(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """What the traces say of one fault. Times are on the axis of the traces, sizes in the fault's unit."""
+    """The trend of one fault. Times are on the axis of the traces, sizes in the fault's unit."""
 
     fault: Fault
     verdict: str  # "TREND" | "NO_TREND" | "TOO_FEW"
@@ -69,84 +68,86 @@ class Trend:
 
     @property
     def level(self) -> Level:
-        """Of the size now, by the rule of `rig fdi`; where the interval cannot tell, by the value."""
+        """Level of the size now, by the rule of `rig fdi`; where its interval is too wide for that, by the value."""
         found = judge_size(self.fault, self.now)
         return classify_size(self.fault, self.now.value) if found is None else found
 
 
-def follow(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:
+def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:
     """The trend of a fault from its sizes at `times` (in order, any unit), at least one."""
     t = np.array(times[-TREND_MOST_TRACES:], dtype=float)
     sizes = tuple(estimates[-TREND_MOST_TRACES:])
-    data, unit = _scaled(fault, t, sizes)
-    found = clean(data) if t[-1] > t[0] else Cleaned(data, 0, ())
+    data, unit = _scale_series(fault, t, sizes)
+    found = find_breaks(data) if t[-1] > t[0] else Cleaned(data, 0, ())
     breaks = tuple(b._replace(size=b.size * unit) for b in found.breaks)
     used = np.arange(len(t)) >= found.first
     used[[found.first + row for row in found.data.loose]] = False
     if used.sum() < TREND_FEWEST_TRACES or np.ptp(t[used]) == 0.0:
         return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
     span = float(t[-1] - t[found.first])
-    posterior = regress(found.data)
-    paths, laws = _drawn(found, posterior, _own(data, used)), posterior.laws()
-    remaining = {level: _remaining(getattr(fault, field), fault, unit, paths, span)
+    posterior = fit_growth(found.data)
+    paths, laws = _draw_paths(found, posterior, _fit_unit_error(data, used)), posterior.laws()
+    remaining = {level: _summarise_remaining(getattr(fault, field), fault, unit, paths, span)
                  for level, field in LIMITS.items()}
     middle = np.linspace(0.0, 1.0, 60)
-    past = Curve(t[found.first] + span * middle, *(fault.healthy + unit * fitted(found.data, posterior, middle)))
+    level = fault.healthy + unit * estimate_level(found.data, posterior, middle)
+    past = Curve(t[found.first] + span * middle, *level)
     now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], 0.0)  # neither fault can be less
     return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, used, breaks, laws,
-                 _quantiles(now), _quantiles(paths.rate * unit / span), remaining, past,
-                 _fan(fault, unit, paths, float(t[-1]), span))
+                 _summarise_draws(now), _summarise_draws(paths.rate * unit / span), remaining, past,
+                 _make_forecast(fault, unit, paths, float(t[-1]), span))
 
 
-def _scaled(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:
+def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:
     """The series in the regression's units, and the size that is 1 there."""
     unit = fault.most - fault.healthy
     value, low, high = np.array(sizes).T
-    sigma = np.maximum(high - value, value - low) / INTERVAL_95_SD / unit  # one side may end at what is possible at all
+    sigma = np.maximum(high - value, value - low) / INTERVAL_95_SD / unit  # one side may end at the parameter's bound
     span = float(t[-1] - t[0]) or 1.0
     bounded = tuple(int(row) for row in np.flatnonzero(value <= low))
     return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
 
 
-def _own(data: Scaled, used: NDArray[np.bool_]) -> remaining_life.Own:
+def _fit_unit_error(data: Scaled, used: NDArray[np.bool_]) -> remaining_life.UnitError:
     """A line through the intervals' deviations over the sizes; their mean where these hardly differ."""
     y, sigma = data.y[used], data.sigma[used]
     if np.ptp(y) < INTERVAL_SLOPE_RANGE:
-        return remaining_life.Own(float(sigma[-1]))
+        return remaining_life.UnitError(float(sigma[-1]))
     share, base = np.polyfit(y, sigma, 1)
-    return remaining_life.Own(float(base), float(share))
+    return remaining_life.UnitError(float(base), float(share))
 
 
-def _drawn(found: Cleaned, posterior: Posterior, own: remaining_life.Own) -> remaining_life.Paths:
+def _draw_paths(found: Cleaned, posterior: Posterior, own: remaining_life.UnitError) -> remaining_life.Paths:
     """Paths from the last trace on.
 
     A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
     """
     last = found.breaks[-1] if found.breaks else None
     if last is None or last.kind != "last" or last.size < 0.0:
-        return remaining_life.draw(posterior, own)
+        return remaining_life.draw_paths(posterior, own)
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
     third = TREND_PATHS // 3
-    jumped = regress(tight._replace(steps=(*tight.steps, at)))
-    three = [remaining_life.draw(p, own, i, third) for i, p in enumerate((posterior, jumped, regress(tight)))]
+    jumped = fit_growth(tight._replace(steps=(*tight.steps, at)))
+    three = [remaining_life.draw_paths(p, own, i, third) for i, p in enumerate((posterior, jumped, fit_growth(tight)))]
     return remaining_life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
 
-def _quantiles(drawn: Floats) -> Estimate:
+def _summarise_draws(drawn: Floats) -> Estimate:
     low, value, high = np.quantile(drawn, [0.025, 0.5, 0.975], method="nearest")
     return Estimate(float(value), float(low), float(high))
 
 
-def _remaining(limit: float, fault: Fault, unit: float, paths: remaining_life.Paths, span: float) -> Remaining:
-    drawn = remaining_life.reached(paths, (limit - fault.healthy) / unit) * span
-    value, low, high = _quantiles(drawn)
+def _summarise_remaining(limit: float, fault: Fault, unit: float, paths: remaining_life.Paths, span: float
+                         ) -> Remaining:
+    drawn = remaining_life.find_first_passage(paths, (limit - fault.healthy) / unit) * span
+    value, low, high = _summarise_draws(drawn)
     return Remaining(limit, value, low, high, drawn)
 
 
-def _fan(fault: Fault, unit: float, paths: remaining_life.Paths, start: float, span: float) -> Curve:
-    """The future up to where most paths have reached MaxBand, or twice the time seen so far again."""
-    until = float(np.quantile(remaining_life.reached(paths, 1.0), 0.5, method="nearest"))
+def _make_forecast(fault: Fault, unit: float, paths: remaining_life.Paths, start: float, span: float) -> Curve:
+    """The sizes up to when most paths have reached MaxBand, at most twice the time seen so far."""
+    until = float(np.quantile(remaining_life.find_first_passage(paths, 1.0), 0.5, method="nearest"))
     ahead = remaining_life.AHEAD
     shown = np.flatnonzero(ahead <= min(max(1.5 * until, 0.3), 2.0))
     low, middle, high = fault.healthy + unit * np.quantile(paths.sizes[:, shown], [0.025, 0.5, 0.975], axis=0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from fdi.diagnosis.faults import FAULTS, Estimate, Level
 from fdi.prognosis.dates import AXES
 from fdi.prognosis.gather import Gathered, Point
-from fdi.prognosis.trend import Trend, follow
+from fdi.prognosis.trend import Trend, fit_trend
 from plant.errors import InputError
 
 LIMIT_NAMES = {"maintenance": "MidBand", "non_nominal": "MaxBand"}
@@ -36,7 +36,7 @@ class UnitTrend:
 def follow_unit(gathered: Gathered) -> UnitTrend:
     """Follow both faults through the traces."""
     t = [point.t for point in gathered.points]
-    trends = (follow(fault, t, [point.sizes[fault.name] for point in gathered.points]) for fault in FAULTS)
+    trends = (fit_trend(fault, t, [point.sizes[fault.name] for point in gathered.points]) for fault in FAULTS)
     return UnitTrend(gathered, tuple(trends))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from fdi.diagnosis.faults import FAULTS, Estimate, Level
 from fdi.prognosis.breaks import Break
-from fdi.prognosis.dates import iso
+from fdi.prognosis.dates import format_day
 from fdi.prognosis.gather import Point
 from fdi.prognosis.trend import Remaining, Trend
 from fdi.prognosis.unit_trend import LIMIT_NAMES, UnitTrend
@@ -174,12 +174,12 @@ def format_date(t: float, unit: UnitTrend) -> str:
     if not math.isfinite(t):
         return "never"
     end = unit.gathered.points[-1].t
-    return iso(end + t) if unit.gathered.axis == "date" else f"{end + t:.0f} {unit.unit}"
+    return format_day(end + t) if unit.gathered.axis == "date" else f"{end + t:.0f} {unit.unit}"
 
 
 def format_place(t: float, unit: UnitTrend) -> str:
     """A date, or hours or flights; `t` is on the axis of the traces."""
-    return iso(t) if unit.gathered.axis == "date" else f"{t:g} {unit.unit}"
+    return format_day(t) if unit.gathered.axis == "date" else f"{t:g} {unit.unit}"
 
 
 def _format_time(t: float, unit: UnitTrend) -> str:
@@ -225,4 +225,4 @@ def _collect_remaining(left: Remaining, end: float, axis: str) -> dict[str, Any]
 
 def _collect_place(t: float, axis: str) -> str | float:
     """A place on the axis: an ISO date, or the number itself."""
-    return iso(t) if axis == "date" else round(t, 3)
+    return format_day(t) if axis == "date" else round(t, 3)

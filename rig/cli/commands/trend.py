@@ -53,7 +53,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def follow_traces(args: argparse.Namespace) -> UnitTrend:
     """The trends of the traces in a folder, or of the points in the JSON file of an earlier answer."""
-    from fdi.prognosis.gather import Options, gather
+    from fdi.prognosis.gather import Options, gather_sizes
     from fdi.prognosis.unit_trend import follow_unit, read_points
     from rig.cli.progress_bar import show_progress
 
@@ -62,7 +62,7 @@ def follow_traces(args: argparse.Namespace) -> UnitTrend:
         if source.suffix == ".json" and not source.is_dir():
             return follow_unit(read_points(source))
         table = None if args.dates is None else Path(args.dates)
-        return follow_unit(gather(source, model, Options(args.axis, table, args.again), progress))
+        return follow_unit(gather_sizes(source, model, Options(args.axis, table, args.again), progress))
 
 
 def choose_output(args: argparse.Namespace, suffixes: tuple[str, ...]) -> Path | None:

@@ -22,7 +22,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.prognosis.gather import traces
+from fdi.prognosis.gather import list_traces
 from plant.effects import Effect
 from plant.errors import InputError
 from plant.model import Model, entry
@@ -190,7 +190,7 @@ def build_trace_matrix(folder: str | Path, model: Model, work: str) -> Matrix:
         InputError: no such folder, or no trace in it.
     """
     root = Path(folder).absolute()
-    names = {path.relative_to(root).as_posix(): path for path in traces(root)}
+    names = {path.relative_to(root).as_posix(): path for path in list_traces(root)}
     digests = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in names.items()}
     spec = {"traces": str(root), "files": digests, "model": model.to_toml(), "work": work}
     return restore_matrix(spec)

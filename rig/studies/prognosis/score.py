@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.prognosis.trend import Trend, follow
+from fdi.prognosis.trend import Trend, fit_trend
 from fdi.thresholds import TREND_FEWEST_TRACES
 from rig.studies.prognosis.degrading_units import Unit
 
@@ -47,7 +47,7 @@ class Score(NamedTuple):
 
 def predict_unit(unit: Unit, traces: int) -> Prediction:
     """The prediction of `follow` from the first `traces` traces."""
-    trend = follow(unit.fault, list(unit.t[:traces]), unit.sizes[:traces])
+    trend = fit_trend(unit.fault, list(unit.t[:traces]), unit.sizes[:traces])
     if not trend.remaining:
         return Prediction(False, np.full(2, np.inf), np.full(2, np.inf))
     return Prediction(trend.verdict == "TREND", trend.remaining["maintenance"].drawn,
@@ -90,7 +90,7 @@ def score_unit(unit: Unit, predict: Predict = predict_unit, every: int = 2) -> S
 
 def find_false_trends(units: Iterable[Unit]) -> list[Trend]:
     """The trends of healthy units that have one after all their traces."""
-    trends = [follow(unit.fault, list(unit.t), unit.sizes) for unit in units]
+    trends = [fit_trend(unit.fault, list(unit.t), unit.sizes) for unit in units]
     return [trend for trend in trends if trend.verdict == "TREND"]
 
 

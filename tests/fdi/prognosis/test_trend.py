@@ -15,9 +15,9 @@ from scipy.stats import halfnorm, multivariate_normal
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.prognosis import gather, regression, remaining_life
-from fdi.prognosis.dates import Row, days, in_name, iso, read_table, row_of
-from fdi.prognosis.growth_laws import basis, shapes
-from fdi.prognosis.trend import Trend, follow
+from fdi.prognosis.dates import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
+from fdi.prognosis.growth_laws import evaluate_shapes, list_shapes
+from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
@@ -38,49 +38,50 @@ def estimates(sizes: Sequence[float], sigma: float = SIGMA) -> list[Estimate]:
 
 def friction(sizes: Sequence[float]) -> Trend:
     """The trend of such sizes, a week apart."""
-    return follow(FRICTION, list(WEEKS[:len(sizes)]), estimates(sizes))
+    return fit_trend(FRICTION, list(WEEKS[:len(sizes)]), estimates(sizes))
 
 
 def test_dates_are_found_in_texts_and_names() -> None:
-    assert days("2026-01-02") - days("2026-01-01") == 1.0
-    assert days("2026-01-01T06:00:00+06:00") == days("2026-01-01") == days("2026-01-01T00:00:00Z")
-    assert all(math.isnan(days(text)) for text in ("", "yesterday", "2026-13-01", "12345"))
+    assert parse_date("2026-01-02") - parse_date("2026-01-01") == 1.0
+    assert parse_date("2026-01-01T06:00:00+06:00") == parse_date("2026-01-01") == parse_date("2026-01-01T00:00:00Z")
+    assert all(math.isnan(parse_date(text)) for text in ("", "yesterday", "2026-13-01", "12345"))
     for name in ("u/2026-03-04_check.csv", "20260304T1200/trace.mcap"):
-        assert iso(in_name(Path(name))) == "2026-03-04"
-    assert in_name(Path("x_2026-03-04T12-00-00.csv")) == days("2026-03-04") + 0.5
-    assert math.isnan(in_name(Path("run_123456789.csv"))) and math.isnan(in_name(Path("serial_99999999.csv")))
+        assert format_day(find_date_in_name(Path(name))) == "2026-03-04"
+    assert find_date_in_name(Path("x_2026-03-04T12-00-00.csv")) == parse_date("2026-03-04") + 0.5
+    assert all(math.isnan(find_date_in_name(Path(name))) for name in ("run_123456789.csv", "serial_99999999.csv"))
 
 
 def test_a_table_of_dates(tmp_path: Path) -> None:
     table = tmp_path / "dates.csv"
     table.write_text("file,date,hours\na.csv,2026-01-01,10\nrun/,2026-02-01,\n")
-    rows = read_table(table)
-    assert row_of(rows, "sub/a.csv") == Row(days("2026-01-01"), 10.0, pytest.approx(math.nan, nan_ok=True))
-    assert row_of(rows, "b.csv") is None
+    rows = read_dates_table(table)
+    assert find_row(rows, "sub/a.csv") == Row(parse_date("2026-01-01"), 10.0, pytest.approx(math.nan, nan_ok=True))
+    assert find_row(rows, "b.csv") is None
     for text, field in (("name,date\n", "header"), ("", "header"), ("file,date\na.csv,soon\n", "date"),
                         ("file,hours\na.csv,x\n", "hours"), ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
         table.write_text(text)
         with pytest.raises(InputError) as refused:
-            read_table(table)
+            read_dates_table(table)
         assert refused.value.field == field
 
 
 def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
     data = regression.Scaled(np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.02, 0.1, 0.3, 0.5]), np.full(4, 0.03),
                              steps=(2,))
-    every, _ = shapes()
-    found = regression.regress(data)
+    every, _ = list_shapes()
+    found = regression.fit_growth(data)
     for part in (found.parts[9], found.parts[25]):
-        cov = regression.covariance(data, part.noise, part.wander)
+        cov = regression.compute_covariance(data, part.noise, part.wander)
         for k in (1, 60, 130):
-            column = basis((every[k],), data.u)[:, 0]
+            column = evaluate_shapes((every[k],), data.u)[:, 0]
 
             def likelihood(rise: float, column: Any = column, cov: Any = cov, k: int = k) -> float:
                 chance = halfnorm.pdf(rise, scale=every[k].rise)
                 return float(chance * multivariate_normal.pdf(data.y, rise * column, cov))
 
             exact = math.log(quad(likelihood, 0.0, 4.0, epsabs=0.0, limit=200, points=[0.2, 0.5, 1.0])[0])
-            ours = part.evidence[k] - regression.odds(part.noise, part.wander)[k] - 2.0 * math.log(2.0 * math.pi)
+            prior = regression.compute_log_prior(part.noise, part.wander)[k]
+            ours = part.evidence[k] - prior - 2.0 * math.log(2.0 * math.pi)
             assert ours == pytest.approx(exact, abs=1e-6)
 
 
@@ -88,14 +89,14 @@ def test_the_future_has_the_spread_of_the_wander() -> None:
     """An integrated Wiener process, conditioned on nothing but its value and slope, spreads as its closed form says."""
     rng = np.random.default_rng(0)
     for kind, variance in (("wiener", 0.09 * remaining_life.AHEAD), ("integrated", 0.09 * remaining_life.AHEAD ** 3)):
-        moved = remaining_life._wander(kind, 0.3, np.zeros(4000), rng)
+        moved = remaining_life._draw_wander(kind, 0.3, np.zeros(4000), rng)
         assert moved.std(axis=0)[1:] == pytest.approx(np.sqrt(variance)[1:], rel=0.08)
 
 
 def test_reaching_a_limit() -> None:
     rising = 0.5 + 0.1 * remaining_life.AHEAD
     paths = remaining_life.Paths(np.array([rising, np.full_like(rising, 0.5), rising + 1.0]), np.zeros(3))
-    assert remaining_life.reached(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
+    assert remaining_life.find_first_passage(paths, 1.0) == pytest.approx([5.0, math.inf, 0.0])
 
 
 @pytest.mark.parametrize("law", ["linear", "exponential", "power"])
@@ -123,7 +124,7 @@ def test_few_points() -> None:
     for count in (1, 2):
         found = friction([10.0, 15.0][:count])
         assert found.verdict == "TOO_FEW" and not found.remaining and found.rate is None
-    assert follow(FRICTION, [1.0] * 4, estimates([10.0] * 4)).verdict == "TOO_FEW"
+    assert fit_trend(FRICTION, [1.0] * 4, estimates([10.0] * 4)).verdict == "TOO_FEW"
     three = friction([10.0, 20.0, 30.0])
     assert three.verdict == "TREND"
     many = friction(np.linspace(10.0, 30.0, 14))
@@ -167,7 +168,7 @@ def test_estimates_at_their_bound_only_say_not_more_than() -> None:
     """Ten zeros that are known to 0.03 each do not exclude that something grows below."""
     bound = [Estimate(0.0, 0.0, 0.06)] * 10
     free = [Estimate(0.0, -0.06, 0.06)] * 10
-    weak, strong = (follow(CLOGGING, list(WEEKS[:10]), sizes).laws["none"] for sizes in (bound, free))
+    weak, strong = (fit_trend(CLOGGING, list(WEEKS[:10]), sizes).laws["none"] for sizes in (bound, free))
     assert weak < strong
 
 
@@ -204,7 +205,7 @@ def test_intervals_hold_the_truth() -> None:
             u = degrading_units.simulate_unit(law, 100 * i + k)
             end = u.time_of_size(u.fault.most)
             n = int(np.searchsorted(u.t, (u.onset + end) / 2))
-            left = follow(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
+            left = fit_trend(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
             held.append(left.low <= end - u.t[n - 1] <= left.high)
     assert sum(held) >= 0.8 * len(held)
     assert len(find_false_trends(degrading_units.simulate_healthy_unit(seed) for seed in range(6))) <= 1
@@ -212,7 +213,7 @@ def test_intervals_hold_the_truth() -> None:
 
 def points(path: Path, sizes: Sequence[float]) -> Path:
     """An earlier answer with these sizes of spool friction."""
-    rows = [{"trace": f"{i}.csv", "t": days("2026-01-05") + 7.0 * i, "fss": e._asdict(),
+    rows = [{"trace": f"{i}.csv", "t": parse_date("2026-01-05") + 7.0 * i, "fss": e._asdict(),
              "kintas": {"value": 0.0, "low": 0.0, "high": 0.06}} for i, e in enumerate(estimates(sizes))]
     path.write_text(json.dumps({"axis": "date", "points": rows}))
     return path
@@ -263,11 +264,11 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (folder / "2026-02-01").mkdir(parents=True)
     for name in ("own.mcap", "2026-02-01/named.csv", "2026-02-01/dead.csv", "table.csv", "broken.csv"):
         (folder / name).write_text("")
-    monkeypatch.setattr(gather, "diagnosed", diagnosed)
-    monkeypatch.setattr(gather, "started", started)
+    monkeypatch.setattr(gather, "diagnose_once", diagnosed)
+    monkeypatch.setattr(gather, "read_start_time", started)
 
     def gathered(axis: str | None = None) -> gather.Gathered:
-        return gather.gather(folder, load_model(), gather.Options(axis), ignore_progress)
+        return gather.gather_sizes(folder, load_model(), gather.Options(axis), ignore_progress)
 
     with pytest.raises(InputError, match=r"table.csv: date: expected .*dates.csv"):
         gathered()
@@ -275,7 +276,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
                                       "named.csv,,20\ndead.csv,,25\nold.csv,,\n")
     found = gathered()
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
-    assert [iso(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
+    assert [format_day(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
     assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
     assert any("old.csv stands in dates.csv" in note for note in found.notes)
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
@@ -300,4 +301,4 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_log_of_the_rig_tells_its_date() -> None:
-    assert days(provenance()["started"]) > days("2026-01-01")
+    assert parse_date(provenance()["started"]) > parse_date("2026-01-01")
