@@ -278,7 +278,7 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [format_day(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
     assert [note.split(" left out")[0] for note in found.notes[::2]] == ["broken.csv", "2026-02-01/dead.csv"]
-    assert any("old.csv stands in dates.csv" in note for note in found.notes)
+    assert any("old.csv is listed in dates.csv" in note for note in found.notes)
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
     with pytest.raises(InputError, match="flights"):
         gathered("flights")
