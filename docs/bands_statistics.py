@@ -10,7 +10,7 @@ from fdi.diagnosis.bands_file import load_default_bands
 from fdi.diagnosis.faults import FAULTS, Level
 from fdi.diagnosis.precursors import format_precursor
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 from plant import load_model
 from rig.sequences import load_sequence
 
@@ -25,7 +25,7 @@ UNITS = (("healthy", UnitKind("healthy"), 1008, 2026), ("healthy, others", UnitK
 def main() -> None:
     """Print the table of band verdicts and the table of precursors."""
     com = load_sequence("preflight").main_profile().command
-    parts, bands, model = sections(com), load_default_bands(), load_model()
+    parts, bands, model = find_sections(com), load_default_bands(), load_model()
     for name, kind, count, seed in UNITS:
         x = simulate_units(model, com, np.zeros_like(com), kind, count, seed)
         found = [judge_position(com, row, 1e-3, bands, parts=parts) for row in x]

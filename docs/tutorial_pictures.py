@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from fdi import Trace
 from fdi.comparison.compare import compare
 from fdi.discovery import explain
-from fdi.discovery.model_file import load
-from fdi.discovery.residual_pattern import pattern
-from fdi.discovery.runs import read
+from fdi.discovery.model_file import load_model_file
+from fdi.discovery.residual_pattern import find_pattern
+from fdi.discovery.runs import read_runs
 from fdi.estimation.preparation import prepare_trace
-from fdi.estimation.replay import open_loop, residuals
+from fdi.estimation.replay import compute_residuals, replay_current
 from fdi.report import explain_figures
 from fdi.report.drawing import STYLE, shorten_svg, to_svg
 from plant import Model
@@ -37,7 +37,7 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
         models = ((Model(), explain_figures.BEFORE, "nominal model"), (model, explain_figures.AFTER, "after rig add"))
         for which, colour, label in models:
             prepared = prepare_trace(trace, which)
-            rest = residuals(prepared, open_loop(prepared, which))
+            rest = compute_residuals(prepared, replay_current(prepared, which))
             whole = len(prepared) // BLOCK * BLOCK
             t = np.arange(0, whole, BLOCK) * trace.period
             for ax, (name, title, scale) in zip(axes, SIGNALS, strict=True):
@@ -55,14 +55,14 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
 def main(folder: str) -> None:
     """Draw residuals and ledger of both examples, and the residual pattern of the second."""
     os.chdir(folder)
-    runs = read(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
+    runs = read_runs(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
-    shape = explain_figures.shape(pattern(found.search, found.ledger[-1]), runs.est.t)
+    shape = explain_figures.shape(find_pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for example, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                      ("second", "cog.csv", "cog2.csv", "cogged.toml")):
-        model, known = load(Path(file))
+        model, known = load_model_file(Path(file))
         (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
         drawn = explain_figures.ledger(known.ledger, known.floor or {})
         (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")

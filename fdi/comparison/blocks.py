@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.noise import floors, from_data
+from fdi.estimation.noise import find_floors, floor_from_data
 from fdi.estimation.preparation import BRIDGED_ROWS
 from fdi.estimation.repeats import align_columns
-from fdi.estimation.replay import Columns, derivative
+from fdi.estimation.replay import Columns, differentiate
 from fdi.trace.columns import bridge_gaps, rms
 from fdi.trace.trace import Trace
 from plant.forced import flow_balance, force_balance
@@ -68,22 +68,22 @@ class Split(NamedTuple):
     winner: str  # "flow", "sensor", "either"
 
 
-def balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
+def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     """Flow and force of the jack from measured XS and P12; an XS that was not measured is the replay's."""
     chosen = {name: getattr(trace, name) if name in trace.outputs else replayed[name] for name in ("p12", "xs")}
     (p12, lost), (xs, missing) = (bridge_gaps(chosen[name], BRIDGED_ROWS) for name in ("p12", "xs"))
     xj = bridge_gaps(trace.xj, BRIDGED_ROWS)[0]
-    seen = derivative(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
+    seen = differentiate(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
     bad = lost | missing | ~trace.usable
     if "p12" not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
         error = _force(trace, model, p12, xj, seen)
         p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
     bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
     sensed, speed = flow_balance(model, xs, p12, float(xj[0]))
-    lag = span(trace.period)
-    way = gained(trace.xj - sensed, lag)
+    lag = rows_in_span(trace.period)
+    way = difference_over(trace.xj - sensed, lag)
     way[_any_within(bad, lag)] = np.nan
-    dx = gained(xj, lag)
+    dx = difference_over(xj, lag)
     there = ~np.isnan(way) & ~np.isnan(dx)
     power = float(np.sum(dx[there] ** 2))
     gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
@@ -94,12 +94,12 @@ def balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     return Balance(way, force, gain, speed, sensed)
 
 
-def span(period: float) -> int:
+def rows_in_span(period: float) -> int:
     """SPAN in rows."""
     return max(1, round(SPAN / period))
 
 
-def gained(x: Floats, rows: int) -> Floats:
+def difference_over(x: Floats, rows: int) -> Floats:
     """x less what it was so many rows before; NaN at the start."""
     out = np.full(len(x), np.nan)
     out[rows:] = x[rows:] - x[:-rows]
@@ -136,7 +136,8 @@ def _resolved(speed: Floats, period: float) -> Flags:
     return out
 
 
-def split(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False) -> Split:
+def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False
+                          ) -> Split:
     """How well an error of the flow and one of the sensor describe `b.way`; xs m, p12 Pa, (n,), as in the balance.
 
     `noisy`: the sensed position changes from sample to sample by more than its noise, as no flow can make it.
@@ -144,11 +145,11 @@ def split(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy
     The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
     whose noise is in the residual itself.
     """
-    lag, x = span(trace.period), b.position
+    lag, x = rows_in_span(trace.period), b.position
     rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _rates(xs, p12)]
-    places = [x, b.speed, p12, *(play(x, width) for width in PLAYS)]
+    places = [x, b.speed, p12, *(apply_play(x, width) for width in PLAYS)]
     there = ~np.isnan(b.way)
-    columns = [gained(s, lag)[there] for s in (*rates, *places)]
+    columns = [difference_over(s, lag)[there] for s in (*rates, *places)]
     error, (rate, place, gain, both) = _left(b.way[there], columns, len(rates))
     effective = int(there.sum()) / lag
 
@@ -186,7 +187,7 @@ def _rates(xs: Floats, p12: Floats) -> list[Floats]:
             x * np.abs(p), x * p * p, edge, narrow, held, edge * np.abs(p)]
 
 
-def play(x: Floats, width: float) -> Floats:
+def apply_play(x: Floats, width: float) -> Floats:
     """x behind a play of that width, m: the elementary hysteresis."""
     out, held, half = [], float(x[0]), 0.5 * width
     for value in x.tolist():
@@ -195,7 +196,7 @@ def play(x: Floats, width: float) -> Floats:
     return np.array(out)
 
 
-def shares(found: Split, floor: float) -> tuple[float, float]:
+def share_error(found: Split, floor: float) -> tuple[float, float]:
     """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains."""
     whole = found.error / floor
     if whole**2 - 1.0 < MATTERS:
@@ -216,7 +217,7 @@ class Jack(NamedTuple):
     gain: float  # by which the ram moves further than the flow says, as a fraction
 
 
-def jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
+def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
          level: Mapping[str, float]) -> Jack | None:
     """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
 
@@ -225,35 +226,35 @@ def jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace
     The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
     more, and what that changes is what noise does.
     """
-    b = balance(trace, model, run)
+    b = compute_balance(trace, model, run)
     found = {"way": b.way, "force": b.force}
     if repeats:
-        others = [(late, balance(other, model, theirs)) for other, late, theirs in repeats]
+        others = [(late, compute_balance(other, model, theirs)) for other, late, theirs in repeats]
         pairs = [align_columns({"way": o.way, "force": o.force}, late, len(trace)) for late, o in others]
-        floor = {name: f.value for name, f in floors(found, pairs, trace.period).items()}
+        floor = {name: f.value for name, f in find_floors(found, pairs, trace.period).items()}
     else:
-        again = balance(noisier(trace, level), model, run)
+        again = compute_balance(add_noise(trace, level), model, run)
         floor = {"way": rms(again.way - b.way), "force": rms(again.force - b.force)}
     floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
     known = {name: getattr(trace, name) if name in trace.outputs else run[name] for name in ("xs", "p12")}
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
     if (~np.isnan(b.way)).sum() < FEWEST or not floor.get("way", 0.0) > 0.0:
         return None
-    noisy = from_data(trace.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
-    flow, sensor = shares(split(trace, b, xs, p12, floor["way"], noisy), floor["way"])
+    noisy = floor_from_data(trace.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
+    flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
     told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and trace.filled.mean() < SPARSE
     return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
 
 
-def noisier(trace: Trace, level: Mapping[str, float]) -> Trace:
+def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
     """The trace with noise of each signal's level added, always the same."""
     rng = np.random.default_rng(0)
     noisy = {name: trace.column(name) + size * rng.standard_normal(len(trace)) for name, size in level.items()}
     return replace(trace, **noisy)  # type: ignore[arg-type]
 
 
-def ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
+def block_ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
            controller: float | None, spool: bool = True) -> dict[str, float | None]:
     """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
 

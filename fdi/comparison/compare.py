@@ -9,13 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.comparison import blocks, controller_block
-from fdi.comparison.localisation import Motion, Place, condition, motion, places, whole
-from fdi.comparison.residual_tests import Diagnosis, diagnose
-from fdi.estimation.noise import Floor, floors, read_noise, sensor_floors
+from fdi.comparison.controller_block import ControllerBlock
+from fdi.comparison.localisation import Motion, Place, combine_residuals, describe_motion, find_condition, locate_error
+from fdi.comparison.residual_tests import ResidualTests, examine_residuals
+from fdi.estimation.noise import Floor, find_floors, sensor_floors, simulate_reading_noise
 from fdi.estimation.preparation import match_period, prepare_trace
 from fdi.estimation.repeats import Repeat, align_columns, find_repeat
-from fdi.estimation.replay import Columns, Replay, checked, closed_loop, drift, measure_misfit, open_loop, residuals
-from fdi.estimation.scatter import Scatter, scatter
+from fdi.estimation.replay import (
+    Columns,
+    Replay,
+    compute_residuals,
+    measure_drift,
+    measure_misfit,
+    replay_command,
+    replay_current,
+    replay_with_checked_steps,
+)
+from fdi.estimation.scatter import Scatter, fit_scatter
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
@@ -37,7 +47,7 @@ STAGES = 7
 
 
 @dataclass(frozen=True)
-class Signal:
+class SignalError:
     """One signal's error, SI units."""
 
     name: str
@@ -63,8 +73,8 @@ class Comparison:
     trace: Trace  # prepared for replay
     verdict: str  # WITHIN_FLOOR, MODEL_INCOMPLETE, CANNOT_TELL
     reason: str  # why it cannot tell, or ""
-    signals: Mapping[str, Signal]
-    answer: controller_block.Answer
+    signals: Mapping[str, SignalError]
+    answer: ControllerBlock
     blocks: Mapping[str, float | None]
     parts: Mapping[str, float | None]  # the jack's: "flow", "force"; and "gain", its speed over the model's less 1
     named: tuple[str, ...]  # blocks that disagree, the worst first
@@ -73,7 +83,7 @@ class Comparison:
     free_error: float  # m, RMS of XJ in a replay without anchor
     drift: float  # m/s, at which that replay departs
     scatter: Scatter | None  # None: nothing to explain
-    diagnoses: Mapping[str, Diagnosis]
+    diagnoses: Mapping[str, ResidualTests]
     replay: Replay
     motion: Motion
     closed: Columns  # residuals of the replay from the command alone, (n,)
@@ -91,30 +101,31 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, signals, source)
     model = match_period(model, trace)
-    trace, found = _in_step(trace, model, controller_block.controller(trace, model))
+    trace, found = _in_step(trace, model, controller_block.compare_controller(trace, model))
     others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
     noise = sensor_floors(trace, model)
-    replay = checked(trace, model, {name: f.value for name, f in noise.items()})
+    replay = replay_with_checked_steps(trace, model, {name: f.value for name, f in noise.items()})
     progress("repeats", 2 / STAGES)
-    runs = [(other, open_loop(other.trace, model, replay.steps)) for other in others]
-    theirs = [align_columns(residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
-    floor = _blinder(noise, replay) | floors(replay.residual, theirs, trace.period)
+    runs = [(other, replay_current(other.trace, model, replay.steps)) for other in others]
+    theirs = [align_columns(compute_residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
+    floor = _blinder(noise, replay) | find_floors(replay.residual, theirs, trace.period)
     judged = {name: np.where(_left_out(replay), np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
-    closed, (free, speed) = closed_loop(trace, model), drift(trace, model)
+    closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
     table = {name: _signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
     progress("blocks", 4 / STAGES)
     ratios, parts = _blocks(trace, model, replay.model, runs, table, found, noise)
     progress("where", 5 / STAGES)
-    m, z2 = motion(trace, replay.model), whole(judged, {name: f.value for name, f in floor.items()})
-    sections, when = places(trace, z2, m, found.limit), condition(z2, m, found.limit)
+    m = describe_motion(trace, replay.model)
+    z2 = combine_residuals(judged, {name: f.value for name, f in floor.items()})
+    sections, when = locate_error(trace, z2, m, found.limit), find_condition(z2, m, found.limit)
     verdict, reason = _verdict(table, sections, ratios, replay, trace.period)
-    diagnoses = diagnose(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
+    diagnoses = examine_residuals(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
     plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
-    scattered = scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
+    scattered = fit_scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
     progress("done", 1.0)
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, _named(ratios),
                       tuple(sections), when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
@@ -132,9 +143,9 @@ def _left_out(replay: Replay) -> NDArray[np.bool_]:
     return out
 
 
-def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> Signal:
+def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> SignalError:
     limit = LIMIT + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
-    return Signal(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
+    return SignalError(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
 
 
 def _spread(floor: Floor, samples: int) -> float:
@@ -142,7 +153,7 @@ def _spread(floor: Floor, samples: int) -> float:
     return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
 
 
-def _in_step(trace: Trace, model: Model, found: controller_block.Answer) -> tuple[Trace, controller_block.Answer]:
+def _in_step(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace, ControllerBlock]:
     """Columns that are cycles late in the file, set right; a firmware that answers late stays as it is."""
     com, xj = found.com_lag, found.xj_lag
     notes = []
@@ -164,18 +175,18 @@ def _cycles(n: int) -> str:
 
 
 def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
-            table: Mapping[str, Signal], found: controller_block.Answer,
+            table: Mapping[str, SignalError], found: ControllerBlock,
             noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, and the parts of the jack's."""
     signal = {name: s.ratio for name, s in table.items()}
     pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
-    level = {"xj": read_noise(model, trace.xj)} | {name: f.value for name, f in noise.items()}
+    level = {"xj": simulate_reading_noise(model, trace.xj)} | {name: f.value for name, f in noise.items()}
     told = model.plant == BALANCED and {"p12", "xs"} & set(trace.outputs)
-    j = blocks.jack(trace, model, run, pairs, level) if told else None
+    j = blocks.judge_jack(trace, model, run, pairs, level) if told else None
     answered = found.ratio if model.kind.controller else None
     if j is None:
-        return blocks.ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
-    ratios = blocks.ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
+        return blocks.block_ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
+    ratios = blocks.block_ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
     return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
 
 
@@ -187,7 +198,7 @@ def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
     return tuple(name for _, name in sorted(over, reverse=True))
 
 
-def _verdict(table: Mapping[str, Signal], sections: Sequence[Place], ratios: Mapping[str, float | None],
+def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
              replay: Replay, period: float) -> tuple[str, str]:
     """The verdict, and why it cannot tell."""
     coarse = [s.name for s in table.values() if s.solver_error > TOO_COARSE * s.floor.value]

@@ -24,7 +24,7 @@ BETTER = 0.1  # of the misfit at no lag, that a lag has to leave for being belie
 DISAGREES = 3.0  # times the resolution; rounding alone does not reach that
 
 
-class Answer(NamedTuple):
+class ControllerBlock(NamedTuple):
     """The controller's block."""
 
     residual: Floats  # (n,) A, Cor less what the model answers; NaN where it cannot be told
@@ -41,14 +41,14 @@ class Answer(NamedTuple):
         return self.error / self.floor
 
 
-def controller(trace: Trace, model: Model) -> Answer:
+def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     """Compare; where it does not fit, look for the cycles that Com and XJ are late. NaN where firmware is unknown."""
     if not model.kind.controller:
-        return Answer(np.full(len(trace), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
+        return ControllerBlock(np.full(len(trace), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
     found = _compared(trace, model, 0, 0)
     if found.ratio <= DISAGREES:
         return found
-    com, xj, gain = lags(trace, model["controller.current_limit"])
+    com, xj, gain = find_lags(trace, model["controller.current_limit"])
     found = found._replace(gain=gain)
     if (com, xj) == (0, 0):
         return found
@@ -56,10 +56,10 @@ def controller(trace: Trace, model: Model) -> Answer:
     return late._replace(gain=gain) if late.error < BETTER * found.error else found
 
 
-def _compared(trace: Trace, model: Model, com: int, xj: int) -> Answer:
+def _compared(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
     limit = model["controller.current_limit"]
     sensed = shift_rows(trace.xj, xj)
-    answers = firmware(model, shift_rows(trace.com, com), hold_last(sensed))
+    answers = run_firmware(model, shift_rows(trace.com, com), hold_last(sensed))
     residual = trace.cor - answers
     unknown = np.isnan(sensed) | ~trace.usable
     unknown[1:] |= unknown[:-1].copy()  # a derivative looks back by one
@@ -69,13 +69,13 @@ def _compared(trace: Trace, model: Model, com: int, xj: int) -> Answer:
     unknown[len(unknown) + min(0, com, xj):] = True
     residual[unknown] = np.nan
     gain = abs(model["controller.proportional_gain"]) + abs(model["controller.derivative_gain"]) / trace.period
-    rounding = [resolution(trace.cor), gain * resolution(trace.xj), gain * resolution(trace.com)]
-    floor = max(float(np.hypot.reduce(rounding)) / math.sqrt(12.0), FLOAT32 * limit)
+    cor, xj_step, com_step = (measure_resolution(column) for column in (trace.cor, trace.xj, trace.com))
+    floor = max(float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0), FLOAT32 * limit)
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
-    return Answer(residual, error, floor, com, xj, limit=limit)
+    return ControllerBlock(residual, error, floor, com, xj, limit=limit)
 
 
-def firmware(model: Model, com: Floats, xj: Floats) -> Floats:
+def run_firmware(model: Model, com: Floats, xj: Floats) -> Floats:
     """What the model's controller answers, (n,) A, to a demand (n,) m and a sensed position (n,) m."""
     out = np.empty(len(com))
     memory = at("command", model.effects)[1]
@@ -83,7 +83,7 @@ def firmware(model: Model, com: Floats, xj: Floats) -> Floats:
     return out
 
 
-def resolution(x: Floats) -> float:
+def measure_resolution(x: Floats) -> float:
     """The RMS step between the values that a column can hold, from the digits they are written with."""
     values = np.unique(x[~np.isnan(x)])
     values = values[:: max(1, len(values) // 400)]  # a few hundred show as many digits as all
@@ -97,7 +97,7 @@ def resolution(x: Floats) -> float:
     return float(np.sqrt(np.mean(np.maximum(steps, 10.0**-places) ** 2)))
 
 
-def lags(trace: Trace, limit: float) -> tuple[int, int, float]:
+def find_lags(trace: Trace, limit: float) -> tuple[int, int, float]:
     """Trace that Com and XJ are late in Cor = g (Com - XJ), the two that fit best; and the gain g, A/m."""
     inside = trace.usable & (np.abs(trace.cor) < 0.98 * min(limit, float(np.abs(trace.cor).max())))
     inside[:max(LAGS)], inside[min(LAGS):] = False, False

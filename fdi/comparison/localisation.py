@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.replay import Columns, derivative
+from fdi.estimation.replay import Columns, differentiate
 from fdi.trace.columns import hold_last
-from fdi.trace.sections import describe_section, sections
+from fdi.trace.sections import describe_section, find_sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -53,12 +53,12 @@ class Motion(NamedTuple):
     reversed_for: Floats  # s since the ram last reversed; inf before
 
 
-def motion(trace: Trace, model: Columns) -> Motion:
+def describe_motion(trace: Trace, model: Columns) -> Motion:
     """What the replay of the `model` does, whose noise is not in the residuals, and how long ago it last reversed."""
     x = model["xj"]
     size = max(5, round(SMOOTH / trace.period) | 1)
-    v = derivative(x, size, 1) / trace.period
-    a = derivative(x, 2 * size + 1, 2) / trace.period**2
+    v = differentiate(x, size, 1) / trace.period
+    a = differentiate(x, 2 * size + 1, 2) / trace.period**2
     sign = np.where(np.abs(v) > REVERSES, np.sign(v), np.nan)
     sign = hold_last(sign)
     turns = np.flatnonzero((np.diff(sign) != 0.0) & (sign[:-1] != 0.0)) + 1
@@ -69,7 +69,7 @@ def motion(trace: Trace, model: Columns) -> Motion:
     return Motion(x, v, a, model["p12"], model["xs"], trace.cor, since)
 
 
-def whole(residual: Columns, floor: Mapping[str, float]) -> Floats:
+def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
     """Squared error over squared floor, mean of the signals, (n,); 1 on average where only noise is left."""
     parts = [(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0]
     with np.errstate(invalid="ignore"):
@@ -80,11 +80,11 @@ def whole(residual: Columns, floor: Mapping[str, float]) -> Floats:
     return out
 
 
-def places(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
+def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
     """The sections of the command with their shares of `z2` (n,), the largest first; `limit` A of the current."""
     total = float(np.nansum(z2))
     out = []
-    for section in sections(trace.com, trace.period):
+    for section in find_sections(trace.com, trace.period):
         rows = slice(section.start, section.stop)
         inside = z2[rows]
         there = ~np.isnan(inside)
@@ -93,14 +93,14 @@ def places(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
         chosen = np.zeros(len(z2), bool)
         chosen[rows] = True
         share = float(np.nansum(inside)) / total
-        said = condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
+        said = find_condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
         words = describe_section(section, float(np.abs(trace.com[rows]).max()))
         t0, t1 = float(trace.t[section.start]), float(trace.t[section.stop - 1] + trace.period)
         out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), said))
     return sorted(out, key=lambda place: -place.share)
 
 
-def condition(z2: Floats, m: Motion, limit: float) -> str:
+def find_condition(z2: Floats, m: Motion, limit: float) -> str:
     """The condition under which the excess of `z2` (n,) over 1 is gathered, in words; "" if under none."""
     there = ~np.isnan(z2)
     excess = np.where(there, z2 - 1.0, 0.0)

@@ -55,7 +55,7 @@ class Depends(NamedTuple):
     half: Floats  # half width of the means' 95 % interval
 
 
-class Diagnosis(NamedTuple):
+class ResidualTests(NamedTuple):
     """One signal's residual."""
 
     memory: float  # s, until the autocorrelation has fallen below 1/e
@@ -71,10 +71,11 @@ class Diagnosis(NamedTuple):
     depends: tuple[Depends, ...]  # the largest share first
 
 
-def diagnose(trace: Trace, residual: Columns, repeats: Mapping[str, Floats], m: Motion) -> dict[str, Diagnosis]:
+def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Floats], m: Motion
+                      ) -> dict[str, ResidualTests]:
     """Each signal's residual (n,); `repeats`: the difference to a repeat's residual over sqrt 2, where there is one."""
     inputs = {"Cor": trace.cor, "Com": trace.com} | ({"load": trace.load} if np.ptp(trace.load) > 0.0 else {})
-    colours = {name: colour(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
+    colours = {name: fit_whitener(np.diff(u)) for name, u in inputs.items() if np.ptp(u) > 0.0}
     quantities = {"speed": m.v, "position": m.x, "P12": m.p12, "acceleration": m.a}
     found = {}
     for name, r in residual.items():
@@ -84,7 +85,7 @@ def diagnose(trace: Trace, residual: Columns, repeats: Mapping[str, Floats], m: 
     return found
 
 
-def colour(x: Floats) -> Floats:
+def fit_whitener(x: Floats) -> Floats:
     """The filter, (p + 1,), that makes x (n,) white: its autoregressive model by Yule and Walker. WHITE if it rests.
 
     Short of what scipy.signal and a choice of order would make of it, but without their second of import.
@@ -102,30 +103,30 @@ def colour(x: Floats) -> Floats:
     return out
 
 
-def whiten(x: Floats, by: Floats) -> Floats:
+def apply_whitener(x: Floats, by: Floats) -> Floats:
     """x (n,) through the filter of a colour; NaN counts as 0."""
     out: Floats = np.convolve(np.nan_to_num(x), by)[:len(x)]
     return out
 
 
 def _one(trace: Trace, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Floats]],
-         quantities: Mapping[str, Floats]) -> Diagnosis:
+         quantities: Mapping[str, Floats]) -> ResidualTests:
     r = np.nan_to_num(residual)
-    e = whiten(r, colour(difference) if difference is not None else WHITE)
-    own = autocorrelation(e)
+    e = apply_whitener(r, fit_whitener(difference) if difference is not None else WHITE)
+    own = autocorrelate(e)
     band = float(ndtri(0.5 + CONFIDENCE / 2)) / math.sqrt(len(e))
-    frequencies, power, departs, allowed = cumulative(e, trace.period)
-    _, plain, _, _ = cumulative(r, trace.period)
+    frequencies, power, departs, allowed = cumulate_periodogram(e, trace.period)
+    _, plain, _, _ = cumulate_periodogram(r, trace.period)
     half = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
-    quiet = autocorrelation(np.nan_to_num(difference)) if difference is not None else np.eye(1, REACH + 1)[0]
-    follows = tuple(follow(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
-    found = [depend(name, q, residual) for name, q in quantities.items()]
+    quiet = autocorrelate(np.nan_to_num(difference)) if difference is not None else np.eye(1, REACH + 1)[0]
+    follows = tuple(correlate_with_input(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
+    found = [bin_residual(name, q, residual) for name, q in quantities.items()]
     depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
-    return Diagnosis(_memory(autocorrelation(r)) * trace.period, _memory(quiet) * trace.period, own, band, frequencies,
-                     power, departs, allowed, half, follows, tuple(depends))
+    return ResidualTests(_memory(autocorrelate(r)) * trace.period, _memory(quiet) * trace.period, own, band,
+                         frequencies, power, departs, allowed, half, follows, tuple(depends))
 
 
-def autocorrelation(x: Floats) -> Floats:
+def autocorrelate(x: Floats) -> Floats:
     """At lags 0..REACH, of a residual that would be zero: its mean is not taken off."""
     whole = correlate(x, x, 0, REACH)
     out: Floats = whole / whole[0] if whole[0] > 0.0 else np.eye(1, len(whole))[0]
@@ -149,7 +150,7 @@ def _memory(correlation: Floats) -> int:
     return int(below[0]) if len(below) else len(correlation)
 
 
-def cumulative(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:
+def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:
     """Frequencies, cumulative periodogram 0..1, its largest distance from the straight line, and Bartlett's 95 % band.
 
     Box and Jenkins: for white noise the distance is that of Kolmogorov and Smirnov for as many samples as frequencies.
@@ -163,9 +164,9 @@ def cumulative(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:
     return frequencies, added, float(np.abs(added - line).max()), allowed
 
 
-def follow(name: str, u: Floats, by: Floats, residual: Floats, period: float) -> Follows:
+def correlate_with_input(name: str, u: Floats, by: Floats, residual: Floats, period: float) -> Follows:
     """Cross-correlation with an input (n,); both are filtered `by` the colour of its steps to make them white."""
-    steps, left = (whiten(np.diff(x), by) for x in (u, residual))
+    steps, left = (apply_whitener(np.diff(x), by) for x in (u, residual))
     # a jump of the command would stand for the whole test
     steps, left = (np.clip(x, -WILD * x.std(), WILD * x.std()) for x in (steps, left))
     size = math.sqrt(float(np.sum(left**2)) * float(np.sum(steps**2))) or 1.0
@@ -173,12 +174,12 @@ def follow(name: str, u: Floats, by: Floats, residual: Floats, period: float) ->
     lags: Floats = np.linspace(-BEFORE * period, AFTER * period, AFTER + BEFORE + 1)
     peak = BEFORE + 1 + int(np.abs(curve[BEFORE + 1:]).argmax())  # what comes before its cause is feedback
     # Bartlett: what is left of both colours widens the band. Of all lags the largest is taken: they share the 1 %
-    wider = 1.0 + 2.0 * float(np.sum(autocorrelation(left)[1:] * autocorrelation(steps)[1:]))
+    wider = 1.0 + 2.0 * float(np.sum(autocorrelate(left)[1:] * autocorrelate(steps)[1:]))
     bound = float(ndtri(1 - (1 - CONFIDENCE) / 2 / AFTER)) * math.sqrt(max(wider, 1.0) / len(steps))
     return Follows(name, float(curve[peak]), float(lags[peak]), bound, lags, curve)
 
 
-def depend(name: str, quantity: Floats, residual: Floats) -> Depends | None:
+def bin_residual(name: str, quantity: Floats, residual: Floats) -> Depends | None:
     """Means of the residual (n,) over BINS of the quantity (n,) with as many samples in each; None for too few."""
     there = ~np.isnan(quantity) & ~np.isnan(residual)
     q, r = quantity[there], residual[there]
@@ -191,17 +192,17 @@ def depend(name: str, quantity: Floats, residual: Floats) -> Depends | None:
     means = np.bincount(where, r, len(edges) - 1) / count
     centres = np.bincount(where, q, len(edges) - 1) / count
     spread = np.sqrt(np.maximum(np.bincount(where, r**2, len(edges) - 1) / count - means**2, 0.0))
-    own = autocorrelation(r - means[where])
+    own = autocorrelate(r - means[where])
     first = int(np.argmax(own < 0.05)) or len(own)
     thin = 1.0 + 2.0 * float(own[1:first].sum())  # neighbours say the same: as many samples count as one
     half = float(ndtri(0.975)) * spread * np.sqrt(thin / count)
     chance = float(np.sum(spread**2 * thin) / len(r))  # what the means would hold by chance
     share = max(0.0, float(np.average(means**2, weights=count)) - chance) / power
     largest = float(means[np.abs(means).argmax()])
-    return Depends(name, share, shape(centres, means, count), largest, centres, means, half)
+    return Depends(name, share, name_shape(centres, means, count), largest, centres, means, half)
 
 
-def shape(x: Floats, means: Floats, count: Floats) -> str:
+def name_shape(x: Floats, means: Floats, count: Floats) -> str:
     """Which of SHAPES holds most of the means, if it holds nearly all."""
     scale = float(np.abs(x).max()) or 1.0
     weights = np.sqrt(count)

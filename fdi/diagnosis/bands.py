@@ -30,7 +30,7 @@ from fdi.thresholds import (
     SECTION_MEASURED_SHARE,
 )
 from fdi.trace.columns import hold_last
-from fdi.trace.sections import Section, describe_section, sections
+from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -223,7 +223,7 @@ def check_command(bands: Bands, found: Sequence[Section], period: float, where: 
 def matches_command(bands: Bands, com: Floats, period: float) -> bool:
     """Whether the bands are of this command, (n,) m."""
     try:
-        check_command(bands, sections(com, period), period, "")
+        check_command(bands, find_sections(com, period), period, "")
     except InputError:
         return False
     return True
@@ -331,7 +331,7 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
     """
     if np.isnan(xj).all():
         raise InputError(where, "xj", "a measured position: bands judge nothing else")
-    parts = parts or sections(com, period)
+    parts = parts or find_sections(com, period)
     check_command(bands, parts, period, where)
     if load is not None and is_loaded(load) and "load" not in bands.provenance:
         most = float(np.nanmax(np.abs(load)))

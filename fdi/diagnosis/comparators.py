@@ -17,7 +17,7 @@ from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.columns import hold_last
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -74,7 +74,7 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     Raises:
         InputError: a command or a trace that shows no precursors.
     """
-    com, parts = hold_last(trace.com), sections(trace.com, trace.period)
+    com, parts = hold_last(trace.com), find_sections(trace.com, trace.period)
     xj, rows = trace.measured("xj"), np.arange(len(trace))
     there = ~np.isnan(xj)
     own = compute_features(com, np.interp(rows, rows[there], xj[there])[None], trace.period, parts)

@@ -24,7 +24,7 @@ from fdi.thresholds import (
     SUSPECT_SMALLEST,
     UNIT_TOLERANCE,
 )
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -128,7 +128,7 @@ def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | Non
 
 
 def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
-    kinds = {s.kind for s in sections(trace.com, trace.period)}
+    kinds = {s.kind for s in find_sections(trace.com, trace.period)}
     if not kinds & {"step", "ramp"}:
         notes.append("no RMS grid: the command has neither steps nor ramps")
         return None

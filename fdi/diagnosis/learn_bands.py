@@ -46,7 +46,7 @@ from fdi.thresholds import (
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
 )
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -109,7 +109,7 @@ def simulate_bands(model: Model, com: Floats, load: Floats, period: float, count
     Raises:
         InputError: a command without steps and ramps, or a period that is not the model's.
     """
-    parts = sections(com, period)
+    parts = find_sections(com, period)
     if not any(s.kind in ("step", "ramp") for s in parts):
         raise InputError("trace", "com", "a command with steps or slow ramps: bands are drawn around those")
     if abs(period / model["controller.period"] - 1) > 0.01:
@@ -281,7 +281,7 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
         raise InputError(name, "xj", f"a whole position, not one with {100 * missing.mean():.0f} % missing")
     if abs(period / base.period - 1) > 0.01:
         raise InputError(name, "t", f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
-    parts = sections(com, period)
+    parts = find_sections(com, period)
     check_command(base, parts, period, name)
     own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
     n = base.sections[-1].stop

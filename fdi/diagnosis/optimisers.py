@@ -22,7 +22,7 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.likelihood import misfit
+from fdi.estimation.likelihood import compute_misfit
 from fdi.trace.trace import Trace
 from plant.model import Model
 
@@ -57,7 +57,7 @@ class Objective:
 
     def __call__(self, points: Floats) -> Floats:
         """Misfits, (m,), of points (m, 3)."""
-        cost: Floats = misfit(self._white(points))
+        cost: Floats = compute_misfit(self._white(points))
         return cost
 
     def report(self, method: str, point: Sequence[float]) -> Attempt:

@@ -24,7 +24,7 @@ from fdi.diagnosis.bands import (
 )
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.thresholds import POSITION_MISSING_SHARE
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -94,7 +94,7 @@ def measure_precursors(source: Trace, bands: Bands | None = None) -> dict[str, P
         return {}
     rows = np.arange(len(xj))
     whole = np.interp(rows, rows[~missing], xj[~missing])
-    found = compute_features(com, whole[None], period, sections(com, period))
+    found = compute_features(com, whole[None], period, find_sections(com, period))
     known = bands.precursors if bands is not None else {}
     return {name: _make_precursor(name, float(values[0]), known.get(name, {})) for name, values in found.items()}
 

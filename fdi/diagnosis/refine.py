@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
-from fdi.estimation.final_rounds import descended, first_widths
+from fdi.estimation.final_rounds import descend_valley, first_covariance
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem, misfit, typical
-from fdi.estimation.unidentifiable import flats
-from fdi.estimation.unknowns import Free, effect_unknowns, free_of, limit_dynamic_friction, quiet
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.estimation.unknowns import Free, all_unknowns, effect_unknowns, limit_dynamic_friction, silence_readings
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
@@ -132,7 +132,7 @@ def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]
     usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
     ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
     taken = {f.name for f in (clogging, *friction, *suspects, ratio)}
-    tolerances = (_take_logarithm(f) for f in free_of(model) if f.name not in taken)
+    tolerances = (_take_logarithm(f) for f in all_unknowns(model) if f.name not in taken)
     return (clogging, *friction, *suspects, ratio, *tolerances)
 
 
@@ -192,7 +192,7 @@ class Refined:
     @property
     def reached(self) -> bool:
         """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
-        usual = typical(self.fit.residuals)
+        usual = compute_typical_rms(self.fit.residuals)
         near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
         return near and max(self.ratio.values()) <= RESIDUAL_WORST
 
@@ -215,8 +215,9 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
                  ) -> CountedProblem:
     """The model with the suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI."""
     level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
-    ready = quiet(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
-    return CountedProblem(ready, trace, tuple(noises.white(level[name]) for name in trace.outputs), workers=workers)
+    ready = silence_readings(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
+    noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
+    return CountedProblem(ready, trace, noise, workers=workers)
 
 
 def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
@@ -259,7 +260,7 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     fine = replace(problem, steps=FINE_STEPS, _lanes={})
     last = first
     for rounds in (4, 8):
-        last = descended(fine, last, rounds, flats(problem, first.free, last.x))
+        last = descend_valley(fine, last, rounds, find_flat_directions(problem, first.free, last.x))
         if _is_explained(problem, last):
             return last
     signals = problem.trace.outputs
@@ -285,7 +286,8 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
 
     def fit_from(part: float) -> Fit:
         begun = _fit_in_stages(alone, free, found.x + part * (home - found.x))
-        return descended(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flats(alone, free, begun.x))
+        flat = find_flat_directions(alone, free, begun.x)
+        return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat)
 
     return min(found, *mapped(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
@@ -299,8 +301,9 @@ def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> 
 
 
 def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
-    start = replace(found, covariance=first_widths(found.free))
-    return descended(_scale_noise(problem, factor), start, rounds, flats(problem, found.free, found.x))
+    start = replace(found, covariance=first_covariance(found.free))
+    flat = find_flat_directions(problem, found.free, found.x)
+    return descend_valley(_scale_noise(problem, factor), start, rounds, flat)
 
 
 def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
@@ -328,7 +331,7 @@ def _scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
 def start_fit(free: Sequence[Free], x: Floats) -> Fit:
     """A fit at `x` (p,) before its first round."""
     none = np.empty((0, 0))
-    return Fit(tuple(free), x, np.inf, np.inf, first_widths(free), none, none, none)
+    return Fit(tuple(free), x, np.inf, np.inf, first_covariance(free), none, none, none)
 
 
 def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
@@ -339,7 +342,7 @@ def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
 
     def try_starts(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
         x = np.array([make_start(free, *s, offsets, sliding) for s in tried])
-        costs = misfit(loud.whitened(loud.residuals(free, x)))
+        costs = compute_misfit(loud.whitened(loud.residuals(free, x)))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 
@@ -377,7 +380,7 @@ def _learn_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     learnt = []
     for old, r in zip(problem.noise, found.residuals, strict=True):
         is_noise = float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level
-        learnt.append(noises.fitted(r) if is_noise else old)
+        learnt.append(noises.fit_noise(r) if is_noise else old)
     return replace(problem, noise=tuple(learnt), _lanes={})
 
 

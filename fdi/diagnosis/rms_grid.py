@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.preparation import read_cycles
-from fdi.estimation.replay import ANCHOR, known_start
-from fdi.trace.sections import Section, sections
+from fdi.estimation.replay import ANCHOR, has_known_start
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -94,7 +94,7 @@ def search_grid(trace: Trace, model: Model | None = None, kintas: Floats = KINTA
         trace = read_cycles(trace, model)[0]
     if drive not in DRIVES:
         raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
-    parts = sections(trace.com, trace.period)
+    parts = find_sections(trace.com, trace.period)
     rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _select_rows(trace, parts, kind)).any()}
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
@@ -145,10 +145,11 @@ def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, slidin
 
     monitor = Monitor(model, sliding=sliding)
     if drive == "command":
-        start = float(trace.xj[0]) if known_start(trace) else 0.0
+        start = float(trace.xj[0]) if has_known_start(trace) else 0.0
         out = monitor.closed_loop(values, trace.com, start, reduced=reduce_runs)
     else:
-        out = monitor.replay(values, trace.cor, trace.xj if known_start(trace) else None, ANCHOR, reduced=reduce_runs)
+        position = trace.xj if has_known_start(trace) else None
+        out = monitor.replay(values, trace.cor, position, ANCHOR, reduced=reduce_runs)
     return dict(zip(rows, out.T, strict=True))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
-from fdi.estimation.unknowns import limit_dynamic_friction, tolerances
+from fdi.estimation.unknowns import limit_dynamic_friction, tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
 from plant.lanes import Lanes
@@ -42,7 +42,7 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
     what that leaves out. Every other block of units moved before its test and came to rest wherever friction left it;
     the others start at rest at null, as a model does.
     """
-    tolerance = tolerances(model)
+    tolerance = tolerance_sizes(model)
     names = list(dict.fromkeys([*tolerance, CLOGGING.parameter, FRICTION.parameter, DYNAMIC]))
     lanes = Lanes(model, names, steps, workers=1)
     out = np.empty((count, len(com)))

@@ -44,7 +44,7 @@ class States(NamedTuple):
     time: Floats
 
 
-def balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
+def compute_balances(search: Search, h: Hypothesis) -> tuple[list[Balance], States]:
     """The balances of ram, valve and torque motor under a hypothesis, the most unbalanced first.
 
     Each is taken on the measurement and on the model's own replay, smoothed alike; the difference is what is missing.

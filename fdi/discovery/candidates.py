@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.explain import BETTER, HELD_OUT, Explanation, gain
-from fdi.discovery.fingerprints import Fingerprint, resolution
+from fdi.discovery.explain import BETTER, HELD_OUT, Explanation, measure_gain
+from fdi.discovery.fingerprints import Fingerprint, firmware_resolution
 from fdi.discovery.search import REACHED, Hypothesis
-from fdi.discovery.significance import p_value, smallest_visible
+from fdi.discovery.significance import compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit
 from fdi.estimation.unknowns import UNREPLAYED, limit_friction_values
 from fdi.trace.signals import SIGNALS
@@ -109,22 +109,23 @@ class Answer:
         return tuple(found.values())
 
 
-def told(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None) -> Answer:
+def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None
+                       ) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
     hand = _firmware(e)
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
-        unit = resolution(e.search.problem.model)
+        unit = firmware_resolution(e.search.problem.model)
         baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
-    blind = tuple(_blind(name, size, model) for name, size in smallest_visible(e.blind).items())
+    blind = tuple(_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
     noiseless = tuple(c.name for c in offered(model.plant) if c.port in UNREPLAYED and c.fitted)
-    return Answer(e, tuple(_candidates(e, seed)), baseline, blind, noiseless, tuple(suspicious(best, model.plant)),
+    return Answer(e, tuple(_candidates(e, seed)), baseline, blind, noiseless, tuple(list_suspicious(best, model.plant)),
                   tuple(_ledger(e, hand)), pattern, separate or {})
 
 
-def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
+def fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
     found = {}
     values, entry = limit_friction_values(fit.values), CATALOGUE[effect]
@@ -141,7 +142,7 @@ def fitted(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     return found
 
 
-def suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
+def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
     """Parameters that are more than `FAR` tolerances from where a healthy unit has them."""
     return [Suspicious(f.name, f.value(float(x)), meaning(f.name, plant=plant).unit, float(x))
             for f, x in zip(fit.free, fit.x, strict=True) if np.isfinite(f.prior) and abs(x) > FAR * f.prior]
@@ -158,13 +159,13 @@ def _candidates(e: Explanation, seed: int) -> list[Candidate]:
 
 
 def _candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
-    won, extra = gain(e.base, h), _unknown(h.fit) - _unknown(e.base.fit)
+    won, extra = measure_gain(e.base, h), _unknown(h.fit) - _unknown(e.base.fit)
     samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
     charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
-    values = fitted(effect, h.fit, e.search.problem.model)
+    values = fitted_parameters(effect, h.fit, e.search.problem.model)
     return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
                      dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * won - charge,
-                     p_value(e.blind, won, max(extra, 1), seed), _word(e, h, effect))
+                     compute_p_value(e.blind, won, max(extra, 1), seed), _word(e, h, effect))
 
 
 def _unknown(fit: Fit) -> int:
@@ -194,7 +195,7 @@ def _printed(e: Explanation, p: Fingerprint) -> Candidate:
     values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
     error, ratios = dict(e.base.errors), dict(e.base.ratio)
     if CATALOGUE[p.effect].firmware:
-        error["cor"] = p.after * resolution(e.search.problem.model)
+        error["cor"] = p.after * firmware_resolution(e.search.problem.model)
         ratios = {"cor": p.after}
     n = len(e.search.problem.trace)
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
@@ -213,7 +214,7 @@ def _blind(name: str, size: float, model: Model) -> Blind:
 
 def _ledger(e: Explanation, hand: Sequence[Fingerprint]
             ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
-    unit = resolution(e.search.problem.model)
+    unit = firmware_resolution(e.search.problem.model)
     cor = {"cor": e.controller * unit} if hand else {}
     rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
         (None, e.base.errors | cor, e.holdout.get((), {}))]
@@ -238,7 +239,7 @@ def to_json(a: Answer) -> dict[str, Any]:
         "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNALS[s].symbol for s in e.floor}}
     if several:
         found["ledger"] = [{"effect": effect, "error": error, "holdout": held} for effect, error, held in a.ledger]
-    return dict(plain(found))
+    return dict(to_plain(found))
 
 
 def _row(c: Candidate) -> dict[str, Any]:
@@ -246,12 +247,12 @@ def _row(c: Candidate) -> dict[str, Any]:
     return row | {"with": list(row.pop("beside"))}
 
 
-def plain(x: Any) -> Any:
+def to_plain(x: Any) -> Any:
     """As JSON has it: dicts, lists, and null for a number that is none."""
     if isinstance(x, Mapping):
-        return {key: plain(value) for key, value in x.items()}
+        return {key: to_plain(value) for key, value in x.items()}
     if isinstance(x, (list, tuple)):
-        return [plain(value) for value in x]
+        return [to_plain(value) for value in x]
     if isinstance(x, (float, np.floating)):
         return float(x) if math.isfinite(x) else None
     return x

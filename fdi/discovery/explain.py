@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.fingerprints import Fingerprint, comb, firmware
+from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
 from fdi.discovery.search import Hypothesis, Search
-from fdi.discovery.significance import SEEN, Sensitivity, sensitivity
-from fdi.estimation.likelihood import Problem, typical
+from fdi.discovery.significance import SEEN, Sensitivity, compute_sensitivity
+from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -61,8 +61,8 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         progress: called with each stage and the share done, 0 to 1.
         workers: threads; default one a core.
     """
-    controller, prints = firmware(model, [est, *repeats])
-    tooth = comb(est)
+    controller, prints = find_firmware_marks(model, [est, *repeats])
+    tooth = find_quantisation(est)
     found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
     candidates = [e.name for e in offered(model.plant) if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, workers)
@@ -121,8 +121,8 @@ def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
 def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Trace) -> bool:
     """Whether a hypothesis leaves less of a held-out run than another, in the typical block, all signals together."""
     floor = search.floor(after)
-    left = [np.array([e / floor[s] for s, e in zip(holdout.outputs, typical(_unseen(search, h, holdout)), strict=True)])
-            for h in (before, after)]
+    noise = np.array([floor[s] for s in holdout.outputs])
+    left = [compute_typical_rms(_unseen(search, h, holdout)) / noise for h in (before, after)]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
     return excess[1] < BETTER * excess[0]
 
@@ -134,14 +134,14 @@ def _distinct(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
     return list(best.values())
 
 
-def gain(parent: Hypothesis, h: Hypothesis) -> float:
+def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
     """What a hypothesis gains in -2 log likelihood: on its own run, and no more than about that on the repeats."""
     own = parent.cost - h.cost
     return min(own, 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
 def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool:
-    return gain(parent, h) > least
+    return measure_gain(parent, h) > least
 
 
 def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
@@ -167,11 +167,12 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     if search.solver_error(close[0] if close else base, floor) > COARSE:
         search.refine(FINEST, TRUEST)
         base, close = search.settle(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
-    held = {h.effects: held_out(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
+    held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
     verdict, named = _verdict(base, close, holding, part, found, controller, floor)
-    blind = sensitivity(search.problem, (close[0] if close and verdict == "EXPLAINED" else base).fit, search.effects)
+    explained = close[0] if close and verdict == "EXPLAINED" else base
+    blind = compute_sensitivity(search.problem, explained.fit, search.effects)
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
                        blind, search)
 
@@ -206,7 +207,7 @@ def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hy
             return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
-    least = gain(base, best)
+    least = measure_gain(base, best)
     if base.reached and least < CONVINCING:
         return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
     there = [h for h in holding if h.reached]
@@ -225,11 +226,11 @@ def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
 
 
 def _holds(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
-    left = typical(_unseen(search, h, trace))
+    left = compute_typical_rms(_unseen(search, h, trace))
     return all(e <= HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
 
 
-def held_out(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
+def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
     """RMS residual on a run that the fit never saw, SI units."""
     residuals = _unseen(search, h, trace)
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(trace.outputs, residuals, strict=True)}

@@ -30,13 +30,13 @@ class Fingerprint(NamedTuple):
     after: float  # with it
 
 
-def resolution(model: Model) -> float:
+def firmware_resolution(model: Model) -> float:
     """How exactly the firmware's answer follows from what a trace holds, A rms: counts of com, XJ, Cor on the bus."""
     counts = np.array([BUS_CURRENT, *(2 * [model["controller.proportional_gain"] * BUS_POSITION])])
     return float(np.sqrt((counts**2).sum() / 12.0))
 
 
-def firmware_residual(model: Model, trace: Trace) -> Floats:
+def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     firmware = tuple(e for e in model.effects if CATALOGUE[e].firmware)
     own = replace(model, effects=firmware)
@@ -47,14 +47,14 @@ def firmware_residual(model: Model, trace: Trace) -> Floats:
     return out - measured
 
 
-def firmware(model: Model, traces: Sequence[Trace]) -> tuple[float, list[Fingerprint]]:
+def find_firmware_marks(model: Model, traces: Sequence[Trace]) -> tuple[float, list[Fingerprint]]:
     """RMS of Cor against the model's firmware in units of its resolution, and the firmware effects that explain it.
 
     Of a plant whose controller is not known, neither.
     """
     if not model.kind.controller:
         return 0.0, []
-    unit = resolution(model)
+    unit = firmware_resolution(model)
     before = _rms(model, traces) / unit
     found = []
     if before > 3.0:
@@ -65,7 +65,7 @@ def firmware(model: Model, traces: Sequence[Trace]) -> tuple[float, list[Fingerp
 
 
 def _rms(model: Model, traces: Sequence[Trace]) -> float:
-    return float(np.sqrt(np.mean([np.nanmean(firmware_residual(model, r) ** 2) for r in traces])))
+    return float(np.sqrt(np.mean([np.nanmean(compute_firmware_residual(model, r) ** 2) for r in traces])))
 
 
 def _sized(model: Model, traces: Sequence[Trace], name: str, before: float) -> Fingerprint:
@@ -74,7 +74,7 @@ def _sized(model: Model, traces: Sequence[Trace], name: str, before: float) -> F
     parameter = entry.fitted[0]
     usual = [abs(s[parameter]) for s in entry.starts]
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
-    unit, ready = resolution(model), model.having([name])
+    unit, ready = firmware_resolution(model), model.having([name])
 
     def left(size: float) -> float:
         return _rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
@@ -88,7 +88,7 @@ def _sized(model: Model, traces: Sequence[Trace], name: str, before: float) -> F
     return Fingerprint(name, {parameter: (value, float(np.exp(low)), float(np.exp(high)))}, before, errors[k])
 
 
-def comb(trace: Trace) -> Fingerprint | None:
+def find_quantisation(trace: Trace) -> Fingerprint | None:
     """A transducer with few bits: every sensed position is a multiple of one step."""
     x = trace.position[~np.isnan(trace.position)]
     levels = np.unique(x)

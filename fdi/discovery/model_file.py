@@ -80,7 +80,7 @@ def _source(said: Mapping[str, Any], name: str) -> Source | None:
     return Source(said[name], said[f"{name}_sha256"]) if name in said else None
 
 
-def load(path: Path) -> tuple[Model, Provenance]:
+def load_model_file(path: Path) -> tuple[Model, Provenance]:
     """A model file with its provenance.
 
     Raises:
@@ -96,7 +96,7 @@ def load(path: Path) -> tuple[Model, Provenance]:
     return parse_model(tables, path, path.stem), found
 
 
-def original(model: Model, p: Provenance) -> Model:
+def remove_all_effects(model: Model, p: Provenance) -> Model:
     """The model as it was before any effect was added, tolerances included."""
     added = [CATALOGUE[name] for name in p.effects]
     theirs = {name for e in added if not e.base for name in e.off}
@@ -104,7 +104,7 @@ def original(model: Model, p: Provenance) -> Model:
     return replace(model, values=values, effects=tuple(e for e in model.effects if e not in p.effects))
 
 
-def without(model: Model, p: Provenance, name: str) -> tuple[Model, Provenance]:
+def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Provenance]:
     """The model and its provenance with an effect taken out; all else keeps its value.
 
     Raises:
@@ -123,7 +123,7 @@ def without(model: Model, p: Provenance, name: str) -> tuple[Model, Provenance]:
     return found, replace(p, effects=tuple(e for e in p.effects if e != name))
 
 
-def written(model: Model, intervals: Mapping[str, Value], p: Provenance) -> str:
+def format_model_file(model: Model, intervals: Mapping[str, Value], p: Provenance) -> str:
     """The model file's text, 95 % intervals beside what was fitted."""
     return "\n".join([*_with_intervals(model.to_toml().splitlines(), intervals), "", *_table(p)]) + "\n"
 

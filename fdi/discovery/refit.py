@@ -7,22 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.explain import gain, held_out
-from fdi.discovery.fingerprints import comb, firmware
-from fdi.discovery.scan import Prospect, scan
+from fdi.discovery.explain import measure_gain, measure_holdout
+from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
+from fdi.discovery.scan import Prospect, scan_effects
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.final_rounds import settled
-from fdi.estimation.fit import Fit, improved, linearised
-from fdi.estimation.likelihood import misfit
+from fdi.estimation.final_rounds import finish_fit
+from fdi.estimation.fit import Fit, continue_fit, linearise
+from fdi.estimation.likelihood import compute_misfit
 from fdi.estimation.unknowns import (
     UNREPLAYED,
     Free,
+    active_effects,
+    all_unknowns,
+    complete_model,
     effect_unknowns,
-    effects_of,
-    free_of,
     limit_friction_values,
-    quiet,
-    whole,
+    silence_readings,
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
@@ -75,10 +75,10 @@ class Refit:
         if CATALOGUE[name].port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
-        return gain(before.hypothesis, after.hypothesis) > HELPS and not worse
+        return measure_gain(before.hypothesis, after.hypothesis) > HELPS and not worse
 
 
-def refit(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
+def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
           holdout: Trace | None = None, progress: Progress = ignore_progress,
           begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
     """Add effects to a model in this order.
@@ -97,13 +97,13 @@ def refit(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence
     Raises:
         InputError: an effect that cannot be added to this model or be fitted to these runs.
     """
-    addable(original, effects)
+    check_addable(original, effects)
     marks = _marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
                     workers)
-    model = lean(search.model, replayed)
+    model = lean_model(search.model, replayed)
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
     progress("fitting the model as it is", 0.1)
@@ -122,14 +122,14 @@ def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     coarse = search.problem.steps
     search.refine(STEPS, STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
-    last = settled(search.problem, chain[-1].fit, LAST, slopes)
+    last = finish_fit(search.problem, chain[-1].fit, LAST, slopes)
     if last.misfit > POOR * np.count_nonzero(last.white):
         again = replace(last, x=np.where(_healthy(last.free), 0.0, last.x))
-        last = min(last, settled(search.problem, again, LAST, slopes), key=lambda fit: fit.cost)
+        last = min(last, finish_fit(search.problem, again, LAST, slopes), key=lambda fit: fit.cost)
     done = [search.judged(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
         begun = _nearer(search, h.fit, done[0].fit)
-        done.insert(0, search.judged(h.effects, settled(search.problem, begun, BEFORE, slopes)))
+        done.insert(0, search.judged(h.effects, finish_fit(search.problem, begun, BEFORE, slopes)))
     return done
 
 
@@ -143,13 +143,13 @@ def _nearer(search: Search, fit: Fit, other: Fit) -> Fit:
     moved = np.array([there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own])
     prior = np.array([f.prior**-2 for f in fit.free])
     trials = np.array([fit.x, moved])
-    costs = misfit(search.problem.whitened(search.problem.residuals(fit.free, trials))) + trials**2 @ prior
+    costs = compute_misfit(search.problem.whitened(search.problem.residuals(fit.free, trials))) + trials**2 @ prior
     return replace(fit, x=trials[int(np.argmin(costs))])
 
 
-def lean(model: Model, effects: Sequence[str]) -> Model:
+def lean_model(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
-    every, own = whole(model), quiet(model.having(effects))
+    every, own = complete_model(model), silence_readings(model.having(effects))
     quick = {e for rung in ladder(every)[:-1] for e in rung.model.effects}
     return every if set(own.effects) <= quick else own
 
@@ -158,18 +158,18 @@ def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float])
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
     own = [u for name in effects for u in effect_unknowns(CATALOGUE[name], search.model)]
     taken = {u.name for u in own}
-    free = (*(f for f in free_of(search.model) if f.name not in taken), *own)
+    free = (*(f for f in all_unknowns(search.model) if f.name not in taken), *own)
     x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
-    return improved(search.problem, linearised(search.problem, free, x), FIRST)
+    return continue_fit(search.problem, linearise(search.problem, free, x), FIRST)
 
 
-def addable(model: Model, effects: Sequence[str]) -> None:
+def check_addable(model: Model, effects: Sequence[str]) -> None:
     """Refuse effects that cannot all join a model.
 
     Raises:
         InputError: one is in it already, excludes another, or nobody can fit it.
     """
-    present = list(effects_of(model))
+    present = list(active_effects(model))
     for name in effects:
         entry = CATALOGUE[name]
         if name not in [e.name for e in offered(model.plant)]:
@@ -190,22 +190,22 @@ def _with(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     If these do not reach the floor, from the effect's own sizes too: a scan believes what a bad fit tells it.
     """
     fit = before.fit
-    healthy = linearised(search.problem, fit.free, np.where(_healthy(fit.free), 0.0, fit.x))
-    found = [*scan(search.problem, fit, [name]), *scan(search.problem, healthy, [name])]
+    healthy = linearise(search.problem, fit.free, np.where(_healthy(fit.free), 0.0, fit.x))
+    found = [*scan_effects(search.problem, fit, [name]), *scan_effects(search.problem, healthy, [name])]
     best = search.judged((*before.effects, name), _fitted(search, _begun(search, found)))
     if best.reached:
         return best
     free, sizes = best.fit.free, CATALOGUE[name].starts
     x = np.array([[(size[f.name] - f.centre) / f.scale if f.name in size else float(v)
                    for f, v in zip(free, np.where(_healthy(free), 0.0, best.fit.x), strict=True)] for size in sizes])
-    other = _fitted(search, [linearised(search.problem, free, row) for row in x])
+    other = _fitted(search, [linearise(search.problem, free, row) for row in x])
     return search.judged(best.effects, other) if other.cost < best.cost else best
 
 
 def _fitted(search: Search, begun: Sequence[Fit]) -> Fit:
     """The best of some fits, taken on side by side."""
     alone = replace(search.problem, workers=1, _lanes={})
-    fits = search.each(lambda fit: settled(alone, improved(alone, fit, FIRST), THEN), begun)
+    fits = search.each(lambda fit: finish_fit(alone, continue_fit(alone, fit, FIRST), THEN), begun)
     return min(fits, key=lambda fit: fit.cost)
 
 
@@ -215,7 +215,7 @@ def _begun(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
     A fit that had to do without a large effect has put it into the tolerances: that may be a wrong basin.
     """
     starts = [x for p in prospects for x in (p.x, np.where(_healthy(p.free), 0.0, p.x))]
-    fits = [linearised(search.problem, prospects[0].free, x) for x in starts]
+    fits = [linearise(search.problem, prospects[0].free, x) for x in starts]
     return sorted(fits, key=lambda f: f.cost)[:2]
 
 
@@ -230,8 +230,8 @@ def _marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dic
     for name in effects:
         if CATALOGUE[name].port not in UNREPLAYED:
             continue
-        tooth = comb(traces[0]) if name == "quantisation" else None
-        prints = [tooth] if tooth else [p for p in firmware(model, traces)[1] if p.effect == name]
+        tooth = find_quantisation(traces[0]) if name == "quantisation" else None
+        prints = [tooth] if tooth else [p for p in find_firmware_marks(model, traces)[1] if p.effect == name]
         if not prints:
             where = "steps in the measured positions" if CATALOGUE[name].port == "reading" else \
                 "a difference between Cor and the model's firmware that it explains"
@@ -243,7 +243,7 @@ def _marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dic
 def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Trace | None
            ) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
-    held = [held_out(search, h, holdout) if holdout else {} for h in chain]
+    held = [measure_holdout(search, h, holdout) if holdout else {} for h in chain]
     steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
     for name in effects[done:]:
         at += CATALOGUE[name].port not in UNREPLAYED
@@ -251,12 +251,12 @@ def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hy
     return tuple(steps)
 
 
-def values_of(r: Refit) -> dict[str, float]:
+def fitted_values(r: Refit) -> dict[str, float]:
     """What was fitted, "group.field" to SI value, to six digits."""
     values = {name: float(f"{v:.6g}") for name, v in r.last.hypothesis.fit.values.items()}
     return limit_friction_values(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
 
 
-def model_of(r: Refit) -> Model:
+def fitted_model(r: Refit) -> Model:
     """The model with what was fitted."""
-    return r.original.replace(values_of(r), "fit")
+    return r.original.replace(fitted_values(r), "fit")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.balance import EDGE, Balance, States, balances
+from fdi.discovery.balance import EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search
 from fdi.output import write_text
 
@@ -66,9 +66,9 @@ def _described(p: Pattern) -> str:
             f"{p.height[-1]:.3g} at {p.at[-1]:.3g} {unit}")
 
 
-def pattern(search: Search, h: Hypothesis) -> Pattern:
+def find_pattern(search: Search, h: Hypothesis) -> Pattern:
     """The shape of what a hypothesis leaves unexplained."""
-    found, states = balances(search, h)
+    found, states = compute_balances(search, h)
     pumped = found[0].place == "flow" and "pump.displacement" in search.problem.model.values
     return _shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
 
@@ -79,20 +79,20 @@ def _shape(best: Balance, states: States) -> Pattern:
         return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
     missing = best.missing[EDGE:-EDGE]
     seen = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
-    curves = {name: curve(missing, x, best.noise) for name, x in seen.items()}
+    curves = {name: fit_curve(missing, x, best.noise) for name, x in seen.items()}
     name = max(curves, key=lambda n: curves[n][0])
     share, at, height, doubt = curves[name]
-    waves = {name: wave(missing, seen[name], best.noise) for name in ("position", "time")}
+    waves = {name: fit_wave(missing, seen[name], best.noise) for name in ("position", "time")}
     over = max(waves, key=lambda n: waves[n][1])
     if waves[over][1] > max(share + 0.05, FOLLOWS):
         shape, share = waves[over]
-        _, at, height, doubt = curve(missing, np.mod(seen[over], shape[1]), best.noise)
+        _, at, height, doubt = fit_curve(missing, np.mod(seen[over], shape[1]), best.noise)
         return Pattern(best.place, best.unit, best.size, over, share, at, height, doubt, shape, best.missing)
     state = name if share >= FOLLOWS else ""
     return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, None, best.missing)
 
 
-def curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Floats]:
+def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Floats]:
     """Means of y over bins of x: share explained, bin centres, means, their errors.
 
     Half of the edges share out the samples, half the range: most of a run is spent near rest.
@@ -113,7 +113,7 @@ def curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Fl
     return max(share, 0.0), at, height, spread / np.sqrt(count[kept])
 
 
-def wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, float], float]:
+def fit_wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, float], float]:
     """The best wave over x: (amplitude, length, phase), and the share of y it explains."""
     from scipy.signal import lombscargle  # here, as it takes a second to import
 

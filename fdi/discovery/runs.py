@@ -32,7 +32,7 @@ class Runs(NamedTuple):
     notes: tuple[str, ...]  # what reading had to leave out or put right
 
 
-def read(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | None = None,
+def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | None = None,
          signals: Sequence[str] | None = None) -> Runs:
     """Read the files of a search.
 
@@ -40,7 +40,7 @@ def read(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | N
         InputError: a file that cannot be used, a repeat that is none, or a run given twice, in one line.
     """
     chosen = _chosen(signals)
-    sources = [source(trace), *(source(file) for file in repeats), *([source(holdout)] if holdout else [])]
+    sources = [read_source(file) for file in (trace, *repeats, *([holdout] if holdout else []))]
     _distinct(sources, len(repeats))
     est = _prepare(Trace.read(trace), model, chosen, trace)
     model = match_period(model, est, SAME_PERIOD)
@@ -49,7 +49,7 @@ def read(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | N
     return Runs(model, est, others, unseen, tuple(sources), est.notes)
 
 
-def source(file: str) -> Source:
+def read_source(file: str) -> Source:
     """The file of a trace, or that of the run in a folder, with the hash of its bytes."""
     path = Path(file)
     data = path / "trace.mcap" if path.is_dir() else path

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem, misfit, weights
-from fdi.estimation.unidentifiable import powers, scaled
-from fdi.estimation.unknowns import Free, effect_unknowns, ends
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
+from fdi.estimation.unidentifiable import list_powers, scale_together
+from fdi.estimation.unknowns import Free, effect_unknowns, scaled_bounds
 from plant.effects import CATALOGUE
 from plant.threads import mapped
 
@@ -55,7 +55,7 @@ class Prospect(NamedTuple):
     x: Floats  # (p,), those of the fit scanned from first
 
 
-def scan(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -> list[Prospect]:
+def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -> list[Prospect]:
     """Expected cost of each effect on top of `fit`, best first, by so many threads.
 
     Every start of an effect is simulated; the fit's own unknowns then move linearly, within their bounds and priors, to
@@ -63,7 +63,7 @@ def scan(problem: Problem, fit: Fit, effects: Iterable[str], workers: int = 1) -
     """
     effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
-             for start in (*CATALOGUE[name].starts, *tones(problem, fit, name))]
+             for start in (*CATALOGUE[name].starts, *find_tones(problem, fit, name))]
     best = _best(_tried(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
@@ -99,7 +99,7 @@ def _near(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str
     return starts
 
 
-def tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]]:
+def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]]:
     """Starts for an effect with a frequency: a fit finds none that it does not begin within a period of.
 
     The effect at next to no frequency and a quarter turn shows how each residual answers a constant; the residual times
@@ -154,17 +154,21 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     if not starts:
         return []
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
-    ways = powers(problem)
+    ways = list_powers(problem)
     begun = [_moved(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
     at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
           for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
-    steep = slope(fit)
+    steep = prepare_slope(fit)
 
     def trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whitened(problem.left(problem.predict(names, rows[part])))
-        return [Trial(starts[i][0], starts[i][1], *absorbed(fit, steep, r, set(starts[i][1]), begun[i]), starts[i][2])
-                for i, r in zip(part, white, strict=True)]
+        found = []
+        for i, r in zip(part, white, strict=True):
+            effect, start, goes_along = starts[i]
+            cost, x = absorb_shift(fit, steep, r, set(start), begun[i])
+            found.append(Trial(effect, start, cost, x, goes_along))
+        return found
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
     return [trial for several in mapped(trials, parts, workers) for trial in several]
@@ -173,10 +177,10 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
 def _moved(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
     left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
-    low, high = ends(fit.free)
+    low, high = scaled_bounds(fit.free)
     x = fit.x
     for way in GOES_WITH[effect]:
-        x = scaled(fit.free, x, ways[way], float(np.log(left)))
+        x = scale_together(fit.free, x, ways[way], float(np.log(left)))
     return np.clip(x, low, high)
 
 
@@ -190,14 +194,14 @@ class Slope(NamedTuple):
     high: Floats  # (p,)
 
 
-def slope(fit: Fit) -> Slope:
+def prepare_slope(fit: Fit) -> Slope:
     """Prepared once for many residuals."""
-    low, high = ends(fit.free)
+    low, high = scaled_bounds(fit.free)
     return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::THINNED]),
                  np.array([f.prior**-2 for f in fit.free]), low, high)
 
 
-def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Floats) -> tuple[float, Floats]:
+def absorb_shift(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Floats) -> tuple[float, Floats]:
     """Cost of a whitened residual (s, n) after the fit's unknowns, but for those `held`, have shifted linearly.
 
     `begun`: the unknowns, (p,), at which the residual was simulated.
@@ -209,10 +213,10 @@ def absorbed(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Floats) -
     flat, left, x = s.thin.reshape(len(begun), -1), white, begun
     few = white[:, ::THINNED].reshape(-1)
     for _ in range(2):
-        heavy = (THINNED * s.thin * weights(left)[:, ::THINNED]).reshape(flat.shape)
+        heavy = (THINNED * s.thin * compute_weights(left)[:, ::THINNED]).reshape(flat.shape)
         hessian = heavy @ flat.T + np.diag(prior + 1e-9)
         gradient = heavy @ few + s.prior * begun * move
         x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), s.low, s.high), begun)
         left = white + ((x - begun) @ s.whole).reshape(white.shape)
-    costs = misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, begun)]
+    costs = compute_misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, begun)]
     return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), begun)

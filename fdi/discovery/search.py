@@ -8,13 +8,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.scan import Prospect, scan
+from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
-from fdi.estimation.final_rounds import settled
-from fdi.estimation.fit import Fit, fit, improved, linearised
-from fdi.estimation.likelihood import Problem, misfit
+from fdi.estimation.final_rounds import finish_fit
+from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
+from fdi.estimation.likelihood import Problem, compute_misfit
 from fdi.estimation.noise import Noise
-from fdi.estimation.unknowns import Free, free_of, quiet, whole
+from fdi.estimation.unknowns import Free, all_unknowns, complete_model, silence_readings
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -61,12 +61,12 @@ class Search:
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None) -> None:
         self.workers = workers or threads()
-        self.sensors = {name: noises.white(model[SIGNALS[name].noise]) for name in OUTPUTS}
+        self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
-        self.noise = tuple(noises.rounded(self.sensors[name], self.coarse.get(name, 0.0)) for name in trace.outputs)
-        self.model, ready = model, whole(model)
-        bare = quiet(model)
+        self.noise = tuple(noises.add_rounding(self.sensors[s], self.coarse.get(s, 0.0)) for s in trace.outputs)
+        self.model, ready = model, complete_model(model)
+        bare = silence_readings(model)
         self.problem = Problem(ready, trace, self.noise, workers=1, bare=bare)
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
@@ -74,8 +74,12 @@ class Search:
 
     def base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
-        free = free_of(self.model)
-        fits = self.each(lambda ease: fit(self.problem, free, self.eased(free) if ease else None), (False, True))
+        free = all_unknowns(self.model)
+
+        def fit_base(ease: bool) -> Fit:
+            return fit_unknowns(self.problem, free, self.eased(free) if ease else None)
+
+        fits = self.each(fit_base, (False, True))
         first = self.judged((), min(fits, key=lambda f: f.cost))
         return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
@@ -84,12 +88,12 @@ class Search:
         x = np.zeros(len(free))
         for factor in EASED:
             noise = tuple(n._replace(innovation=factor * n.innovation) for n in self.noise)
-            x = fit(replace(self.problem, noise=noise), free, x, 4).x
+            x = fit_unknowns(replace(self.problem, noise=noise), free, x, 4).x
         return x
 
     def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
-        for other in self.each(partial(fit, self.problem, h.fit.free), starts):
+        for other in self.each(partial(fit_unknowns, self.problem, h.fit.free), starts):
             if other.cost < h.cost - 1.0:
                 h = self.judged(h.effects, other)
         return h
@@ -109,10 +113,10 @@ class Search:
     def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
         effects = [e for e in self.effects if e not in start.effects and not self._excluded(e, start.effects)]
-        prospects = scan(self.problem, start.fit, effects, self.workers)
+        prospects = scan_effects(self.problem, start.fit, effects, self.workers)
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
-            nominal = linearised(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
-            prospects = _merged(prospects, scan(self.problem, nominal, effects, self.workers))
+            nominal = linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
+            prospects = _merged(prospects, scan_effects(self.problem, nominal, effects, self.workers))
         worth = [p for p in prospects if p.cost < start.cost - WORTH][:fitted]
         fits = list(zip([p.effect for p in worth], self.each(self._begun, worth), strict=True))
         for rounds, kept in RACE:
@@ -128,7 +132,7 @@ class Search:
 
     def lighter(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
-        usual = {f.name: f for f in free_of(self.model)}
+        usual = {f.name: f for f in all_unknowns(self.model)}
 
         def left_out(gone: str) -> Hypothesis:
             own = set(CATALOGUE[gone].fitted)
@@ -137,7 +141,7 @@ class Search:
             x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
             inside = np.array([v if f.name not in own or f.low < h.fit.values[f.name] < f.high else 0.0
                                for f, v in zip(kept, x, strict=True)])
-            return self.judged(tuple(e for e in h.effects if e != gone), fit(self.problem, kept, inside))
+            return self.judged(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, inside))
 
         return sorted(self.each(left_out, h.effects), key=lambda each: each.cost)
 
@@ -146,15 +150,15 @@ class Search:
         return mapped(do, items, self.workers)
 
     def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
-        return each[0], each[1] if each[1].converged else improved(self.problem, each[1], rounds)
+        return each[0], each[1] if each[1].converged else continue_fit(self.problem, each[1], rounds)
 
     def _begun(self, p: Prospect) -> Fit:
         """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
         own = np.isin([f.name for f in p.free], CATALOGUE[p.effect].fitted)
         starts = np.array([p.x, np.where(own, p.x, 0.0)])
         prior = np.array([f.prior**-2 for f in p.free])
-        costs = misfit(self.problem.whitened(self.problem.residuals(p.free, starts))) + (starts**2) @ prior
-        return linearised(self.problem, p.free, starts[int(np.argmin(costs))])
+        costs = compute_misfit(self.problem.whitened(self.problem.residuals(p.free, starts))) + (starts**2) @ prior
+        return linearise(self.problem, p.free, starts[int(np.argmin(costs))])
 
     def _excluded(self, effect: str, present: Sequence[str]) -> bool:
         return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
@@ -170,31 +174,32 @@ class Search:
         if not others:
             floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
             return Hypothesis(effects, found, errors, {}, {s: errors[s] / floor[s] for s in signals})
-        cost = float(np.mean([misfit(p.whitened(r[None]))[0] for p, r in zip(self.repeats, others, strict=True)]))
+        pairs = zip(self.repeats, others, strict=True)
+        cost = float(np.mean([compute_misfit(p.whitened(r[None]))[0] for p, r in pairs]))
         repeated = {s: float(np.sqrt(np.mean([_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
-        ratio = dict(zip(signals, common(own, others, coarse), strict=True))
+        ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
 
     def learn_noise(self, best: Hypothesis) -> None:
         """Take the noise from what differs between the runs under the best hypothesis."""
-        self.noise = tuple(noise_of(best, self.problem.trace, self.noise))
+        self.noise = tuple(learn_noise(best, self.problem.trace, self.noise))
         self.problem = replace(self.problem, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
 
     def floor(self, best: Hypothesis) -> dict[str, float]:
         """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
-        found = noise_of(best, self.problem.trace, self.noise)
+        found = learn_noise(best, self.problem.trace, self.noise)
         return {s: float(np.hypot(n.level, self.coarse.get(s, 0.0)))
                 for s, n in zip(self.problem.trace.outputs, found, strict=True)}
 
     def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
-        return self.judged(h.effects, fit(self.problem, h.fit.free, h.fit.x, rounds))
+        return self.judged(h.effects, fit_unknowns(self.problem, h.fit.free, h.fit.x, rounds))
 
     def settle(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
-        near = fit(self.problem, h.fit.free, h.fit.x, 2)
-        return self.judged(h.effects, settled(self.fine or self.problem, near, rounds, self.problem))
+        near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
+        return self.judged(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem))
 
     def solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
@@ -213,20 +218,20 @@ class Search:
         self.repeats = [replace(p, steps=finest, _lanes={}) for p in self.repeats]
 
 
-def noise_of(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[Noise]:
+def learn_noise(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[Noise]:
     """Noise of each signal: of the difference between repeats, else of the residual where only noise is left."""
     found = []
     for i, old in enumerate(before):
         if h.others:
             n = min(len(trace), *(o.shape[1] for o in h.others))
             difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
-            found.append(noises.fitted(difference))
+            found.append(noises.fit_noise(difference))
         else:
-            found.append(noises.fitted(h.fit.residuals[i]) if h.reached else old)
+            found.append(noises.fit_noise(h.fit.residuals[i]) if h.reached else old)
     return found
 
 
-def common(residual: Floats, others: Sequence[Floats], coarse: Sequence[float]) -> list[float]:
+def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequence[float]) -> list[float]:
     """What repeats in residuals (s, n) of runs of one command, as total over noise: 1 where only noise is left.
 
     Independent noise of any colour averages out of the product of two runs; physics that is missing does not.
@@ -237,7 +242,7 @@ def common(residual: Floats, others: Sequence[Floats], coarse: Sequence[float]) 
         n = min(len(own), *(o.shape[1] for o in others))
         shared = float(np.mean([np.nanmean(own[:n] * o[i, :n]) for o in others]))
         different = np.concatenate([own[:n] - o[i, :n] for o in others]) / np.sqrt(2.0)
-        noise = noises.level(different) ** 2 + rounding**2 + 1e-300
+        noise = noises.measure_level(different) ** 2 + rounding**2 + 1e-300
         ratios.append(float(np.sqrt(max(1.0 + (shared - rounding**2) / noise, 0.0))))
     return ratios
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.fit import fit
+from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import Noise
 from fdi.estimation.preparation import hold_inputs
@@ -35,7 +35,7 @@ class Separation(NamedTuple):
     misfit: float
 
 
-def separate(search: Search, equal: Sequence[Hypothesis]) -> Separation | None:
+def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation | None:
     """The first sensor, or else the best command, that splits a set of hypotheses; None if none that was tried does.
 
     One explanation's prediction stands for the measurement; the other is fitted to it, its tolerances and all.
@@ -50,7 +50,7 @@ def separate(search: Search, equal: Sequence[Hypothesis]) -> Separation | None:
         if left > SPLITS:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
-    for words, command, play in commands(search.problem.model.values["controller.period"]):
+    for words, command, play in list_commands(search.problem.model.values["controller.period"]):
         left = min(_misfit(search, a, b, _played(search, a, play, own.outputs)) for a, b in pairs)
         if left > SPLITS and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
@@ -62,7 +62,7 @@ def _sensors(there: Sequence[str]) -> list[tuple[str, ...]]:
     return [*((s,) for s in missing), missing] if len(missing) > 1 else [missing] if missing else []
 
 
-def commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
+def list_commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
     """Commands to try, in words, as segments of a sequence, and as functions of time giving demand m and load N."""
     def sine(amplitude: float, hertz: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
         return lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load))
@@ -117,4 +117,4 @@ def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
                                      for s in seen.outputs)
     problem: Problem = replace(search.problem, trace=seen, noise=noise, also=())
-    return fit(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit
+    return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit

@@ -29,7 +29,7 @@ class Sensitivity(NamedTuple):
     gram: Floats  # (d, d) cosines between directions
 
 
-def sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
+def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
     usual = problem.model.kind.nominal
     starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
@@ -50,7 +50,7 @@ def sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivi
     return Sensitivity(tuple(e for e, _ in starts), sizes, gains, (left @ left.T) / np.outer(length, length))
 
 
-def p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:
+def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:
     """Chance that the best of all effects gains as much where nothing is missing.
 
     Runs without any effect are simulated in the space of the effects' directions, where their noise is normal with the
@@ -66,7 +66,7 @@ def p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> 
     return simulated if simulated > 10.0 / DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / DRAWS))
 
 
-def smallest_visible(s: Sensitivity, seen: float = SEEN) -> Mapping[str, float]:
+def find_smallest_visible(s: Sensitivity, seen: float = SEEN) -> Mapping[str, float]:
     """Size of each effect's first parameter, from its off value, at which it would be seen; inf: at none tried.
 
     Between the sizes tried, log gain is linear in log size; below the smallest, the gain falls with its square.

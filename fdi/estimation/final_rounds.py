@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import DAMPINGS, ENOUGH, Fit, cut_at_bounds, step_within_bounds
-from fdi.estimation.likelihood import Problem, misfit, weights
-from fdi.estimation.unidentifiable import across, relaxed, relaxed_along, tangents, without_slope
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
+from fdi.estimation.unidentifiable import choose_across, find_tangents, relax_along, relax_fit, remove_slope
 from fdi.estimation.unknowns import Free
 
 Floats = NDArray[np.float64]
@@ -30,24 +30,25 @@ WIDTH = 3.0  # of a difference, standard deviations
 WIDEST, NARROWEST = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
-def settled(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | None = None) -> Fit:
+def finish_fit(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | None = None) -> Fit:
     """A fit taken to the end, with a covariance that holds at the width of its own intervals.
 
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.
     """
-    now, idle = relaxed(problem, fit), 0
-    _, flat = tangents(slopes or problem, now.free, now.x)
+    now, idle = relax_fit(problem, fit), 0
+    _, flat = find_tangents(slopes or problem, now.free, now.x)
     for _ in range(rounds):
-        here = along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
+        here = linearise_along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
         now = there
         if idle >= PATIENCE:
             break
-    return replace(relaxed(problem, now), converged=True)
+    return replace(relax_fit(problem, now), converged=True)
 
 
-def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem, flat: Floats) -> Fit:
+def linearise_along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem,
+                    flat: Floats) -> Fit:
     """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p).
 
     Along `flat` (p, k) there is no slope.
@@ -58,10 +59,10 @@ def along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats,
     residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
     steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
-    jacobian = without_slope(steep.reshape(len(x), *white[0].shape), flat)
+    jacobian = remove_slope(steep.reshape(len(x), *white[0].shape), flat)
     prior = np.diag([f.prior**-2 for f in free])
-    heavy = (jacobian * weights(white[0])).reshape(len(x), -1)
-    held = float(misfit(white)[0])
+    heavy = (jacobian * compute_weights(white[0])).reshape(len(x), -1)
+    held = float(compute_misfit(white)[0])
     hessian = heavy @ jacobian.reshape(len(x), -1).T + prior
     known = np.asarray(np.linalg.pinv(hessian), np.float64)
     return Fit(tuple(free), x, held + float(x @ prior @ x), held, known, residuals[0], white[0], jacobian)
@@ -77,12 +78,12 @@ def _principal(covariance: Floats) -> Floats:
 def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
     prior = np.diag([f.prior**-2 for f in fit.free])
-    flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * weights(fit.white)))
+    flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * compute_weights(fit.white)))
     gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
     trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
     residuals = problem.residuals(fit.free, trials)
     white = problem.whitened(residuals)
-    held = misfit(white)
+    held = compute_misfit(white)
     costs = held + np.einsum("ij,jk,ik->i", trials, prior, trials)
     k = int(np.argmin(costs))
     if costs[k] >= fit.cost:
@@ -91,25 +92,25 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
                    white=white[k])
 
 
-def descended(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> Fit:
+def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> Fit:
     """A fit after so many rounds of damped Gauss-Newton steps, fewer if some of them gain nothing.
 
     `flat` (p, k) are the directions that the data do not see.
     """
     now, idle = begun, 0
     for _ in range(rounds):
-        here = sloped(problem, now.free, now.x, now.covariance, flat)
+        here = linearise_across(problem, now.free, now.x, now.covariance, flat)
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
         now = replace(there, covariance=here.covariance)
         if idle >= PATIENCE:
             break
-    return replace(relaxed_along(now, flat), converged=True)
+    return replace(relax_along(now, flat), converged=True)
 
 
-def sloped(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
+def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
     """The model at `x` (p,), its Jacobian by differences across the valley, along principal directions there."""
-    places = across(free, flat)
+    places = choose_across(free, flat)
     basis = np.column_stack([np.eye(len(free))[:, places], flat])
     inverse = np.linalg.inv(basis)[:len(places)]  # of the coordinates across by all unknowns
     variances, vectors = np.linalg.eigh(inverse @ covariance @ inverse.T)
@@ -122,12 +123,12 @@ def sloped(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats
     jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
     prior = np.diag([f.prior**-2 for f in free])
     flat_rows = jacobian.reshape(len(free), -1)
-    heavy = (jacobian * weights(white[0])).reshape(len(free), -1)
-    held = float(misfit(white[:1])[0])
+    heavy = (jacobian * compute_weights(white[0])).reshape(len(free), -1)
+    held = float(compute_misfit(white[:1])[0])
     return Fit(tuple(free), x, held + float(x @ prior @ x), held, np.linalg.pinv(heavy @ flat_rows.T + prior),
                residuals[0], white[0], jacobian)
 
 
-def first_widths(free: Sequence[Free], across: float = 1e-3) -> Floats:
+def first_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
     """A covariance, (p, p), that gives differences across the valley their first width."""
     return np.diag([min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4 for f in free])

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.estimation.likelihood import Problem, misfit, weights
-from fdi.estimation.unknowns import Free, ends
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
+from fdi.estimation.unknowns import Free, scaled_bounds
 
 Floats = NDArray[np.float64]
 
@@ -46,29 +46,29 @@ class Fit:
         return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
 
 
-def fit(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
+def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
     """The most likely parameters near `start` (p,), scaled (default: the centres)."""
     x = np.zeros(len(free)) if start is None else np.array(start, float)
-    return improved(problem, linearised(problem, free, x), rounds)
+    return continue_fit(problem, linearise(problem, free, x), rounds)
 
 
-def improved(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
+def continue_fit(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
         gradient, hessian = _normal(now)
         trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
         white = problem.whitened(problem.residuals(now.free, trials))
-        costs = misfit(white) + (trials**2) @ _prior(now.free)
+        costs = compute_misfit(white) + (trials**2) @ _prior(now.free)
         k = int(np.argmin(costs))
         gained = now.cost - float(costs[k])
         if gained < max(ENOUGH, CLOSE * now.cost):
             final = _moved(problem, now, trials[k]) if gained > 0.0 else now
             return replace(final, converged=True)
-        now = linearised(problem, now.free, trials[k], _widths(now.free, hessian))
+        now = linearise(problem, now.free, trials[k], _widths(now.free, hessian))
     return now
 
 
-def linearised(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | None = None) -> Fit:
+def linearise(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | None = None) -> Fit:
     """The model at `x` (p,) with its Jacobian by differences of `step`, away from a bound."""
     free = tuple(free)
     step = np.array([f.step for f in free]) if step is None else step
@@ -78,7 +78,7 @@ def linearised(problem: Problem, free: Sequence[Free], x: Floats, step: Floats |
     residuals = problem.residuals(free, moved)
     white = problem.whitened(residuals)
     jacobian = (white[1:] - white[0]) / (signs * step)[:, None, None]
-    held = float(misfit(white[:1])[0])
+    held = float(compute_misfit(white[:1])[0])
     return Fit(free, x, held + float(x**2 @ _prior(free)), held, _covariance(free, jacobian, white[0]), residuals[0],
                white[0], jacobian)
 
@@ -87,7 +87,7 @@ def _moved(problem: Problem, fit: Fit, x: Floats) -> Fit:
     """The fit at `x`, close enough to keep its Jacobian."""
     residuals = problem.residuals(fit.free, x[None])
     white = problem.whitened(residuals)
-    held = float(misfit(white)[0])
+    held = float(compute_misfit(white)[0])
     return Fit(fit.free, x, held + float(x**2 @ _prior(fit.free)), held, fit.covariance, residuals[0], white[0],
                fit.jacobian)
 
@@ -98,7 +98,7 @@ def _prior(free: Sequence[Free]) -> Floats:
 
 def _normal(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
-    heavy = fit.jacobian * weights(fit.white)
+    heavy = fit.jacobian * compute_weights(fit.white)
     prior = _prior(fit.free)
     flat = fit.jacobian.reshape(len(fit.x), -1)
     heavy = heavy.reshape(len(fit.x), -1)
@@ -106,7 +106,7 @@ def _normal(fit: Fit) -> tuple[Floats, Floats]:
 
 
 def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
-    flat = (jacobian * np.sqrt(weights(white))).reshape(len(free), -1)
+    flat = (jacobian * np.sqrt(compute_weights(white))).reshape(len(free), -1)
     inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior(free))), np.float64)
     return inverse
 
@@ -119,7 +119,7 @@ def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
 
 def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:
     """A damped Gauss-Newton step within the bounds: what runs into one stays there, and the rest is solved again."""
-    low, high = ends(fit.free)
+    low, high = scaled_bounds(fit.free)
     damped = hessian + np.diag(damping * np.diag(hessian) + 1e-12 * np.trace(hessian) + 1e-12)
     x, open_ = fit.x.copy(), np.ones(len(fit.x), bool)
     for _ in range(len(x)):
@@ -138,6 +138,6 @@ def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, damping: flo
 
 def cut_at_bounds(free: Sequence[Free], x: Floats, move: Floats) -> Floats:
     """The move, or its opposite, cut off at the bounds: whichever is longer then."""
-    low, high = ends(free)
+    low, high = scaled_bounds(free)
     ways = [np.clip(x + way, low, high) - x for way in (move, -move)]
     return max(ways, key=lambda way: float(way @ way))

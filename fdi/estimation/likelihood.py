@@ -74,7 +74,7 @@ class Problem:
         parts, start = [], 0
         for trace in (self.trace, *self.also):
             residuals = predicted[..., start:start + len(trace)] - trace.measurements
-            lines = mains(len(trace), self.model.values["controller.period"])
+            lines = mains_waves(len(trace), self.model.values["controller.period"])
             parts.append(residuals - (np.nan_to_num(residuals) @ lines) @ lines.T)
             start += len(trace)
         return np.concatenate(parts, axis=-1) if self.also else parts[0]
@@ -85,7 +85,7 @@ class Problem:
 
 
 @cache
-def mains(n: int, period: float) -> Floats:
+def mains_waves(n: int, period: float) -> Floats:
     """Orthonormal sines and cosines of the mains' lines over n samples, (n, k): what a steady hum looks like.
 
     A hum that starts with the test has the same phase in every run, so no repeat tells it from physics.
@@ -96,7 +96,7 @@ def mains(n: int, period: float) -> Floats:
     return waves
 
 
-def blocks(white: Floats) -> Floats:
+def sum_blocks(white: Floats) -> Floats:
     """Sums of squares of whitened residuals (.., n) over blocks: (.., b)."""
     n = white.shape[-1]
     padded = np.concatenate([white, np.zeros((*white.shape[:-1], -n % BLOCK))], axis=-1)
@@ -105,25 +105,25 @@ def blocks(white: Floats) -> Floats:
     return sums
 
 
-def misfit(white: Floats) -> Floats:
+def compute_misfit(white: Floats) -> Floats:
     """-2 log likelihood of whitened residuals (m, s, n), up to a constant: (m,)."""
-    sums = blocks(white)
+    sums = sum_blocks(white)
     limit = FITTED * BLOCK
     beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
     total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
     return total
 
 
-def weights(white: Floats) -> Floats:
+def compute_weights(white: Floats) -> Floats:
     """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
-    sums = blocks(white)
+    sums = sum_blocks(white)
     each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
     return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
 
 
-def typical(residuals: Floats, share: float = 0.85) -> Floats:
+def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
     """RMS of residuals (s, n) without the worst blocks: a stop of the ram that is made or missed by a hair is luck."""
-    squares = np.sort(blocks(np.nan_to_num(residuals)), axis=-1)
+    squares = np.sort(sum_blocks(np.nan_to_num(residuals)), axis=-1)
     kept = squares[:, :max(1, round(share * squares.shape[1]))]
     rms: Floats = np.sqrt(kept.mean(axis=1) / BLOCK)
     return rms

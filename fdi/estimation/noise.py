@@ -58,7 +58,7 @@ class Floor(NamedTuple):
     freedom: float = 1.0  # independent samples in one, of the noise's square: 1 for white noise, less for coloured
 
 
-def floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats]],
+def find_floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats]],
            period: float = 1e-3) -> dict[str, Floor]:
     """The floor of each signal from the residuals (n,) of the same model on repeats of one command.
 
@@ -68,24 +68,24 @@ def floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats
     for name, r in residual.items():
         others = [other[name] for other in repeats if name in other]
         if others:
-            out[name] = from_repeats(r, others, period)
+            out[name] = floor_from_repeats(r, others, period)
     return out
 
 
-def from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
+def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
     """The floor of one signal from its residuals (n,), (m,).. under one model."""
     n = min(len(residual), *(len(r) for r in repeats))
     runs = [residual[:n], *(r[:n] for r in repeats)]
     pairs = [(a - b) / np.sqrt(2.0) for a, b in combinations(runs, 2)]
     difference = float(np.sqrt(np.nanmean(np.concatenate(pairs) ** 2)))
-    lines = hum_lines(runs, period)
+    lines = find_hum_lines(runs, period)
     steady = [_without(r, lines, period) for r in runs]
-    level, share, freedom = quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])
+    level, share, freedom = measure_quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])
     hum = float(np.sqrt(sum(power for _, power in lines)))
     return Floor(float(np.hypot(level, hum)), "repeats", False, share, difference, hum, freedom)
 
 
-def from_data(signal: Floats) -> Floor:
+def floor_from_data(signal: Floats) -> Floor:
     """A lower bound from one signal's own second differences, (n,): noise that is not white has less in them."""
     second = np.abs(np.diff(signal, 2))
     second = second[~np.isnan(second)]
@@ -100,14 +100,14 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
     out = {}
     for name in trace.outputs:
-        given, seen = model[SIGNALS[name].noise], from_data(trace.measured(name))
-        given = read_noise(model, trace.xj) if name == "xj" else given
+        given, seen = model[SIGNALS[name].noise], floor_from_data(trace.measured(name))
+        given = simulate_reading_noise(model, trace.xj) if name == "xj" else given
         found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER * given else seen
         out[name] = found._replace(value=max(found.value, FINEST[name]))
     return out
 
 
-def read_noise(model: Model, xj: Floats) -> float:
+def simulate_reading_noise(model: Model, xj: Floats) -> float:
     """RMS, m, of what noise and the effects on a reading (rounding, say) make of a position within xj's range.
 
     A sweep through it, as neither is in a replay.
@@ -125,7 +125,7 @@ def read_noise(model: Model, xj: Floats) -> float:
     return rms(out - true)
 
 
-def quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[float, float, float]:
+def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[float, float, float]:
     """Standard deviation of stationary noise, (n,) each, in which at times something larger happens.
 
     Also the share of windows that were taken for noise, and their degrees of freedom per sample. A window's mean square
@@ -182,7 +182,7 @@ def _freedom(pieces: Floats) -> float:
     return max(1.0, float(size) / (1.0 + 2.0 * alike))
 
 
-def hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, float]]:
+def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, float]]:
     """(Hz, mean square) of the mains' lines that stand out in the quiet half of the windows of the runs (n,)."""
     mains = sorted({f * k for f in MAINS for k in range(1, HARMONICS + 1) if f * k < 0.45 / period})
     grid = np.array([[f, *(f + d for d in NEIGHBOURS)] for f in mains])
@@ -257,17 +257,17 @@ def _through(weights: Floats, x: Floats) -> Floats:
     return np.apply_along_axis(lambda row: np.convolve(weights, row)[:len(row)], -1, x)
 
 
-def white(level: float) -> Noise:
+def white_noise(level: float) -> Noise:
     """White noise of a known standard deviation."""
     return Noise(level, np.ones(1), level)
 
 
-def rounded(noise: Noise, step: float) -> Noise:
+def add_rounding(noise: Noise, step: float) -> Noise:
     """White noise and rounding, `step` RMS: for weights; the level stays that of the noise."""
     return noise._replace(innovation=float(np.hypot(noise.innovation, step)))
 
 
-def level(difference: Floats, block: int = WINDOW) -> float:
+def measure_level(difference: Floats, block: int = WINDOW) -> float:
     """Standard deviation of noise, (n,), in which now and then something else happens: the median block's."""
     n = len(difference) // block * block
     if n == 0:
@@ -278,12 +278,12 @@ def level(difference: Floats, block: int = WINDOW) -> float:
     return float(np.sqrt(np.nanmedian(variance) * CONSISTENT))
 
 
-def fitted(residual: Floats, order: int = ORDER) -> Noise:
+def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
     """The autoregressive model of noise, (n,), that its length supports (Yule-Walker; Akaike's choice of order)."""
     x = residual[~np.isnan(residual)]
-    sigma = level(x)
+    sigma = measure_level(x)
     if sigma == 0.0:
-        return white(float(np.finfo(float).tiny))
+        return white_noise(float(np.finfo(float).tiny))
     size = WINDOW * (len(x) // WINDOW) or len(x)
     blocks = x[:size].reshape(-1, min(WINDOW, size))
     calm = blocks[(blocks**2).mean(axis=1) <= CALM * sigma**2]  # the others hold a stop that came a little later
@@ -291,7 +291,7 @@ def fitted(residual: Floats, order: int = ORDER) -> Noise:
     pairs = [np.einsum("ij,ij->", calm[:, k:], calm[:, :calm.shape[1] - k]) for k in range(order + 1)]
     covariance = np.array(pairs) / n
     covariance *= sigma**2 / covariance[0]
-    best, cost = white(float(np.sqrt(covariance[0]))), 0.0
+    best, cost = white_noise(float(np.sqrt(covariance[0]))), 0.0
     for p in range(1, order + 1):
         a = solve_toeplitz(covariance[:p], covariance[1:p + 1])
         variance = covariance[0] - a @ covariance[1:p + 1]

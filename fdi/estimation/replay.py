@@ -46,31 +46,31 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
 
 
-def open_loop(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
+def replay_current(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
-    out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if known_start(trace) else None, anchor)
+    out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if has_known_start(trace) else None, anchor)
     return {name: out[0, :, i] for i, name in enumerate(OUTPUTS)}
 
 
 def measure_misfit(trace: Trace, model: Model) -> float:
     """How badly a replay fits the outputs of a prepared trace: the mean logarithm of their RMS residuals."""
-    left = residuals(trace, open_loop(trace, model, 20))
+    left = compute_residuals(trace, replay_current(trace, model, 20))
     return sum(math.log(rms(r)) for r in left.values()) / len(left)
 
 
-def known_start(trace: Trace) -> bool:
+def has_known_start(trace: Trace) -> bool:
     """Whether the first position is known; else the replay starts in the middle."""
     return not np.isnan(trace.xj[0])
 
 
-def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
+def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
-    values = edges(model)
-    lanes = Lanes(model.replace(WITHOUT_NOISE), frictions(model), STEPS)
-    position = trace.xj if known_start(trace) else None
+    values = vary_frictions(model)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), STEPS)
+    position = trace.xj if has_known_start(trace) else None
     runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
-    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR) for cor in guesses(trace)]
+    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR) for cor in guess_current(trace)]
     runs = np.concatenate([runs, *others])
     undecided = np.zeros(len(trace), bool)
     for i, name in enumerate(OUTPUTS):
@@ -79,7 +79,7 @@ def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
             undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(trace.measured(name))
     coarse, steps = runs[0], STEPS
     while True:
-        finer = Lanes(model.replace(WITHOUT_NOISE), frictions(model), 2 * steps)
+        finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
         fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
         small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
@@ -89,10 +89,10 @@ def checked(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     found = {name: coarse[:, i] for i, name in enumerate(OUTPUTS)}
     guessed = runs[len(values):] - runs[:1]
     blind = {name: rms(guessed[:, ~undecided, i]) if len(guessed) else 0.0 for i, name in enumerate(OUTPUTS)}
-    return Replay(found, residuals(trace, found), steps, error, undecided, blind)
+    return Replay(found, compute_residuals(trace, found), steps, error, undecided, blind)
 
 
-def guesses(trace: Trace) -> list[Floats]:
+def guess_current(trace: Trace) -> list[Floats]:
     """The current with what its filled rows may have been instead; none if every row was recorded.
 
     The fill misses a row by as much as it would miss every other recorded row around: that error, with random signs.
@@ -110,19 +110,19 @@ def guesses(trace: Trace) -> list[Floats]:
     return [trace.cor + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
 
 
-def residuals(trace: Trace, model: Columns) -> Columns:
+def compute_residuals(trace: Trace, model: Columns) -> Columns:
     """Measured less model, of the chosen signals."""
     return {name: trace.measured(name) - model[name] for name in trace.outputs}
 
 
-def frictions(model: Model) -> tuple[str, ...]:
+def list_frictions(model: Model) -> tuple[str, ...]:
     """The friction levels that the model's plant has."""
     return tuple(name for name in FRICTIONS if name in model.values)
 
 
-def edges(model: Model) -> Floats:
+def vary_frictions(model: Model) -> Floats:
     """(m, frictions) values: the model's, and each level a little higher and lower; dynamic stays below static."""
-    names = frictions(model)
+    names = list_frictions(model)
     base = np.array([model[name] for name in names])
     shifts = KNIFE * np.eye(len(names))
     values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
@@ -139,15 +139,15 @@ def _windows_above(moved: Floats, floor: float) -> Flags:
     return out
 
 
-def drift(trace: Trace, model: Model, steps: int = STEPS) -> tuple[float, float]:
+def measure_drift(trace: Trace, model: Model, steps: int = STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
-    free = trace.measured("xj") - open_loop(trace, model, steps, 0.0)["xj"]
+    free = trace.measured("xj") - replay_current(trace, model, steps, 0.0)["xj"]
     there = ~np.isnan(free)
     t = trace.t[there] - trace.t[there].mean()
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
 
 
-def closed_loop(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
+def replay_command(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
     before = round(SETTLED / trace.period)
     com = np.concatenate([np.full(before, trace.com[0]), trace.com])
@@ -159,7 +159,7 @@ def closed_loop(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
     return left | {"cor": trace.measured("cor") - whole["cor"]}
 
 
-def derivative(x: Floats, size: int, order: int) -> Floats:
+def differentiate(x: Floats, size: int, order: int) -> Floats:
     """First or second derivative of x (n,) per sample, of the parabola through `size` samples (Savitzky and Golay)."""
     k = np.arange(size) - size // 2
     weights = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))[order] * order

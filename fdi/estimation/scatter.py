@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.replay import ANCHOR, known_start
-from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerances
+from fdi.estimation.replay import ANCHOR, has_known_start
+from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerance_sizes
 from fdi.trace.columns import rms
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
@@ -39,16 +39,16 @@ class Scatter(NamedTuple):
     enough: bool  # within reach of the floor
 
 
-def scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
+def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
-    known = tolerances(model)
+    known = tolerance_sizes(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
     lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), STEPS)
     measured = np.array([trace.measured(name) for name in trace.outputs])
     columns = [OUTPUTS.index(name) for name in trace.outputs]
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
-    position = trace.xj if known_start(trace) else None
+    position = trace.xj if has_known_start(trace) else None
 
     def residual(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit, cut_at_bounds
-from fdi.estimation.likelihood import Problem, misfit
-from fdi.estimation.unknowns import Free, ends
+from fdi.estimation.likelihood import Problem, compute_misfit
+from fdi.estimation.unknowns import Free, scaled_bounds
 
 Floats = NDArray[np.float64]
 
@@ -37,13 +37,13 @@ FLAT_BY_RATIO = tuple({name: power for name, power in flat.items() if name != "j
              for flat in FLAT)
 
 
-def powers(problem: Problem) -> list[Mapping[str, float]]:
+def list_powers(problem: Problem) -> list[Mapping[str, float]]:
     """`FLAT` for the filter's law of this model."""
     law = problem.model.values.get("filter.law", 0.5)
     return [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else flat for flat in FLAT]
 
 
-def scaled(free: Sequence[Free], x: Floats, said: Mapping[str, float], logarithm: float) -> Floats:
+def scale_together(free: Sequence[Free], x: Floats, said: Mapping[str, float], logarithm: float) -> Floats:
     """Scaled unknowns (p,) after those in `said` have been multiplied by their powers of exp(`logarithm`)."""
     moved = x.copy()
     for k, f in enumerate(free):
@@ -54,20 +54,20 @@ def scaled(free: Sequence[Free], x: Floats, said: Mapping[str, float], logarithm
     return moved
 
 
-def tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Mapping[str, float]], Floats]:
+def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Mapping[str, float]], Floats]:
     """The directions that hold at `x` (p,), and their tangents of scaled unknowns as columns (p, k).
 
     Left out is a direction that a bound stops, or that a trial replay does not find flat.
     """
     if problem.model.plant != "eha":
         return [], np.empty((len(x), 0))
-    low, high = ends(free)
+    low, high = scaled_bounds(free)
     names, found, trials = {f.name for f in free}, [], []
-    for said in powers(problem):
+    for said in list_powers(problem):
         if next(iter(said)) not in names:
             continue
         for way in (TRIED, -TRIED):
-            trial = scaled(free, x, said, way)
+            trial = scale_together(free, x, said, way)
             if ((trial >= low - 1e-9) & (trial <= high + 1e-9)).all() and (trial != x).any():
                 found.append(said)
                 trials.append(trial)
@@ -77,11 +77,11 @@ def tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Ma
     white = problem.whitened(problem.residuals(free, np.vstack([x, *trials])))
     flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < LEVEL * white.shape[2] / 13500.0
     held = [said for said, level in zip(found, flat, strict=True) if level]
-    ways = [(scaled(free, x, said, 1e-6) - x) / 1e-6 for said in held]
+    ways = [(scale_together(free, x, said, 1e-6) - x) / 1e-6 for said in held]
     return held, np.array(ways).T if ways else np.empty((len(x), 0))
 
 
-def without_slope(jacobian: Floats, flat: Floats) -> Floats:
+def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
     """A Jacobian (p, s, n) with its slope along the flat directions (p, k) taken out."""
     if not flat.size:
         return jacobian
@@ -91,21 +91,21 @@ def without_slope(jacobian: Floats, flat: Floats) -> Floats:
     return left
 
 
-def relaxed(problem: Problem, found: Fit) -> Fit:
+def relax_fit(problem: Problem, found: Fit) -> Fit:
     """The fit moved along the flat directions to where the priors want it, if that leaves no more than before."""
     free, x = found.free, found.x
-    said, _ = tangents(problem, free, x)
+    said, _ = find_tangents(problem, free, x)
     if not said:
         return found
     prior = np.array([f.prior**-2 for f in free])
-    low, high = ends(free)
+    low, high = scaled_bounds(free)
     for _ in range(ROUNDS):  # Gauss-Newton on the priors alone, along the curved directions
-        ways = np.array([(scaled(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
+        ways = np.array([(scale_together(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
         step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]
         for way in (1.0, 0.5, 0.25, 0.1):
             there = x
             for s, part in zip(said, step, strict=True):
-                there = scaled(free, there, s, way * float(part))
+                there = scale_together(free, there, s, way * float(part))
             if ((there >= low) & (there <= high)).all() and there**2 @ prior < x**2 @ prior:
                 x = there
                 break
@@ -113,14 +113,14 @@ def relaxed(problem: Problem, found: Fit) -> Fit:
             break
     residuals = problem.residuals(free, x[None])
     white = problem.whitened(residuals)
-    held = float(misfit(white)[0])
+    held = float(compute_misfit(white)[0])
     cost = held + float(x**2 @ prior)
     if cost >= found.cost:
         return found
     return replace(found, x=x, cost=cost, misfit=held, residuals=residuals[0], white=white[0])
 
 
-def flats(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
+def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
     """Directions of `FLAT_BY_RATIO` that hold at `x` (p,) of scaled unknowns in logarithms, as columns (p, k)."""
     law = problem.model["filter.law"]
     load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
@@ -135,17 +135,17 @@ def flats(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
     return found
 
 
-def across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
+def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
     """Places of the unknowns that, with the flat directions (p, k), span all: one of each direction is left out."""
     left_out = {int(np.argmax(np.abs(column) * [f.name in [next(iter(v)) for v in FLAT_BY_RATIO] for f in free]))
                 for column in flat.T}
     return np.array([k for k in range(len(free)) if k not in left_out])
 
 
-def relaxed_along(found: Fit, flat: Floats) -> Fit:
+def relax_along(found: Fit, flat: Floats) -> Fit:
     """The fit moved along the flat directions to where the priors want it, within the bounds: no residual changes."""
     prior = np.array([f.prior**-2 for f in found.free])
-    low, high = ends(found.free)
+    low, high = scaled_bounds(found.free)
     x = found.x
     for _ in range(len(flat.T) + 1):
         pull = flat.T @ (prior * x)

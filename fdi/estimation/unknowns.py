@@ -33,7 +33,7 @@ class Free(NamedTuple):
         return min(max(self.centre + self.scale * x, self.low), self.high)
 
 
-def ends(free: Sequence[Free]) -> tuple[Floats, Floats]:
+def scaled_bounds(free: Sequence[Free]) -> tuple[Floats, Floats]:
     """The least and the most that scaled unknowns, (p,), can be."""
     low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
     return low, high
@@ -45,7 +45,7 @@ def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
     return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
 
 
-def tolerances(model: Model) -> dict[str, float]:
+def tolerance_sizes(model: Model) -> dict[str, float]:
     """The parameters that differ from one healthy unit to the next, with one tolerance in SI units."""
     found = relative_tolerances(model, model.names())
     sizes = {name: tolerance * abs(model[name]) for name, tolerance in found.items()}
@@ -82,21 +82,21 @@ def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tupl
     return tuple(free)
 
 
-def effects_of(model: Model) -> tuple[str, ...]:
+def active_effects(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
     return tuple(e.name for e in offered(model.plant)
                  if (_off_nominal(e, model) if e.base else e.name in model.effects and e.acts(model.values)))
 
 
-def unknowns_of(model: Model) -> tuple[Free, ...]:
+def own_unknowns(model: Model) -> tuple[Free, ...]:
     """The parameters of these effects, to be fitted from the values they have; nothing else is known of them."""
-    replayed = [CATALOGUE[name] for name in effects_of(model) if CATALOGUE[name].port not in UNREPLAYED]
+    replayed = [CATALOGUE[name] for name in active_effects(model) if CATALOGUE[name].port not in UNREPLAYED]
     return tuple(u._replace(centre=model[u.name]) for e in replayed for u in effect_unknowns(e, model))
 
 
-def free_of(model: Model) -> tuple[Free, ...]:
+def all_unknowns(model: Model) -> tuple[Free, ...]:
     """All that is free in a model: tolerances, and the parameters of the effects that it has."""
-    own = unknowns_of(model)
+    own = own_unknowns(model)
     taken = {u.name for u in own}
     return (*(f for f in tolerance_unknowns(model) if f.name not in taken), *own)
 
@@ -125,12 +125,12 @@ def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
     return {**values, **dict(zip(names, limited.tolist(), strict=True))}
 
 
-def whole(model: Model) -> Model:
+def complete_model(model: Model) -> Model:
     """The model without sensor noise and with all effects that its plant may have, at their off values."""
-    return quiet(model.having(e.name for e in offered(model.plant) if not e.disturbance))
+    return silence_readings(model.having(e.name for e in offered(model.plant) if not e.disturbance))
 
 
-def quiet(model: Model) -> Model:
+def silence_readings(model: Model) -> Model:
     """The model without sensor noise and rounding: these are what fits allow for."""
     readings = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].port == "reading"]
     return model.replace(WITHOUT_NOISE | {name: value for e in readings for name, value in e.off.items()})

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fdi.comparison.compare import Comparison
-from fdi.comparison.residual_tests import Depends, Diagnosis
+from fdi.comparison.residual_tests import Depends, ResidualTests
 from fdi.report.compare_text import SHOWN
 from fdi.report.drawing import COMMAND, INK, RED, STYLE, thin_line, to_svg
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def _left(ax: Axes, found: Comparison, name: str) -> None:
 
 def _shaded(ax: Axes, found: Comparison) -> None:
     c = found.trace
-    for section in sections(c.com, c.period):
+    for section in find_sections(c.com, c.period):
         if section.kind in ("ramp", "dynamic"):
             ax.axvspan(float(c.t[section.start]), float(c.t[section.stop - 1]),
                        color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
@@ -105,7 +105,7 @@ def whiteness(found: Comparison) -> str:
         return to_svg(figure, "whiteness")
 
 
-def _autocorrelation(ax: Axes, d: Diagnosis, period: float, label: str) -> None:
+def _autocorrelation(ax: Axes, d: ResidualTests, period: float, label: str) -> None:
     lags = np.arange(1, len(d.correlation)) * period * 1e3
     ax.axhspan(-d.band, d.band, color=NOISE, alpha=0.25, lw=0)
     ax.vlines(lags, 0.0, d.correlation[1:], color=INK, lw=0.8)
@@ -113,7 +113,7 @@ def _autocorrelation(ax: Axes, d: Diagnosis, period: float, label: str) -> None:
     ax.set_xlabel("lag [ms]")
 
 
-def _periodogram(ax: Axes, d: Diagnosis) -> None:
+def _periodogram(ax: Axes, d: ResidualTests) -> None:
     f, line = d.frequencies, np.linspace(0.0, 1.0, len(d.frequencies))
     ax.fill_between(f, line - d.allowed, line + d.allowed, color=NOISE, alpha=0.25, lw=0)
     ax.plot(*thin_line(f, d.power), color=INK, lw=1.0)
@@ -122,7 +122,7 @@ def _periodogram(ax: Axes, d: Diagnosis) -> None:
     ax.set_xlabel("frequency [Hz]")
 
 
-def _cross(ax: Axes, d: Diagnosis) -> None:
+def _cross(ax: Axes, d: ResidualTests) -> None:
     chosen = next((f for f in d.follows if f.input == "Cor"), d.follows[0] if d.follows else None)
     if chosen is None:
         ax.set_axis_off()

@@ -5,9 +5,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from fdi.comparison.compare import BALANCED, BLOCK, Comparison, Signal
+from fdi.comparison.compare import BALANCED, BLOCK, Comparison, SignalError
 from fdi.comparison.controller_block import DISAGREES
-from fdi.comparison.residual_tests import LEAST_SHARE, Diagnosis
+from fdi.comparison.residual_tests import LEAST_SHARE, ResidualTests
 
 SHOWN = {"xj": ("XJ", "um", 1e6), "p12": ("P12", "bar", 1e-5), "xs": ("XS", "um", 1e6)}
 BLOCKS = {
@@ -171,7 +171,7 @@ def _residuals(found: Comparison) -> list[tuple[str, str]]:
     return out
 
 
-def _diagnosis(name: str, d: Diagnosis) -> list[str]:
+def _diagnosis(name: str, d: ResidualTests) -> list[str]:
     said = []
     if d.memory > LONG * d.noise_memory:
         said.append(f"keeps its sign for {1e3 * d.memory:.0f} ms (noise {1e3 * d.noise_memory:.0f} ms), "
@@ -210,7 +210,7 @@ def to_json(found: Comparison) -> dict[str, Any]:
         "repeats": found.repeats, "notes": list(found.notes)}
 
 
-def _signal(s: Signal) -> dict[str, Any]:
+def _signal(s: SignalError) -> dict[str, Any]:
     return {"unit": s.unit, "error": number(s.error), "floor": number(s.floor.value), "ratio": number(s.ratio),
             "closed_loop_error": number(s.closed_loop_error), "solver_error": number(s.solver_error),
             "limit": number(s.limit), "floor_source": s.floor.source, "lower_bound": s.floor.lower_bound,
@@ -224,7 +224,7 @@ def _tolerances(found: Comparison) -> dict[str, Any] | None:
     return {"enough": s.enough, "error": numbers(s.error), "ratio": numbers(s.ratio), "moved": numbers(s.moved)}
 
 
-def _numbers(d: Diagnosis) -> dict[str, Any]:
+def _numbers(d: ResidualTests) -> dict[str, Any]:
     return {"memory": number(d.memory), "noise_memory": number(d.noise_memory), "half_power": number(d.half_power),
             "periodogram": {"distance": number(d.departs), "band": number(d.allowed)},
             "autocorrelation": {"lag_1": number(float(d.correlation[1])), "band": number(d.band)},

@@ -27,7 +27,7 @@ from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -134,7 +134,7 @@ def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
 def _places(trace: Trace, bands: Bands) -> dict[int, Section]:
     """The trace's sections by their number in the bands."""
     com = read_columns(trace)[0]
-    own = [s for s in sections(com, trace.period) if s.kind in ("step", "ramp")]
+    own = [s for s in find_sections(com, trace.period) if s.kind in ("step", "ramp")]
     return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
 
 

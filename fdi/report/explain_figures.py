@@ -15,7 +15,7 @@ from fdi.discovery.residual_pattern import Pattern
 from fdi.discovery.search import Hypothesis
 from fdi.report.drawing import COMMAND, INK, STYLE, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ def left_over(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor:
 
 def _shaded(ax: Axes, trace: Trace) -> None:
     """Ramps and dynamic sections of the command."""
-    for s in sections(trace.com, trace.period):
+    for s in find_sections(trace.com, trace.period):
         if s.kind in ("ramp", "dynamic"):
             ax.axvspan(float(trace.t[s.start]), float(trace.t[s.stop - 1]),
                        color="#f1f3f8" if s.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)

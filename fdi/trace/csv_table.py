@@ -23,7 +23,7 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str],
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
     try:
-        with opened(path) as stream:
+        with open_text(path) as stream:
             return _parse(path, csv.reader(stream, delimiter=separator), tuple(required), tuple(optional))
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
@@ -44,7 +44,7 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
         raise InputError(path, "", f"a place that can be written ({error.strerror})") from error
 
 
-def opened(path: Path) -> io.TextIOBase:
+def open_text(path: Path) -> io.TextIOBase:
     """A text file, unpacked if it is a `.gz`."""
     if path.suffix == ".gz":
         return io.TextIOWrapper(gzip.open(path), encoding="utf-8-sig", newline="")

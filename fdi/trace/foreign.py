@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import opened, read_csv
+from fdi.trace.csv_table import open_text, read_csv
 from plant.plants import Plant, Table, Term, find, names
 
 Floats = NDArray[np.float64]
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 def recorded_by(path: Path) -> Plant | None:
     """The plant whose rig wrote a CSV, told by the names in its first line; None for a trace of ours or any other."""
     try:
-        with opened(path) as stream:
+        with open_text(path) as stream:
             first = stream.readline()
     except (OSError, EOFError, UnicodeDecodeError):
         return None  # the reader says it better

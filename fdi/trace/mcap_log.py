@@ -54,7 +54,7 @@ class Log:
         with self.path.open("rb") as stream:
             for index in self._chunks:
                 if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
-                    for channel, time_ns, _, data in scan(_chunk(self.path, stream, index)):
+                    for channel, time_ns, _, data in scan_messages(_chunk(self.path, stream, index)):
                         if channel in decode:
                             out.append((time_ns, channel, data))
         out.sort(key=lambda item: item[0])
@@ -184,7 +184,7 @@ def _rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArr
     return rows
 
 
-def scan(raw: bytes) -> Iterator[tuple[int, int, int, bytes]]:
+def scan_messages(raw: bytes) -> Iterator[tuple[int, int, int, bytes]]:
     """(channel, log time in ns, offset of the record, data) of each message in an unpacked chunk, in its order.
 
     Raises struct.error for a chunk that ends within a record.

@@ -38,7 +38,7 @@ def describe_section(section: Section, furthest: float = 0.0) -> str:
     return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {level}"
 
 
-def sections(command: Floats, period: float = 1e-3) -> list[Section]:
+def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
     """Cut a command, shape (n,) in m, one row per `period` s, into sections that cover it without overlap.
 
     Straight lines are found greedily within the resolution of the bus; what is not straight for 0.15 s is dynamic.

@@ -16,7 +16,7 @@ from fdi.trace.columns import shift_rows
 from fdi.trace.csv_table import read_csv, write_csv
 from fdi.trace.foreign import read_foreign, recorded_by
 from fdi.trace.mcap_log import Log, open_log
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
 
@@ -189,7 +189,7 @@ class Trace:
 
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
-        return sections(self.com, self.period)
+        return find_sections(self.com, self.period)
 
     def write_csv(self, path: str | Path) -> None:
         """Write t and the measured signals; missing cycles become gaps in t. Raises InputError."""

@@ -37,11 +37,11 @@ def model_of(args: argparse.Namespace) -> tuple[Model, Provenance]:
     Raises:
         InputError: what cannot be used.
     """
-    from fdi.discovery.model_file import Provenance, load
+    from fdi.discovery.model_file import Provenance, load_model_file
 
     options.load_user_effects([*args.effects, *options.named_in(args.model, args.effects)])
     if args.model and Path(args.model).is_file():
-        model, known = load(Path(args.model))
+        model, known = load_model_file(Path(args.model))
         return model.replace(options.changes(args.set)), known
     return options.model_of(args), Provenance()
 
@@ -57,8 +57,8 @@ def prepare(runs: Runs, progress: Progress, effects: Sequence[str] | None = None
     Raises:
         InputError: a user's law that cannot be compiled and run.
     """
-    from fdi.discovery.refit import lean
-    from fdi.estimation.unknowns import UNREPLAYED, whole
+    from fdi.discovery.refit import lean_model
+    from fdi.estimation.unknowns import UNREPLAYED, complete_model
     from plant.effects import CATALOGUE
     from plant.lanes import warm
     from plant.model import offered
@@ -70,7 +70,7 @@ def prepare(runs: Runs, progress: Progress, effects: Sequence[str] | None = None
             progress(f"looking for sizes of {name}", 0.0)
             ensure_starts(name, runs.est.com, runs.est.load)
     replayed = [name for name in effects or () if CATALOGUE[name].port not in UNREPLAYED]
-    model = whole(runs.model) if effects is None else lean(runs.model, replayed)
+    model = complete_model(runs.model) if effects is None else lean_model(runs.model, replayed)
     with laws(model):
         if effects is None:
             warm(model, lambda stage, share: progress(stage, 0.0))

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import NORMAL, ROUGH, Suspicious, Value, fitted, suspicious
+from fdi.discovery.candidates import NORMAL, ROUGH, Suspicious, Value, fitted_parameters, list_suspicious
 from fdi.discovery.model_file import Provenance, Row
-from fdi.discovery.refit import Refit, model_of, refit
+from fdi.discovery.refit import Refit, fitted_model, refit_effects
 from fdi.discovery.runs import Runs
 from fdi.estimation.unknowns import limit_friction_values
 from fdi.output import write_text
@@ -74,15 +74,15 @@ def runs_of(args: argparse.Namespace, trace: str | None, model: Model, known: Pr
     Raises:
         InputError: runs that cannot be used, or none at all.
     """
-    from fdi.discovery.runs import read, source
+    from fdi.discovery.runs import read_runs, read_source
 
     signals = discovery_options.signals_of(args)
-    if known.trace is None or (trace is not None and source(trace).sha256 != known.trace.sha256):
+    if known.trace is None or (trace is not None and read_source(trace).sha256 != known.trace.sha256):
         if trace is None:
             raise InputError("TRACE", "", "the measured run to fit (rig add EFFECT TRACE)")
-        return read(model, trace, args.repeat, args.holdout, signals)
+        return read_runs(model, trace, args.repeat, args.holdout, signals)
     held = args.holdout or (known.holdout.file if known.holdout else None)
-    return read(model, trace or known.trace.file, args.repeat or [r.file for r in known.repeats], held,
+    return read_runs(model, trace or known.trace.file, args.repeat or [r.file for r in known.repeats], held,
                 signals or known.signals or None)
 
 
@@ -91,7 +91,8 @@ def added(new: Sequence[str], runs: Runs, model: Model, known: Provenance,
     """The model with `new` effects as well. `runs.model` is the model before any effect was added."""
     goes_on = bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)
     done = len(known.effects) if goes_on else 0
-    r = refit(runs.model, [*known.effects, *new], runs.est, runs.repeats, runs.holdout, progress, model.values, done)
+    r = refit_effects(runs.model, [*known.effects, *new], runs.est, runs.repeats, runs.holdout, progress, model.values,
+                      done)
     rows = [Row(s.effect, s.error, s.holdout) for s in r.steps]
     kept = list(known.ledger) if goes_on else []
     note = ("other runs than those of the ledger: it begins anew",) if known.ledger and not goes_on else ()
@@ -101,25 +102,26 @@ def added(new: Sequence[str], runs: Runs, model: Model, known: Provenance,
 def removed(name: str, runs: Runs | None, model: Model, known: Provenance,
             progress: Progress) -> Done:
     """The model without an effect: refitted where runs are given, else all other values as they are."""
-    left, less = model_file.without(model, known, name)
+    left, less = model_file.remove_effect(model, known, name)
     if runs is None:
         note = f"the other parameters are as they were fitted with {name}; give a TRACE to fit them anew"
         return Done(left, less, None, {}, (), (note,))
     kept = list(known.ledger)
     if not (kept and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)):
-        whole = refit(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
+        whole = refit_effects(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
                       len(known.effects)).last
         kept = [Row(whole.effect, whole.error, whole.holdout)]
-    start = model_file.without(runs.model, known, name)[0] if name not in known.effects else runs.model
-    r = refit(start, less.effects, runs.est, runs.repeats, runs.holdout, progress, model.values, len(less.effects))
+    start = model_file.remove_effect(runs.model, known, name)[0] if name not in known.effects else runs.model
+    r = refit_effects(start, less.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
+                      len(less.effects))
     rows = [*kept, Row(name, r.last.error, r.last.holdout, True)]
     return _finished(r, runs, less, less.effects, rows, runs.notes)
 
 
 def _finished(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
               notes: tuple[str, ...]) -> Done:
-    model, fit = model_of(r), r.last.hypothesis.fit
-    values = {name: v for e in effects for name, v in fitted(e, fit, runs.model).items()}
+    model, fit = fitted_model(r), r.last.hypothesis.fit
+    values = {name: v for e in effects for name, v in fitted_parameters(e, fit, runs.model).items()}
     values |= {name: Value(*of, meaning(name, plant=model.plant).unit) for name, of in r.marks.items()}
     before = {name: runs.model[name] for name in fit.values if name in runs.model.values}
     held = runs.sources[-1] if runs.holdout is not None else None
@@ -129,12 +131,12 @@ def _finished(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], r
         known, software=software(), history=(*known.history, discovery_options.typed()), effects=tuple(effects),
         signals=runs.est.outputs, trace=runs.sources[0], repeats=runs.sources[1:1 + len(runs.repeats)], holdout=held,
         floor=floor, before={**(known.before or {}), **before}, ledger=tuple(rows))
-    return Done(model, provenance, r, values, suspicious(fit, model.plant), notes)
+    return Done(model, provenance, r, values, list_suspicious(fit, model.plant), notes)
 
 
 def write(path: Path, done: Done, page: Path | None, title: str, why: str) -> Path | None:
     """Write the model file, and the page; -> where the file that was there before is now, None if there was none."""
-    text = model_file.written(done.model, _intervals(done), done.provenance)
+    text = model_file.format_model_file(done.model, _intervals(done), done.provenance)
     kept = None
     if path.exists() and path.read_bytes():
         kept = path.with_name(path.name + ".bak")

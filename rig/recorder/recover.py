@@ -15,7 +15,7 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schem
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 
 from fdi.output import writable
-from fdi.trace.mcap_log import scan
+from fdi.trace.mcap_log import scan_messages
 from plant.errors import InputError
 from rig.recorder.container import McapFile
 
@@ -128,6 +128,6 @@ def _declare(file: McapFile, record: McapRecord) -> None:
 def _index(raw: bytes) -> dict[int, array[int]]:
     """Channel -> flat pairs (log time ns, offset) of the messages in a chunk."""
     index: dict[int, array[int]] = {}
-    for channel, time_ns, at, _ in scan(raw):
+    for channel, time_ns, at, _ in scan_messages(raw):
         index.setdefault(channel, array("Q")).extend((time_ns, at))
     return index

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: the file of --model, else model.toml); exit status 0 if the effect helps, 1 if not."""
     from fdi.discovery import model_file as ledgers
-    from fdi.discovery.refit import addable
+    from fdi.discovery.refit import check_addable
     from rig.cli import model_update, show_ledger
     from rig.cli.progress_bar import show_progress
 
@@ -34,8 +34,8 @@ def run_command(args: argparse.Namespace) -> int:
     page = discovery_options.place(str(path.with_suffix(".html")), (".html",), trace or args.words[0])
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
-        runs = model_update.runs_of(args, trace, ledgers.original(model, known), known)
-        addable(runs.model, [*known.effects, *effects])
+        runs = model_update.runs_of(args, trace, ledgers.remove_all_effects(model, known), known)
+        check_addable(runs.model, [*known.effects, *effects])
         discovery_options.prepare(runs, progress, [*known.effects, *effects])
         done = model_update.added(effects, runs, model, known, progress)
         done = done.using(discovery_options.effect_files(args, known))

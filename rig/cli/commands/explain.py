@@ -32,7 +32,7 @@ def run_command(args: argparse.Namespace) -> int:
     """Name what is missing; exit status 0 if nothing is, 1 otherwise."""
     from fdi.discovery import explain
     from fdi.discovery.candidates import to_json
-    from fdi.discovery.runs import read
+    from fdi.discovery.runs import read_runs
     from fdi.output import write_text
     from rig.cli import show_explain
     from rig.cli.progress_bar import show_progress
@@ -41,7 +41,7 @@ def run_command(args: argparse.Namespace) -> int:
     model, _ = discovery_options.model_of(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("reading", 0.0)
-        runs = read(model, args.trace, args.repeat, args.holdout, discovery_options.signals_of(args))
+        runs = read_runs(model, args.trace, args.repeat, args.holdout, discovery_options.signals_of(args))
         discovery_options.prepare(runs, progress)
         found = explain(runs.model, runs.est, runs.repeats, runs.holdout, progress)
         progress("putting it into words", 0.95)
@@ -71,23 +71,23 @@ def places(args: argparse.Namespace) -> tuple[Path | None, Path | None]:
 
 def worked_out(found: Explanation, seed: int, effect_file: str | None) -> tuple[Answer, Pattern | None]:
     """All that is told: the shape of what is left, what would split a set, and the effect file if one is wanted."""
-    from fdi.discovery.candidates import told
+    from fdi.discovery.candidates import assess_explanation
 
     shape = None
     if found.verdict in LEFT_OVER or effect_file:
-        from fdi.discovery.residual_pattern import pattern, write_effect  # takes half a second to import
+        from fdi.discovery.residual_pattern import find_pattern, write_effect  # takes half a second to import
 
-        shape = pattern(found.search, found.ledger[-1])
+        shape = find_pattern(found.search, found.ledger[-1])
         if effect_file:
             write_effect(shape, effect_file)
     split: dict[str, Any] = {}
     if found.verdict == "AMBIGUOUS":
-        from fdi.discovery.separate import separate
+        from fdi.discovery.separate import find_separation
 
         equal = [h for h in found.ranked if h.reached and set(h.effects) <= set(found.effects)]
-        separation = separate(found.search, equal)
+        separation = find_separation(found.search, equal)
         split = separation._asdict() if separation else {}
-    return told(found, seed, str(shape) if shape and found.verdict in LEFT_OVER else "", split), shape
+    return assess_explanation(found, seed, str(shape) if shape and found.verdict in LEFT_OVER else "", split), shape
 
 
 def write_page(page: Path, args: argparse.Namespace, answer: Answer, runs: Runs, shape: Pattern | None) -> None:

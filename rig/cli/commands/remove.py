@@ -41,7 +41,7 @@ def run_command(args: argparse.Namespace) -> int:
         runs = None
         if trace is not None:
             progress("reading", 0.0)
-            runs = model_update.runs_of(args, trace, ledgers.original(model, known), known)
+            runs = model_update.runs_of(args, trace, ledgers.remove_all_effects(model, known), known)
             discovery_options.prepare(runs, progress, known.effects)
         done = model_update.removed(effects[0], runs, model, known, progress)
         done = done.using(discovery_options.effect_files(args, known))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.comparison.controller_block import DISAGREES, controller, lags, resolution
+from fdi.comparison.controller_block import DISAGREES, compare_controller, find_lags, measure_resolution
 from fdi.estimation.preparation import read_cycles
 from fdi.trace.columns import shift_rows
 from fdi.trace.trace import Trace
@@ -22,7 +22,7 @@ def c() -> Trace:
 
 
 def test_the_same_firmware_agrees_to_the_last_digit(c: Trace) -> None:
-    found = controller(c, MODEL)
+    found = compare_controller(c, MODEL)
     assert found.error < 1e-15 and found.ratio <= 1.0 and (found.com_lag, found.xj_lag) == (0, 0)
 
 
@@ -31,7 +31,7 @@ def test_rounding_in_a_file_is_no_disagreement(c: Trace, digits: int) -> None:
     def rounded(x: np.ndarray) -> np.ndarray:
         return np.array([float(f"{v:.{digits - 1}e}") for v in x.tolist()])
 
-    found = controller(replace(c, cor=rounded(c.cor), xj=rounded(c.xj)), MODEL)
+    found = compare_controller(replace(c, cor=rounded(c.cor), xj=rounded(c.xj)), MODEL)
     assert found.ratio < DISAGREES
 
 
@@ -39,7 +39,7 @@ def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
     """The firmware sees what the bus carries, and its answer is rounded to 1e-8 A."""
     xj = np.round(c.xj / 1e-7) * 1e-7
     cor = np.round(np.clip(3.8 * (c.com - xj), -8e-3, 8e-3) / 1e-8) * 1e-8
-    found = controller(replace(c, xj=xj, cor=cor), MODEL)
+    found = compare_controller(replace(c, xj=xj, cor=cor), MODEL)
     assert found.ratio < 1.2
 
 
@@ -50,9 +50,9 @@ def test_another_firmware_is_told(changes: dict[str, float]) -> None:
     model = MODEL.replace(changes)
     run = simulate(model, healthy().com, seed=1, steps=20)
     c = replace(read_cycles(healthy(), MODEL)[0], com=run.com, xj=run.xj, cor=run.cor)
-    found = controller(c, MODEL)
+    found = compare_controller(c, MODEL)
     assert found.ratio > 100 and (found.com_lag, found.xj_lag) == (0, 0)
-    assert controller(c, model).ratio <= 1.0
+    assert compare_controller(c, model).ratio <= 1.0
     if "controller.proportional_gain" in changes:
         assert found.gain == pytest.approx(3.7, rel=1e-6)
 
@@ -60,22 +60,22 @@ def test_another_firmware_is_told(changes: dict[str, float]) -> None:
 @pytest.mark.parametrize(("com", "xj"), [(3, 0), (-2, 0), (0, 2), (2, 2)])
 def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     """`com` cycles before row k is what Cor_k answers, the file having it earlier than it should."""
-    found = controller(replace(c, com=shift_rows(c.com, -com), xj=shift_rows(c.xj, -xj)), MODEL)
+    found = compare_controller(replace(c, com=shift_rows(c.com, -com), xj=shift_rows(c.xj, -xj)), MODEL)
     assert (found.com_lag, found.xj_lag) == (com, xj) and found.ratio <= 1.0
-    assert lags(c, 8e-3)[:2] == (0, 0)
+    assert find_lags(c, 8e-3)[:2] == (0, 0)
 
 
 def test_resolution_of_a_column() -> None:
     rng = np.random.default_rng(0)
-    assert resolution(np.round(rng.standard_normal(1000), 3)) == pytest.approx(1e-3, rel=0.01)
-    assert resolution(np.round(rng.standard_normal(1000) * 1e5) * 1e-8) == pytest.approx(1e-8, rel=0.01)
+    assert measure_resolution(np.round(rng.standard_normal(1000), 3)) == pytest.approx(1e-3, rel=0.01)
+    assert measure_resolution(np.round(rng.standard_normal(1000) * 1e5) * 1e-8) == pytest.approx(1e-8, rel=0.01)
     six = np.array([float(f"{x:.5e}") for x in rng.uniform(1, 9, 1000)])
-    assert resolution(six) == pytest.approx(1e-5, rel=0.01)
-    assert resolution(rng.standard_normal(1000)) < 1e-10
+    assert measure_resolution(six) == pytest.approx(1e-5, rel=0.01)
+    assert measure_resolution(rng.standard_normal(1000)) < 1e-10
 
 
 def test_missing_samples_are_not_judged(c: Trace) -> None:
     xj = c.xj.copy()
     xj[100:103] = np.nan
-    found = controller(replace(c, xj=xj), MODEL)
+    found = compare_controller(replace(c, xj=xj), MODEL)
     assert np.isnan(found.residual[100:104]).all() and found.ratio <= 1.0 and not np.isnan(found.residual[104])

@@ -7,8 +7,24 @@ import numpy as np
 import pytest
 from noisy_traces import LEVELS, healthy, noise
 
-from fdi.comparison.localisation import Motion, condition, derivative, motion, places, whole
-from fdi.comparison.residual_tests import WHITE, colour, cumulative, depend, diagnose, follow, shape, whiten
+from fdi.comparison.localisation import (
+    Motion,
+    combine_residuals,
+    derivative,
+    describe_motion,
+    find_condition,
+    locate_error,
+)
+from fdi.comparison.residual_tests import (
+    WHITE,
+    apply_whitener,
+    bin_residual,
+    correlate_with_input,
+    cumulate_periodogram,
+    examine_residuals,
+    fit_whitener,
+    name_shape,
+)
 from fdi.estimation.preparation import read_cycles
 from fdi.trace.trace import Trace
 from plant import Model
@@ -23,7 +39,7 @@ def c() -> Trace:
 
 @pytest.fixture(scope="module")
 def m(c: Trace) -> Motion:
-    return motion(c, {"xj": c.xj, "p12": c.p12, "xs": c.xs})
+    return describe_motion(c, {"xj": c.xj, "p12": c.p12, "xs": c.xs})
 
 
 def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
@@ -55,19 +71,19 @@ def test_motion_of_the_ram(c: Trace, m: Motion) -> None:
 def test_the_condition_is_named(c: Trace, m: Motion, chosen: object, words: str) -> None:
     rows = chosen(c, m)  # type: ignore[operator]
     z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
-    said = condition(z2, m, LIMIT)
+    said = find_condition(z2, m, LIMIT)
     assert said.startswith(("100 %", "99 %")) and re.search(words, said), said
 
 
 def test_noise_and_what_is_everywhere_have_no_condition(c: Trace, m: Motion) -> None:
-    assert condition(squares(2, len(c), np.zeros(len(c))), m, LIMIT) == ""
-    assert condition(squares(2, len(c), np.full(len(c), 9.0)), m, LIMIT) == ""
-    assert condition(np.full(len(c), np.nan), m, LIMIT) == ""
+    assert find_condition(squares(2, len(c), np.zeros(len(c))), m, LIMIT) == ""
+    assert find_condition(squares(2, len(c), np.full(len(c), 9.0)), m, LIMIT) == ""
+    assert find_condition(np.full(len(c), np.nan), m, LIMIT) == ""
 
 
 def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
     z2 = squares(3, len(c), np.where((c.t >= 4.0) & (c.t < 6.0), 50.0, 0.0))
-    found = places(c, z2, m, LIMIT)
+    found = locate_error(c, z2, m, LIMIT)
     assert sum(p.share for p in found) == pytest.approx(1.0, abs=0.01)
     assert found[0].section == "ramp at 0.5 mm/s"
     assert (found[0].t0, found[0].t1) == (pytest.approx(4.0, abs=2e-3), pytest.approx(6.0, abs=2e-3))
@@ -76,14 +92,14 @@ def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
 
 
 def test_signals_are_weighed_by_their_floors() -> None:
-    z2 = whole({"xj": np.array([2e-6, np.nan]), "p12": np.array([4e4, np.nan])}, {"xj": 2e-6, "p12": 2e4})
+    z2 = combine_residuals({"xj": np.array([2e-6, np.nan]), "p12": np.array([4e4, np.nan])}, {"xj": 2e-6, "p12": 2e4})
     assert z2[0] == pytest.approx((1 + 4) / 2) and np.isnan(z2[1])
 
 
 def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
     outside, reached, dependent = 0, 0, 0
     for seed in range(100, 120):  # not that of the trace, whose noise is in its own XJ
-        d = diagnose(c, {"xj": noise(seed, len(c))[:, 0]}, {}, m)["xj"]
+        d = examine_residuals(c, {"xj": noise(seed, len(c))[:, 0]}, {}, m)["xj"]
         outside += d.departs > d.allowed
         reached += any(abs(f.correlation) > f.bound for f in d.follows)
         dependent += bool(d.depends) and d.depends[0].share > 0.02
@@ -92,26 +108,26 @@ def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
 
 def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Motion) -> None:
     r, repeat = (noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
-    alone = diagnose(c, {"xj": r}, {}, m)["xj"]
-    d = diagnose(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
+    alone = examine_residuals(c, {"xj": r}, {}, m)["xj"]
+    d = examine_residuals(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
     assert alone.departs > 5 * alone.allowed and d.departs < 3 * d.allowed
     assert d.memory == pytest.approx(d.noise_memory, abs=1.5e-3)
 
 
 def test_a_colour_is_taken_out() -> None:
     x = noise(1, 13_500, "hum")[:, 0]
-    e = whiten(x, colour(x))
+    e = apply_whitener(x, fit_whitener(x))
     assert np.abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03 < np.corrcoef(x[1:], x[:-1])[0, 1]
-    assert (colour(np.zeros(100)) == WHITE).all() and np.isfinite(colour(np.sin(np.arange(500.0)))).all()
+    assert (fit_whitener(np.zeros(100)) == WHITE).all() and np.isfinite(fit_whitener(np.sin(np.arange(500.0)))).all()
 
 
 @pytest.mark.parametrize("lag", [1, 7, 30])
 def test_what_follows_an_input_is_found_with_its_lag(c: Trace, lag: int) -> None:
     u = np.random.default_rng(0).standard_normal(len(c)).cumsum()
     left = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
-    found = follow("Cor", u, WHITE, left, 1e-3)
+    found = correlate_with_input("Cor", u, WHITE, left, 1e-3)
     assert found.lag == pytest.approx(lag * 1e-3) and found.correlation > 4 * found.bound
-    alone = follow("Cor", u, WHITE, left - 0.5 * np.roll(u, lag), 1e-3)
+    alone = correlate_with_input("Cor", u, WHITE, left - 0.5 * np.roll(u, lag), 1e-3)
     assert abs(alone.correlation) < 1.5 * alone.bound
 
 
@@ -122,16 +138,16 @@ def test_dependence_on_speed_and_its_shape(m: Motion, law: object, word: str) ->
     rng = np.random.default_rng(0)
     v = rng.uniform(-0.1, 0.1, 13_500)
     left = law(v) + 0.1 * rng.standard_normal(len(v))  # type: ignore[operator]
-    found = depend("speed", v, left)
+    found = bin_residual("speed", v, left)
     assert found is not None and found.shape == word and found.share > 0.8
     inside = np.abs(found.means - law(found.centres)) < 4 * found.half + 0.05  # type: ignore[operator]
     assert inside.mean() > 0.8
-    assert depend("speed", np.zeros(100), left[:100]) is None
-    assert shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
+    assert bin_residual("speed", np.zeros(100), left[:100]) is None
+    assert name_shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
 
 
 def test_the_cumulative_periodogram_of_a_line() -> None:
     x = np.sin(2 * np.pi * 0.1 * np.arange(5000))
-    frequencies, power, departs, allowed = cumulative(x, 1e-3)
+    frequencies, power, departs, allowed = cumulate_periodogram(x, 1e-3)
     assert power[np.searchsorted(frequencies, 99.0)] < 0.01 and power[np.searchsorted(frequencies, 101.0)] > 0.99
     assert departs > 10 * allowed and allowed == pytest.approx(1.358 / np.sqrt(len(power)), rel=1e-3)

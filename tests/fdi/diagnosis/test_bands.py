@@ -24,7 +24,7 @@ from fdi.diagnosis.faults import Level
 from fdi.diagnosis.learn_bands import simulate_bands
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.thresholds import BAND_EVENT_SAMPLES
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from plant.profile import build as profile
@@ -42,7 +42,7 @@ def command() -> np.ndarray:
 
 @cache
 def parts() -> list[Section]:
-    return sections(command())
+    return find_sections(command())
 
 
 @cache
@@ -193,7 +193,7 @@ def test_any_command() -> None:
     for kind, ruling in ((UnitKind("", 0.4), CLOGGING), (UnitKind("", friction=60.0), FRICTION), (UnitKind(""), None)):
         x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
         assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
-    check_command(made, sections(com), 1e-3, "")
+    check_command(made, find_sections(com), 1e-3, "")
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:

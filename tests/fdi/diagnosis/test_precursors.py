@@ -21,7 +21,7 @@ from fdi.diagnosis.precursors import (
 )
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.report.diagnosis_figures import estimates, telling
-from fdi.trace.sections import Section, sections
+from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import load_model, simulate
 from rig.cli.main import main
@@ -53,7 +53,7 @@ def test_a_step_of_second_order(zeta: float, omega: float) -> None:
     """Overshoot exp(-pi zeta / root), its square back, peak at pi / omega_d; rise and settling as on a fine grid."""
     com = np.r_[np.zeros(300), np.full(700, 2e-3)]
     x = np.r_[np.zeros(300), second_order(zeta, omega, 700, 2e-3)]
-    found = {name: float(v[0]) for name, v in compute_features(com, x[None], MS, sections(com)).items()}
+    found = {name: float(v[0]) for name, v in compute_features(com, x[None], MS, find_sections(com)).items()}
     root = math.sqrt(1 - zeta**2)
     over = math.exp(-math.pi * zeta / root)
     fine = np.arange(700_000) * 1e-6
@@ -71,7 +71,7 @@ def test_an_oscillation_on_a_ramp() -> None:
     ramp = 5e-4 * np.arange(2000) * MS
     com = np.r_[np.zeros(300), ramp, np.full(300, 1e-3), 1e-3 - ramp, np.zeros(300)]
     wave = 5e-5 * np.sin(2 * np.pi * 8 * np.arange(len(com)) * MS)
-    parts = sections(com)
+    parts = find_sections(com)
     way = np.zeros(len(com))
     for s in parts:
         way[s.start:s.stop] = np.sign(s.rate)
@@ -113,7 +113,7 @@ def test_the_table_tells_what_tells() -> None:
     assert abs(table["mean_ramp_error"].clogging_ratio) < 1 < abs(table["settling_time_5mm"].clogging_ratio)
     com = command()
     x = simulate_units(load_model(), com, np.zeros_like(com), UnitKind(""), 64, seed=77)
-    fresh = compute_features(com, x, MS, sections(com))
+    fresh = compute_features(com, x, MS, find_sections(com))
     for name in ("overshoot_5mm", "break_away", "mean_ramp_error", "speed_ripple"):
         assert float(fresh[name].mean()) == pytest.approx(table[name].healthy, abs=0.5 * table[name].noise)
         assert float(fresh[name].std()) == pytest.approx(table[name].noise, rel=0.4)
@@ -138,7 +138,7 @@ def test_what_a_command_does_not_show() -> None:
     """No ramps, no stick-slip; no steps, no overshoot; an oscillation that goes on has no settling time."""
     com = np.r_[np.zeros(200), np.full(800, 1e-3)]
     x = com + 2e-4 * np.sin(2 * np.pi * 10 * np.arange(1000) * MS)
-    found = compute_features(com, x[None], MS, sections(com))
+    found = compute_features(com, x[None], MS, find_sections(com))
     assert "break_away" not in found and math.isnan(found["settling_time_1mm"][0])
     assert format_precursor(math.nan, "settling_time_1mm") == "-"
     assert compute_features(np.zeros(500), np.zeros((1, 500)), MS, [Section("hold", 0, 500, 0.0, 0.0, 0.0)]) == {}

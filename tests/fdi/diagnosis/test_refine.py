@@ -16,9 +16,9 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.final_rounds import sloped
+from fdi.estimation.final_rounds import linearise_across
 from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.unidentifiable import flats, relaxed_along
+from fdi.estimation.unidentifiable import find_flat_directions, relax_along
 from plant import Model, load_model
 from rig.studies.campaign.case import simulate_case
 from rig.studies.campaign.matrix import build_matrix
@@ -80,7 +80,7 @@ def test_flat_directions_change_no_signal() -> None:
     """Scaled together, they are another plant and the same run; along any one of their parameters the run changes."""
     problem, free = make_problem(MODEL, hold_inputs(recorded({}))), list_unknowns(MODEL)
     x = make_start(free, 0.2, 20.0)
-    flat = flats(problem, free, x)
+    flat = find_flat_directions(problem, free, x)
     assert flat.shape == (len(free), 4)
     white = problem.whitened(problem.residuals(free, np.vstack([x, x + 0.01 * flat.T, x + 0.01 * np.diag(flat[:, 0])])))
     moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
@@ -89,11 +89,11 @@ def test_flat_directions_change_no_signal() -> None:
 
 def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
     problem, found = make_problem(MODEL, hold_inputs(recorded({}))), off_grid.fit
-    flat = flats(problem, found.free, found.x)
-    here = sloped(problem, found.free, found.x, found.covariance, flat)
+    flat = find_flat_directions(problem, found.free, found.x)
+    here = linearise_across(problem, found.free, found.x, found.covariance, flat)
     along = np.abs(np.tensordot(flat.T, here.jacobian, 1)).max()
     assert along < 1e-6 * np.abs(here.jacobian).max() * np.abs(flat).max()
-    away = relaxed_along(here, flat)
+    away = relax_along(here, flat)
     pull = flat.T @ (np.array([f.prior**-2 for f in found.free]) * away.x)
     assert np.abs(pull).max() < 1e-6 * np.abs(flat).max()
 

@@ -9,13 +9,13 @@ from effect_files import restored_catalogue
 from noisy_traces import recorded
 from scipy.signal import lfilter
 
-from fdi.discovery.fingerprints import comb, firmware, firmware_residual
-from fdi.discovery.residual_pattern import Pattern, curve, wave, write_effect
-from fdi.discovery.scan import tones
-from fdi.discovery.search import Search, common
-from fdi.discovery.significance import Sensitivity, p_value, smallest_visible
-from fdi.estimation.likelihood import BLOCK, FITTED, misfit, weights
-from fdi.estimation.noise import fitted, level
+from fdi.discovery.fingerprints import compute_firmware_residual, find_firmware_marks, find_quantisation
+from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
+from fdi.discovery.scan import find_tones
+from fdi.discovery.search import Search, measure_repeating
+from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
+from fdi.estimation.likelihood import BLOCK, FITTED, compute_misfit, compute_weights
+from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.preparation import hold_inputs
 from fdi.trace.trace import Trace
 from plant import InputError, Model, simulate
@@ -31,7 +31,7 @@ def coloured(seed: int, n: int = 13_500) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_coloured_noise_becomes_white(seed: int) -> None:
-    noise = fitted(coloured(seed))
+    noise = fit_noise(coloured(seed))
     white = noise.whiten(coloured(seed + 1000))
     assert noise.level == pytest.approx(2e-6, rel=0.05)  # 1.2e-6 / sqrt(1 - 0.8^2)
     assert white[50:].std() == pytest.approx(1.0, rel=0.05)
@@ -41,7 +41,7 @@ def test_coloured_noise_becomes_white(seed: int) -> None:
 def test_what_is_not_measured_counts_as_nothing() -> None:
     x = coloured(0)
     x[500:520] = np.nan
-    white = fitted(x).whiten(x)
+    white = fit_noise(x).whiten(x)
     assert np.isfinite(white).all()
     assert (white[500:520] == 0.0).all()
 
@@ -49,33 +49,33 @@ def test_what_is_not_measured_counts_as_nothing() -> None:
 def test_a_stop_that_came_later_is_no_noise() -> None:
     x = np.random.default_rng(0).normal(0.0, 1.0, 13_500)
     x[3000:4000] += 50.0
-    assert level(x) == pytest.approx(1.0, rel=0.05)
-    assert fitted(x).level == pytest.approx(1.0, rel=0.05)
+    assert measure_level(x) == pytest.approx(1.0, rel=0.05)
+    assert fit_noise(x).level == pytest.approx(1.0, rel=0.05)
 
 
 def test_the_likelihood_is_squares_where_fitted_and_logarithms_where_not() -> None:
     noise = np.random.default_rng(1).standard_normal((1, 2, 50 * BLOCK))
-    assert misfit(noise)[0] == pytest.approx((noise**2).sum())
+    assert compute_misfit(noise)[0] == pytest.approx((noise**2).sum())
     spoilt = noise.copy()
     spoilt[0, 0, :BLOCK] = 1e3
     expected = FITTED * BLOCK * (1 + np.log(1e6 / FITTED)) - (noise[0, 0, :BLOCK] ** 2).sum()
-    assert misfit(spoilt)[0] - misfit(noise)[0] == pytest.approx(expected)
+    assert compute_misfit(spoilt)[0] - compute_misfit(noise)[0] == pytest.approx(expected)
 
 
 def test_the_weights_are_the_slope_of_the_likelihood() -> None:
     rng = np.random.default_rng(2)
     white = rng.standard_normal((2, 10 * BLOCK)) * np.repeat([[1.0, 5.0] * 5], BLOCK, axis=1)
     way, h = rng.standard_normal(white.shape), 1e-6
-    slope = (misfit((white + h * way)[None]) - misfit((white - h * way)[None]))[0] / (2 * h)
-    assert slope == pytest.approx(2 * (weights(white) * white * way).sum(), rel=1e-5)
+    slope = (compute_misfit((white + h * way)[None]) - compute_misfit((white - h * way)[None]))[0] / (2 * h)
+    assert slope == pytest.approx(2 * (compute_weights(white) * white * way).sum(), rel=1e-5)
 
 
 def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> None:
-    ratios = [common(coloured(s)[None], [coloured(s + 500)[None]], [0.0])[0] for s in SEEDS]
+    ratios = [measure_repeating(coloured(s)[None], [coloured(s + 500)[None]], [0.0])[0] for s in SEEDS]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.02)
     assert max(ratios) < 1.08  # the gate
     physics = 1e-6 * np.sin(np.arange(13_500) / 200.0)
-    found = common((coloured(1) + physics)[None], [(coloured(2) + physics)[None]], [0.0])[0]
+    found = measure_repeating((coloured(1) + physics)[None], [(coloured(2) + physics)[None]], [0.0])[0]
     assert found == pytest.approx(np.sqrt(1 + 0.5e-12 / 4e-12), abs=0.03)
 
 
@@ -90,13 +90,13 @@ def test_the_p_value_is_that_of_the_best_of_all_candidates() -> None:
     s = _independent(10)
     for gain in (4.0, 6.0, 9.0):
         exact = 1.0 - (1.0 - 0.5 * chi2.sf(gain, 1)) ** 10  # each on its own side only
-        assert p_value(s, gain) == pytest.approx(exact, rel=0.3)
-    assert p_value(s, 60.0) < 1e-3
+        assert compute_p_value(s, gain) == pytest.approx(exact, rel=0.3)
+    assert compute_p_value(s, 60.0) < 1e-3
 
 
 def test_the_smallest_visible_size_is_where_the_gain_reaches_the_threshold() -> None:
     s = Sensitivity(("a", "a", "b"), (1.0, 10.0, 5.0), np.array([0.3, 30.0 * 100, 30.0 / 4]), np.eye(3))
-    seen = smallest_visible(s)
+    seen = find_smallest_visible(s)
     assert 1.0 < seen["a"] < 10.0
     assert np.isinf(seen["b"])
 
@@ -111,9 +111,9 @@ def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
 def test_the_firmware_leaves_its_mark_without_noise() -> None:
     model = Model()
     healthy, limited = hold_inputs(_recorded({})), hold_inputs(_recorded({"command_rate_limit.rate": 0.12}))
-    assert np.nanmax(np.abs(firmware_residual(model, healthy))) == 0.0
-    assert firmware(model, [healthy]) == (0.0, [])
-    error, found = firmware(model, [limited])
+    assert np.nanmax(np.abs(compute_firmware_residual(model, healthy))) == 0.0
+    assert find_firmware_marks(model, [healthy]) == (0.0, [])
+    error, found = find_firmware_marks(model, [limited])
     assert error > 100.0
     assert [f.effect for f in found] == ["command_rate_limit"]
     value, low, high = found[0].parameters["command_rate_limit.rate"]
@@ -121,8 +121,8 @@ def test_the_firmware_leaves_its_mark_without_noise() -> None:
 
 
 def test_a_converter_with_few_bits_leaves_a_comb() -> None:
-    assert comb(hold_inputs(_recorded({}))) is None
-    tooth = comb(hold_inputs(_recorded({"quantisation.lsb": 7.3e-6})))
+    assert find_quantisation(hold_inputs(_recorded({}))) is None
+    tooth = find_quantisation(hold_inputs(_recorded({"quantisation.lsb": 7.3e-6})))
     assert tooth is not None
     assert tooth.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4)
 
@@ -132,7 +132,7 @@ def test_a_wave_over_the_position_is_found() -> None:
     t = np.arange(13_000) * 1e-3
     x = 5e-3 * np.sin(2 * np.pi * 0.3 * t) + 1e-3 * np.sin(2 * np.pi * 2.1 * t)
     y = 700.0 * np.sin(2 * np.pi * x / 1.7e-3 + 0.4) + rng.normal(0.0, 200.0, x.size)
-    (amplitude, length, phase), share = wave(y, x, 200.0)
+    (amplitude, length, phase), share = fit_wave(y, x, 200.0)
     assert (amplitude, length) == pytest.approx((700.0, 1.7e-3), rel=0.05)
     assert share > 0.9
     assert np.cos(phase - 0.4) > 0.9
@@ -141,7 +141,7 @@ def test_a_wave_over_the_position_is_found() -> None:
 def test_a_curve_over_the_speed_is_found() -> None:
     rng = np.random.default_rng(4)
     v = rng.normal(0.0, 0.02, 13_000)
-    share, at, height, doubt = curve(2e6 * v * np.abs(v) + rng.normal(0.0, 100.0, v.size), v, 100.0)
+    share, at, height, doubt = fit_curve(2e6 * v * np.abs(v) + rng.normal(0.0, 100.0, v.size), v, 100.0)
     assert share > 0.95
     assert np.abs(height - 2e6 * at * np.abs(at)).max() < 150.0
     assert (doubt > 0.0).all()
@@ -176,6 +176,6 @@ def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None
     """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
     ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
     search = Search(Model(), hold_inputs(recorded(ripple)), [], ["supply_ripple"], 1)
-    starts = tones(search.problem, search.base().fit, "supply_ripple")
+    starts = find_tones(search.problem, search.base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10

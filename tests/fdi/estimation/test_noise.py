@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from noisy_traces import LEVELS, noise
 
-from fdi.estimation.noise import floors, from_data, from_repeats, hum_lines, quiet_level
+from fdi.estimation.noise import find_floors, find_hum_lines, floor_from_data, floor_from_repeats, measure_quiet_level
 
 ROWS = 13_500
 
@@ -24,7 +24,7 @@ def test_a_perfect_model_has_ratio_one(colour: str, rows: int, scatter: float) -
     ratios = []
     for seed in range(30):
         r, repeat = pair(seed, colour, rows)
-        ratios.append(rms(r) / from_repeats(r, [repeat]).value)
+        ratios.append(rms(r) / floor_from_repeats(r, [repeat]).value)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.025)
     assert np.std(ratios) < scatter
     assert max(ratios) < 1.02 + 4 * scatter
@@ -34,7 +34,7 @@ def test_a_perfect_model_has_ratio_one(colour: str, rows: int, scatter: float) -
 def test_what_the_model_lacks_in_both_runs_is_no_noise(colour: str) -> None:
     r, repeat = pair(0, colour)
     shared = 20 * np.sin(np.arange(ROWS) / 300)
-    assert from_repeats(r + shared, [repeat + shared]).value == pytest.approx(1.0, abs=0.06)
+    assert floor_from_repeats(r + shared, [repeat + shared]).value == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize(("part", "least"), [(0.3, 0.02), (0.6, 0.05), (0.8, 0.1)])
@@ -46,7 +46,7 @@ def test_stick_slip_that_comes_at_other_times_is_no_noise(part: float, least: fl
         rng = np.random.default_rng(seed)
         events = np.repeat(np.where(rng.random(ROWS // 100) < part, rng.exponential(10, ROWS // 100), 0.0), 100)
         slow = np.cumsum(rng.standard_normal(ROWS)) / 20
-        found.append(from_repeats(r + events * np.tanh(slow), [repeat - events * np.tanh(slow)]))
+        found.append(floor_from_repeats(r + events * np.tanh(slow), [repeat - events * np.tanh(slow)]))
     assert np.mean([f.value for f in found]) == pytest.approx(1.0, abs=least)
     assert found[0].difference > 3.0  # told apart from the noise
     assert found[0].share < 1.05 - 0.6 * part
@@ -57,17 +57,17 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
     k = np.arange(ROWS)
     r, repeat = pair(3, "white")
     hum = 0.8 * np.sin(2 * np.pi * 0.05 * k + 1.0)
-    found = from_repeats(r + hum, [repeat + hum])
+    found = floor_from_repeats(r + hum, [repeat + hum])
     assert found.hum == pytest.approx(0.8 / np.sqrt(2), rel=0.1)
     assert found.value == pytest.approx(np.hypot(1.0, 0.8 / np.sqrt(2)), rel=0.03)
-    assert [f for f, _ in hum_lines([r + hum, repeat + hum], 1e-3)] == [50.0]
-    assert hum_lines([r, repeat], 1e-3) == []
-    assert 400.0 in [f for f, _ in hum_lines([r + 0.3 * np.sin(2 * np.pi * 0.4 * k)] * 2, 1e-3)]
+    assert [f for f, _ in find_hum_lines([r + hum, repeat + hum], 1e-3)] == [50.0]
+    assert find_hum_lines([r, repeat], 1e-3) == []
+    assert 400.0 in [f for f, _ in find_hum_lines([r + 0.3 * np.sin(2 * np.pi * 0.4 * k)] * 2, 1e-3)]
 
 
 def test_more_repeats_say_the_same_with_less_doubt() -> None:
     def scatter(count: int) -> float:
-        return float(np.std([from_repeats(noise(10 * s, 2000)[:, 0], [noise(10 * s + i, 2000)[:, 0]
+        return float(np.std([floor_from_repeats(noise(10 * s, 2000)[:, 0], [noise(10 * s + i, 2000)[:, 0]
                                                                       for i in range(1, count + 1)]).value
                              for s in range(20)]))
 
@@ -77,17 +77,17 @@ def test_more_repeats_say_the_same_with_less_doubt() -> None:
 def test_gaps_and_other_lengths() -> None:
     r, repeat = pair(1, "white")
     r[2000:3000], repeat[500:600] = np.nan, np.nan
-    found = floors({"xj": r, "p12": r}, [{"xj": repeat[:9000]}])
+    found = find_floors({"xj": r, "p12": r}, [{"xj": repeat[:9000]}])
     assert set(found) == {"xj"} and found["xj"].source == "repeats" and not found["xj"].lower_bound
     assert found["xj"].value == pytest.approx(1.0, abs=0.03)
     assert found["xj"].freedom == pytest.approx(1.0, abs=0.1)
-    assert from_repeats(r[:50], [repeat[:50]]).value == pytest.approx(1.0, abs=0.4)  # too short for windows
-    assert quiet_level([np.full(500, np.nan)])[0] == 0.0 and quiet_level([np.zeros(500)])[0] == 0.0
+    assert floor_from_repeats(r[:50], [repeat[:50]]).value == pytest.approx(1.0, abs=0.4)  # too short for windows
+    assert measure_quiet_level([np.full(500, np.nan)])[0] == 0.0 and measure_quiet_level([np.zeros(500)])[0] == 0.0
 
 
 def test_second_differences_are_a_lower_bound() -> None:
     slow = 1e3 * np.sin(np.arange(ROWS) / 200)
     white, coloured = (noise(5, ROWS, colour)[:, 0] / LEVELS[0] for colour in ("white", "hum"))
-    assert from_data(white + slow).value == pytest.approx(1.0, abs=0.05)
-    assert from_data(coloured + slow).value < 0.6
-    assert from_data(white).lower_bound and from_data(np.array([1.0, 2.0])).value == 0.0
+    assert floor_from_data(white + slow).value == pytest.approx(1.0, abs=0.05)
+    assert floor_from_data(coloured + slow).value < 0.6
+    assert floor_from_data(white).lower_bound and floor_from_data(np.array([1.0, 2.0])).value == 0.0

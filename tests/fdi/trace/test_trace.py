@@ -10,7 +10,7 @@ import pytest
 from places import ROOT, SHARED
 from synthetic_run import ATTACHMENTS, command, record
 
-from fdi.trace.sections import sections
+from fdi.trace.sections import find_sections
 from fdi.trace.trace import Check, Gap, Trace
 from plant.errors import InputError
 from rig.recorder import Event, NmtState, Recorder, Signals, Timing
@@ -158,20 +158,20 @@ def test_run_that_ended_in_its_set_up(tmp_path: Path) -> None:
 def test_sections_of_any_command() -> None:
     t = np.arange(2000) / 1000
     steps = np.repeat([0.0, 1e-3, -2e-3, -2.05e-3], 500)
-    assert [s.kind for s in sections(steps)] == ["hold", "step", "step", "step"]
+    assert [s.kind for s in find_sections(steps)] == ["hold", "step", "step", "step"]
     ramp = np.concatenate([np.zeros(500), 0.33e-3 * t, np.full(500, 0.33e-3 * 2)])
     on_the_bus = np.rint(ramp * 1e7) / 1e7
-    (hold, slope, rest) = sections(on_the_bus)
+    (hold, slope, rest) = find_sections(on_the_bus)
     assert (hold.kind, slope.kind, rest.kind) == ("hold", "ramp", "hold")
     assert slope.rate == pytest.approx(0.33e-3, rel=1e-3) and abs(slope.start - 500) < 3
     for hz in (0.1, 1.0, 30.0):
-        assert {s.kind for s in sections(1e-3 * np.sin(2 * np.pi * hz * t))} == {"dynamic"}, hz
+        assert {s.kind for s in find_sections(1e-3 * np.sin(2 * np.pi * hz * t))} == {"dynamic"}, hz
     noise = np.random.default_rng(0).normal(0, 1e-4, 1000)
-    assert [s.kind for s in sections(np.concatenate([np.zeros(500), noise]))] == ["hold", "dynamic"]
+    assert [s.kind for s in find_sections(np.concatenate([np.zeros(500), noise]))] == ["hold", "dynamic"]
     with_gap = steps.copy()
     with_gap[700:720] = np.nan
-    assert [s.kind for s in sections(with_gap)] == ["hold", "step", "step", "step"]
-    cover = sections(command())
+    assert [s.kind for s in find_sections(with_gap)] == ["hold", "step", "step", "step"]
+    cover = find_sections(command())
     assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == 13_500
 
 
@@ -180,7 +180,7 @@ def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
     for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
         cut = command()[:last]
         for com in (cut, np.concatenate([cut, np.linspace(cut[-1], 0, 300)]), cut[-15:]):
-            cover = sections(com)
+            cover = find_sections(com)
             assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == len(com)
 
 
