@@ -106,7 +106,8 @@ class Demand:
     """What the firmware of a model makes of a demand, cycle by cycle: the effects at the port `command`."""
 
     def __init__(self, model: Model) -> None:
-        self._law = kernel("demanded", model.effects, fast=False)
+        is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
+        self._law = kernel("demanded", model.effects, fast=False) if is_changed else None
         self._first = initial(model.effects).memory.command
         self._record = model.record()[0]
         self._period = model["controller.period"]
@@ -118,6 +119,8 @@ class Demand:
 
     def __call__(self, demand: float, position: float) -> float:
         """The demand that the loop closes on, m, from the demand and the sensed position, m."""
+        if self._law is None:
+            return demand
         taken, self._memory = self._law(demand, self._memory, position, self._cycle * self._period, self._record)
         self._cycle += 1
         return float(taken)

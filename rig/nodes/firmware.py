@@ -20,6 +20,9 @@ from rig.network.frame import Send
 
 NODE = 2
 GAINS = 0x2110
+# As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
+_RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
+_LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
 LOST_AFTER = 3  # SYNCs in a row without feedback
 
 
@@ -96,7 +99,7 @@ class Firmware:
             self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
         self._silent = 0
         status = self._status()
-        if status & Status.MODE:
+        if status & _LOOP_CLOSED:
             demand = codec.position(cast(int, self._od[0x2100, 0]))
             position = codec.position(cast(int, self._od[0x2102, 0]))
             current, self._loop = answer(self._loop, self._taken(demand, position), position, self._gains)
@@ -108,14 +111,14 @@ class Firmware:
     def _status(self) -> int:
         """Status word: the level bits of the control word as far as no fault forbids them."""
         control = cast(int, self._od[0x6040, 0])
-        reset = bool(control & Control.RESET)
+        reset = bool(control & _RESET)
         if self._fault and reset and not self._acknowledged and not self.device.emcy.active:
             self._fault = False
         self._acknowledged = reset
         if self._fault:
             return 0
-        asked = control & Control.ACTIVE  # the levels build on each other: 1, 3, 7
-        return (asked if asked & (asked + 1) == 0 else 0) | Status.READY
+        asked = control & _ACTIVE  # the levels build on each other: 1, 3, 7
+        return (asked if asked & (asked + 1) == 0 else 0) | _READY
 
     def _drive(self, current: float, status: int) -> None:
         od = self._od

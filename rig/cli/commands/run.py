@@ -40,23 +40,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """Run a sequence; results go to --out (default: a new folder in runs/)."""
-    from fdi.report.html import write_html
     from fdi.report.run_report import build_run_report
     from fdi.trace.trace import Trace
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
     from rig.network.bus import choose
+    from rig.run.page_writer import PageWriter
     from rig.run.runner import run as do
 
     job = read_job(args.source, args) if args.source else build_job(args)
     bus, why = choose(job.bus if args.source and args.bus == "auto" else args.bus)
     job = replace_settings(job, bus=bus)
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
-    with announce_run(job, why, is_silent=args.json or args.quiet) as progress, catch_signals() as is_to_stop:
+    with (PageWriter(in_background=not job.realtime) as pages, catch_signals() as is_to_stop,
+          announce_run(job, why, is_silent=args.json or args.quiet) as progress):
         outcome = do(job, folder, progress, is_to_stop)
         progress("report", 0.0)
+        pages.write_page(folder / "trace.mcap", folder / "report.html")
         report = build_run_report(Trace.read(folder / "trace.mcap", all=True))
-        write_html(report, folder / "report.html")
         if args.fdi:
             outcome = diagnose_run(outcome, progress)
     with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
