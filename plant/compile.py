@@ -18,10 +18,6 @@ from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
-import numba
-import numba.core.cgutils
-import numba.core.compiler_lock
-import numba.extending
 import numpy as np
 
 from plant import functions
@@ -55,6 +51,9 @@ def interpreted(function: Function, ports: Mapping[str, Function] | None = None)
 
 def compiled(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
+    import numba  # here and below: who only reads a trace need not load it, which takes 0.3 s
+    import numba.core.compiler_lock
+
     root = _link(function, ports or {}, lambda f: f)
     linked = _link(function, ports or {}, lambda f: numba.njit(f, **INLINED))
     plain = rebind(linked.py_func)
@@ -95,6 +94,10 @@ def record_at(kind: np.dtype[Any], first: int, apart: int) -> Function:
     of two hundred numbers handed to each law, which doubles the time to compile; the address in the array itself,
     which lets the compiler turn a choice of two numbers into a choice of two addresses, and then no vector code.
     """
+    import numba
+    import numba.core.cgutils
+    import numba.extending
+
     record = numba.from_dtype(kind)
 
     def at(typing: Any, array: Any, place: Any) -> Any:

@@ -23,26 +23,27 @@ def provenance(**given: object) -> dict[str, str]:
         "host": platform.node(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}, {os.cpu_count()} processors",
         "python": platform.python_version(),
-        **{f"version.{name}": _version(name) for name in PACKAGES},
-        **_git(Path(__file__).parents[2]),
+        **{f"version.{name}": _read_version(name) for name in PACKAGES},
+        **_read_git_state(Path(__file__).parents[2]),
     }
 
 
-def _version(name: str) -> str:
+def _read_version(name: str) -> str:
     try:
         return version(name)
     except PackageNotFoundError:
         return "not installed"
 
 
-def _git(root: Path) -> dict[str, str]:
+def _read_git_state(root: Path) -> dict[str, str]:
     """Commit and whether files differ from it; nothing when this is no checkout or git is missing."""
     if not (root / ".git").exists():
         return {}
+    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
     try:
-        commit, changed = (subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, check=True,
-                                          timeout=5).stdout.strip()
-                           for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"]))
+        lines = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
         return {}
-    return {"git.commit": commit, "git.state": f"{len(changed.splitlines())} files changed" if changed else "clean"}
+    commit = next((line.removeprefix("# branch.oid ") for line in lines if line.startswith("# branch.oid ")), "")
+    changed = sum(not line.startswith("#") for line in lines)
+    return {"git.commit": commit, "git.state": f"{changed} files changed" if changed else "clean"}
