@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from fdi.progress import ignore_progress
 from plant import load_model
 from rig.run.job import Job
 from rig.run.outcome import Outcome
@@ -26,10 +27,6 @@ checks = [
 """
 
 
-def silent(what: str, done: int, total: int) -> None:
-    """No progress is shown."""
-
-
 def never() -> bool:
     """Nobody stops the run."""
     return False
@@ -44,7 +41,7 @@ def job(text: str = SHORT, seed: int = 0, set_: dict[str, float] | None = None, 
 
 def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
     """Run a job; its results lie in `folder`."""
-    return run(one, folder, silent, stop)
+    return run(one, folder, ignore_progress, stop)
 
 
 def stop_after(cycles: int) -> Callable[[], bool]:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from short_sequences import SHORT, job, kinds, play, silent, stop_after
+from short_sequences import SHORT, job, kinds, play, stop_after
 
+from fdi.progress import ignore_progress
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
 from rig.network.clock import VirtualClock
@@ -160,7 +161,7 @@ def play_with(intruder: Intruder, tmp_path: Path) -> Session:
 
     wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, join])  # type: ignore[list-item]
     with runner.log(job(), tmp_path) as recorder:
-        session = Session(job(), wire, recorder, silent, lambda: False)
+        session = Session(job(), wire, recorder, ignore_progress, lambda: False)
         session.bring_up()
         session.play()
     return session
