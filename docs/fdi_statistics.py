@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fdi.diagnosis.faults import FAULTS
-from rig.studies.campaign.detection_figure import detection
+from rig.studies.campaign.campaign_report import format_requirement, format_share
+from rig.studies.campaign.detection_figure import draw_detection_curves
 from rig.studies.campaign.folder import read_campaign_rows, read_matrix_of_folder
-from rig.studies.campaign.show_campaign import asked, percent
 from rig.studies.campaign.summary import name_size, summarise_campaign
 
 PAGE = Path(__file__).with_suffix(".md")
@@ -29,8 +29,8 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def format_rates(found: Sequence[Mapping[str, Any]]) -> str:
     """The required rates as a table."""
     return format_table(("", "count", "share", "95 % interval", "required", ""),
-                        [(r["name"].strip(), *percent(r["share"]), asked(100 * r["least"], 100 * r["most"]),
-                          MET[r["met"]])
+                        [(r["name"].strip(), *format_share(r["share"]),
+                          format_requirement(100 * r["least"], 100 * r["most"]), MET[r["met"]])
                          for r in found if r["share"]["of"]])
 
 
@@ -43,8 +43,8 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
         if len(points) > 1:
             out += format_table((name_size(fault), "maintenance or worse", "share", "95 % interval", "non-nominal",
                                  "ruling", "by the bands alone"),
-                                [(f"{p['size']:g}", *percent(p["detected"]),
-                                  *(percent(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
+                                [(f"{p['size']:g}", *format_share(p["detected"]),
+                                  *(format_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
     for fault in FAULTS:
         counts = figures["levels"][fault.name]
         said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
@@ -56,7 +56,7 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
     return out + format_table(
         ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
         [(e["label"], name_size(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
-          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *percent(e["covered"])[1:])
+          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *format_share(e["covered"])[1:])
          for e in figures["errors"]])
 
 
@@ -81,7 +81,7 @@ def main(folder: str, *others: str) -> None:
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     PAGE.write_text(before + BEGIN + "\n" + text + END + rest.partition(END)[2], encoding="utf-8")
     curves = max(figures["tolerances"], key=lambda of: sum(map(len, of["curves"].values())))
-    PAGE.with_suffix(".svg").write_text(detection(curves), encoding="utf-8")
+    PAGE.with_suffix(".svg").write_text(draw_detection_curves(curves), encoding="utf-8")
 
 
 if __name__ == "__main__":

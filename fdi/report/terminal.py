@@ -91,30 +91,37 @@ def _as_cell(cell: Cell | str) -> Cell:
 
 def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> RichTable:
     out = RichTable(box=None, pad_edge=False, padding=(0, GAP, 0, 0), show_header=any(c.heading for c in columns))
-    for i, (column, wanted) in enumerate(zip(columns, heading_widths(columns, rows, width), strict=True)):
-        needed = minimal_width(column, [row[i] for row in rows])
+    widths = choose_widths(columns, rows, width)
+    for column, own in zip(columns, widths, strict=True):
         if column.align == "right":
-            heading = Text("\n".join(wrap_heading(column.heading, wanted)))
-            out.add_column(heading, justify="right", no_wrap=True, min_width=needed)
+            heading = Text("\n".join(wrap_heading(column.heading, own)))
+            out.add_column(heading, justify="right", no_wrap=True, width=own)
         else:
-            out.add_column(Text(column.heading), overflow="fold", min_width=needed)
+            out.add_column(Text(column.heading), overflow="fold", width=own)
     for row in rows:
         out.add_row(*(Text(cell.text, style_of(cell)) for cell in row))
     return out
 
 
-def heading_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> list[int]:
-    """Characters of each heading: all of it where the table has room, else as many as the column needs anyway."""
+def choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> list[int]:
+    """Characters of each column: what it needs, and what it would like where the table has room for that.
+
+    rich itself would shrink the widest column first, below the width of its longest word, and crop the table.
+    """
     needed = [minimal_width(column, [row[i] for row in rows]) for i, column in enumerate(columns)]
-    natural = [max([needed[i], *(cell_len(row[i].text) for row in rows)]) for i in range(len(columns))]
-    room = width - sum(natural) - GAP * (len(columns) - 1)
-    out = []
-    for column, own in zip(columns, needed, strict=True):
-        more = max(0, cell_len(column.heading) - own) if column.align == "right" else 0
-        if more > room:
-            more = 0
+    liked = [max([own, cell_len(column.heading), *(cell_len(line) for row in rows for line in row[i].text.split("\n"))])
+             for i, (column, own) in enumerate(zip(columns, needed, strict=True))]
+    out, room = list(needed), max(0, width - sum(needed) - GAP * (len(columns) - 1))
+    words = sorted((i for i, column in enumerate(columns) if column.align == "left"), key=lambda i: liked[i] - needed[i])
+    for position, i in enumerate(words):  # narrow columns first, so that one long text does not fold the others
+        more = min(liked[i] - needed[i], room // (len(words) - position))
+        out[i] += more
         room -= more
-        out.append(own + more)
+    for i, column in enumerate(columns):
+        more = liked[i] - needed[i]
+        if column.align == "right" and more <= room:  # the whole heading in one line, or as many lines as it takes
+            out[i] += more
+            room -= more
     return out
 
 

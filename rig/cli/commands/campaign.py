@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,29 +65,28 @@ def run_command(args: argparse.Namespace) -> int:
 
 def _report(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Namespace) -> int:
     """Write and show the statistics; exit status 1 if a case failed or a required rate is not reached."""
-    from rig.cli.terminal import console
-    from rig.studies.campaign import show_campaign
+    from rig.cli.answer import show_answer
+    from rig.studies.campaign.campaign_report import build_campaign_report
     from rig.studies.campaign.folder import read_matrix_of_folder
     from rig.studies.campaign.summary import summarise_campaign
 
     figures = summarise_campaign(rows)
+    report = build_campaign_report(figures, str(folder))
     if folder.is_dir():
         _write_statistics(figures, folder)
-    if args.json:
-        print(json.dumps(figures))
-    elif not args.quiet:
-        show_campaign.summary(figures, console())
-        if folder.is_dir():
-            if left := len(read_matrix_of_folder(folder).cases) - len(rows):
-                print(f"left      {left} cases; to resume: rig campaign {shlex.quote(str(folder))}")
-            print(f"results   {folder}/ " + ", ".join(sorted(file.name for file in folder.iterdir()
-                                                             if file.suffix in (".parquet", ".json", ".svg"))))
+        names = sorted(file.name for file in folder.iterdir() if file.suffix in (".parquet", ".json", ".svg"))
+        report = replace(report, files=[("results", f"{folder}/ {', '.join(names)}")])
+        left = len(read_matrix_of_folder(folder).cases) - len(rows)
+        if left:
+            report = replace(report, sentence=f"{report.sentence} {left} cases are left.",
+                             next_command=f"rig campaign {shlex.quote(str(folder))}")
+    show_answer(report, args)
     missed = [rate for part in figures["tolerances"] for rate in part["rates"] if rate["met"] is False]
     return 1 if missed or figures["status"].get("failed") else 0
 
 
 def _write_statistics(figures: dict[str, Any], folder: Path) -> None:
-    from rig.studies.campaign.detection_figure import detection
+    from rig.studies.campaign.detection_figure import draw_detection_curves
     from rig.studies.campaign.folder import replace_file
 
     replace_file(folder / "summary.json", (json.dumps(figures, indent=1) + "\n").encode())
@@ -94,7 +94,7 @@ def _write_statistics(figures: dict[str, Any], folder: Path) -> None:
         if any(len(points) > 1 for points in part["curves"].values()):
             alone = len(figures["tolerances"]) == 1
             name = "detection.svg" if alone else f"detection-{100 * part['tolerance']:g}.svg"
-            replace_file(folder / name, detection(part).encode())
+            replace_file(folder / name, draw_detection_curves(part).encode())
 
 
 def _choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
@@ -154,16 +154,16 @@ def _show_batch_progress(silent: bool, interval: float = 30.0) -> Iterator[Calla
     """Show progress as a bar on a terminal; elsewhere, for logs, as a line on standard error every `interval` s."""
     from rig.cli.progress_bar import show_progress
     from rig.network.clock import WallClock
-    from rig.studies.campaign.show_campaign import line
+    from rig.studies.campaign.campaign_report import describe_progress
 
     clock, printed = WallClock(), 0.0
     with show_progress(is_silent=silent) as update:
         def report_progress(progress: BatchProgress) -> None:
             nonlocal printed
-            update(line(progress), progress.done / max(progress.total, 1))
+            update(describe_progress(progress), progress.done / max(progress.total, 1))
             now = clock.now() * 1e-9
             if not silent and not sys.stderr.isatty() and now - printed >= interval:
                 printed = now
-                print(line(progress), file=sys.stderr, flush=True)
+                print(describe_progress(progress), file=sys.stderr, flush=True)
 
         yield report_progress

@@ -3,58 +3,56 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rig.doctor import Finding
-
-MARKS = {"ok": "[green]ok[/]", "limited": "[yellow]limited[/]", "missing": "[red]missing[/]"}
+    from fdi.report.report import Mood, Report
+    from rig.doctor import Finding, Status
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
-    text = "length of each timer measurement, 0: none (default 1)"
-    parser.add_argument("--seconds", type=float, default=1.0, metavar="S", help=text)
+    """Add the options of `rig doctor`."""
+    parser.add_argument("--seconds", type=float, default=1.0, metavar="S",
+                        help="duration of each timer measurement; 0: no measurement (default 1)")
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Show every finding; 1 if something is missing without which not even the embedded bench runs."""
+    """Show every finding; exit status 1 if the embedded bench cannot run on this machine."""
     from plant.errors import InputError
 
     if not 0 <= args.seconds <= 3600:
         raise InputError("--seconds", "", f"between 0 and 3600 s, not {args.seconds:g}")
     from fdi.output import write_text
     from rig import doctor
+    from rig.cli.answer import show_answer
 
-    findings = doctor.survey(args.seconds)
-    blocked = [finding.name for finding in findings if finding.needed and finding.status == "missing"]
-    answer = {"verdict": "FAIL" if blocked else "PASS", "findings": [finding._asdict() for finding in findings]}
+    report = build_doctor_report(doctor.survey(args.seconds))
     if args.out is not None:
-        write_text(args.out, json.dumps(answer, indent=1) + "\n")
-    if args.json:
-        print(json.dumps(answer))
-    elif not args.quiet:
-        show(findings)
-    if blocked and not args.json:
-        print(f"rig doctor: the bench cannot run without: {', '.join(blocked)}")
-    return 1 if blocked else 0
+        write_text(args.out, json.dumps(report.data, indent=1) + "\n")
+    show_answer(report, args)
+    return 0 if report.verdict == "PASS" else 1
 
 
-def show(findings: list[Finding]) -> None:
-    """The table: one row for each finding, under its area's name."""
-    from rich.markup import escape
-    from rich.table import Table
+def build_doctor_report(findings: Sequence[Finding]) -> Report:
+    """Report on the findings: a table with one row each, below the name of its area."""
+    from fdi.report.report import Cell, Column, Report, Section, Table
 
-    from rig.cli.terminal import console
-
-    table = Table(box=None, pad_edge=False)
-    for column in ("What this machine can do", "", "found", "for", "how to get it"):
-        table.add_column(column, overflow="fold")
+    moods: dict[Status, Mood] = {"ok": "good", "limited": "doubtful", "missing": "bad"}
+    blocking = [finding.name for finding in findings if finding.needed and finding.status == "missing"]
+    rows: list[list[Cell | str]] = []
     area = ""
     for finding in findings:
         if finding.area != area:
-            table.add_row(f"[bold]{finding.area}[/]")
             area = finding.area
-        texts = [escape(text) for text in (finding.found, finding.purpose, finding.remedy)]
-        table.add_row(f"  {escape(finding.name)}", MARKS[finding.status], *texts)
-    console().print(table)
+            rows.append([Cell(area, is_strong=True), "", "", "", ""])
+        rows.append([f"  {finding.name}", Cell(finding.status, moods[finding.status]), finding.found, finding.purpose,
+                     finding.remedy])
+    columns = [Column(title) for title in ("capability", "", "found", "used for", "how to get it")]
+    verdict = "FAIL" if blocking else "PASS"
+    return Report(
+        command="doctor", title="this machine", verdict=verdict, mood="bad" if blocking else "good",
+        sentence=f"The bench cannot run without: {', '.join(blocking)}." if blocking
+        else "The embedded bench runs on this machine.",
+        sections=[Section("", [Table(columns, rows)])],
+        data={"verdict": verdict, "findings": [finding._asdict() for finding in findings]})

@@ -1,8 +1,9 @@
-"""`rig effects`: the catalogue, and what one effect is; one of the user's own is tried as well."""
+"""`rig effects`: the catalogue of physical effects, one effect in detail, and the self-test of an effect."""
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rig.cli import options
@@ -10,18 +11,20 @@ from rig.cli import options
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from fdi.report.report import Item, Report
     from plant.effects import Effect
-    from plant.selftest import Report
+    from plant.selftest import Report as SelfTest
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
-    parser.add_argument("name", nargs="?", metavar="NAME", help="one effect; without it the whole catalogue")
-    parser.add_argument("--model", metavar="FILE|NAME", default="eha", help="of which plant (default eha)")
+    """Add the options of `rig effects`."""
+    parser.add_argument("name", nargs="?", metavar="NAME", help="show this effect in detail (default: list all)")
+    parser.add_argument("--model", metavar="FILE|NAME", default="eha",
+                        help="list the effects of this plant (default eha)")
     parser.add_argument("--effects", action="append", default=[], type=_path, metavar="FILE.py",
-                        help="your own effects (repeatable); told about one of them, it is tried as well")
+                        help="your own effects (repeatable); one that is shown is tested as well")
     parser.add_argument("--test", action="store_true",
-                        help="try the effect, or all of them, on the preflight command; exit status 1 for a fault")
+                        help="test the effect, or all of them, on the preflight command; exit status 1 for a fault")
 
 
 def _path(text: str) -> Path:
@@ -31,39 +34,62 @@ def _path(text: str) -> Path:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """List the catalogue of effects, or tell about one of them."""
+    """List the catalogue of effects, or show one in detail."""
+    from fdi.report.json import to_plain
     from plant.model import entry, load_model, offered
+    from rig.cli.answer import show_answer
 
     options.load_user_effects(args.effects)
     plant = load_model(args.model).plant
     chosen = [entry(args.name, plant)] if args.name else offered(plant)
     own = {file.absolute() for file in args.effects}
-    tried = chosen if args.test or (args.name and chosen[0].file in own) else []
-    reports = {e.name: _tried(e) for e in tried}
-    rows = [describe(e, plant) | ({"self_test": _rows(reports[e.name])} if e.name in reports else {}) for e in chosen]
-    text = json.dumps({"effects": rows}, indent=None if args.json else 1)
+    tested = chosen if args.test or (args.name and chosen[0].file in own) else []
+    tests = {e.name: test_effect(e) for e in tested}
+    report = build_effects_report(chosen, plant, tests, is_detailed=bool(args.name))
     if args.out:
         from fdi.output import write_text
 
-        write_text(args.out, text + "\n")
-    if args.json:
-        print(text)
-    elif not args.quiet:
-        tell(chosen[0], plant) if args.name else table(chosen)
-        for report in reports.values():
-            tell_report(report)
-    return int(any(report.faults for report in reports.values()))
+        write_text(args.out, json.dumps(to_plain(report.data), indent=1) + "\n")
+    show_answer(report, args)
+    return int(any(test.faults for test in tests.values()))
 
 
-def _tried(e: Effect) -> Report:
+def test_effect(e: Effect) -> SelfTest:
+    """Test an effect on the preflight command."""
     from plant.selftest import examine
     from rig.sequences import load_sequence
 
     return examine(e.name, load_sequence("preflight").main_profile().command)
 
 
-def describe(e: Effect, plant: str = "eha") -> dict[str, Any]:
-    """An effect for machines: parameters with unit, off value and allowed range in words."""
+def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,
+                         is_detailed: bool) -> Report:
+    """Report on the catalogue, or on one effect in detail, with the self-tests that were made."""
+    from fdi.report.report import Report, Section
+
+    rows = [describe_effect(e, plant) for e in chosen]
+    for row in rows:
+        if row["effect"] in tests:
+            test = tests[row["effect"]]
+            row["self_test"] = {"faults": list(test.faults), "visible": test.visible,
+                                "shown": [shown._asdict() for shown in test.shown]}
+    first = _describe_law(chosen[0]) if is_detailed else ""
+    return Report(
+        command="effects", title=chosen[0].name if is_detailed else "effects",
+        sentence=f"{chosen[0].name}: {first}" if first else chosen[0].name if is_detailed else "",
+        sections=[Section("", _list_properties(chosen[0], rows[0]) if is_detailed else _tabulate_effects(chosen)),
+                  *(Section(f"self-test of {name}", _show_test(test)) for name, test in tests.items())],
+        data={"effects": rows})
+
+
+def _describe_law(e: Effect) -> str:
+    """The first line of the docstring of the effect's law."""
+    doc = (e.function.__doc__ or "") if e.function else ""
+    return doc.splitlines()[0] if doc else ""
+
+
+def describe_effect(e: Effect, plant: str = "eha") -> dict[str, Any]:
+    """An effect as JSON values: its law, and its parameters with unit, off value and allowed range."""
     from plant.plants import find
 
     base = find(plant).nominal
@@ -74,73 +100,54 @@ def describe(e: Effect, plant: str = "eha") -> dict[str, Any]:
             "source": e.source, "parameters": parameters, "starts": [dict(start) for start in e.starts]}
 
 
-def _rows(report: Report) -> dict[str, Any]:
-    return {"faults": list(report.faults), "visible": report.visible, "shown": [s._asdict() for s in report.shown]}
+def _tabulate_effects(chosen: Sequence[Effect]) -> list[Item]:
+    from fdi.report.report import Cell, Column, Paragraph, Table
 
-
-def table(chosen: list[Effect]) -> None:
-    """The catalogue as a table."""
-    from rich.table import Table
-
-    from rig.cli.terminal import console
-
-    t = Table(box=None, pad_edge=False, title_justify="left")
-    for column in ("effect", "acts on", "parameters", "what tells it apart"):
-        t.add_column(column, overflow="fold", no_wrap=column in ("effect", "parameters"))  # what one has to type
+    rows: list[list[Cell | str]] = []
     for e in chosen:
-        names = "\n".join(f"{name.removeprefix(e.name + '.')} [dim]{q.unit}[/]" for name, q in e.parameters.items())
-        t.add_row(f"[bold]{e.name}[/]", e.port or "[dim](reference)[/]", names, e.symptoms)
-    out = console()
-    out.print(t)
-    out.print("\nGive a model an effect with [bold]--set EFFECT.PARAMETER=VALUE[/] (those of the reference model have "
-              "their own group); [bold]rig effects EFFECT[/] tells its law.", highlight=False)
+        names = "\n".join(f"{name.removeprefix(e.name + '.')} [{q.unit}]" for name, q in e.parameters.items())
+        rows.append([Cell(e.name, is_strong=True), e.port or "(reference)", names, e.symptoms])
+    columns = [Column(title) for title in ("effect", "acts on", "parameters", "how to recognise it")]
+    return [Table(columns, rows), Paragraph(
+        "Give a model an effect with --set EFFECT.PARAMETER=VALUE; effects of the reference model have their own "
+        "group. rig effects EFFECT shows its law.")]
 
 
-def tell(e: Effect, plant: str = "eha") -> None:
-    """One effect at length."""
-    from rich.markup import escape
-    from rich.table import Table
-
+def _list_properties(e: Effect, row: Mapping[str, Any]) -> list[Item]:
+    from fdi.report.report import Line
     from plant.state import UNITS
-    from rig.cli.terminal import console
 
-    doc = (e.function.__doc__ or "") if e.function else ""
     port = f"{e.port} ({getattr(UNITS, e.port)})" if e.port else "the reference model itself"
-    rows = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
-            ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
-    for name, p in describe(e, plant)["parameters"].items():
+    properties = [("law", e.law), ("acts on", port), ("symptoms", e.symptoms), ("source", e.source),
+                  ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
+    for name, p in row["parameters"].items():
         words = [p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
                  "" if p["fitted"] else "not fitted"]
-        rows.append(("parameter", f"{name} in {p['unit']}: {'; '.join(filter(None, words))}"))
-    rows += [("a fit starts", ", ".join(f"{name} = {value:g}" for name, value in start.items())) for start in e.starts]
-    t = Table.grid(padding=(0, 2))
-    for word, said in rows:
-        if said:
-            t.add_row(word, escape(said))
-    out = console()
-    out.print(f"[bold]{e.name}[/]  {escape(doc.splitlines()[0]) if doc else ''}")
-    out.print(t)
+        properties.append(("parameter", f"{name} in {p['unit']}: {'; '.join(filter(None, words))}"))
+    properties += [("fits start at", ", ".join(f"{name} = {value:g}" for name, value in start.items()))
+                   for start in e.starts]
+    return [Line(label, text) for label, text in properties if text]
 
 
-def tell_report(report: Report) -> None:
-    """How the trial of an effect went: its faults, and what its sizes change over the preflight command."""
-    from rich.table import Table
+def _show_test(test: SelfTest) -> list[Item]:
+    """The faults that a self-test found, and what each size changes."""
+    from fdi.report.numbers import format_digits
+    from fdi.report.report import Column, Line, Table
 
-    from rig.cli.terminal import console
-
-    out = console()
-    t = Table(box=None, pad_edge=False, title_justify="left")
-    for column in ("size", "XJ, um", "P12, bar", "XS, um", "over noise"):
-        t.add_column(column, justify="left" if column == "size" else "right")
-    for s in report.shown:
-        size = ", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in s.start.items())
-        t.add_row(size, f"{s.xj * 1e6:.3g}", f"{s.p12 * 1e-5:.3g}", f"{s.xs * 1e6:.3g}", f"{s.level:.3g}")
-    if report.shown:
-        out.print(f"\n[bold]{report.effect}[/] changes, RMS over the preflight driven by the same current")
-        out.print(t)
-    for fault in report.faults:
-        out.print(f"[bold red]FAULT[/] {report.effect}: {fault}")
-    if not report.faults:
-        hidden = "" if report.visible or not report.shown else "; below the noise on this command"
-        out.print(f"[bold green]sound[/] {report.effect}: exact at its off value, finite, repeatable, compiled as in "
-                  f"plain Python{hidden}")
+    items: list[Item] = []
+    if test.shown:
+        rows = []
+        for shown in test.shown:
+            size = ", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in shown.start.items())
+            changes = (shown.xj * 1e6, shown.p12 * 1e-5, shown.xs * 1e6, shown.level)
+            rows.append([size, *(format_digits(change) for change in changes)])
+        columns = [Column("size"), Column("XJ", "um", "right"), Column("P12", "bar", "right"),
+                   Column("XS", "um", "right"), Column("over noise", align="right")]
+        items.append(Table(columns, rows, f"What {test.effect} changes: RMS over the preflight, driven by the same "
+                                          "current; and the largest change over the noise of its sensor."))
+    items += [Line("FAULT", f"{test.effect}: {fault}", "bad") for fault in test.faults]
+    if not test.faults:
+        hidden = "" if test.visible or not test.shown else "; below the noise on this command"
+        items.append(Line("passed", f"{test.effect}: exact at its off value, finite, repeatable, compiled code equal "
+                                    f"to plain Python{hidden}", "good"))
+    return items

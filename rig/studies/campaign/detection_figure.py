@@ -1,4 +1,4 @@
-"""The detection curve of a campaign as a picture."""
+"""The figure of a campaign: detection rate by fault size."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -17,13 +17,16 @@ LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED
          ("bands", "maintenance or worse, by the bands alone", COMMAND))
 
 
-def detection(part: Mapping[str, Any]) -> str:
-    """Share of plants by size of a single fault, with 95 % intervals, as SVG; `part` is of one tolerance."""
+def draw_detection_curves(part: Mapping[str, Any]) -> str:
+    """Draw the share of plants that are detected, by size of a single fault, with 95 % intervals, as SVG.
+
+    `part` is the element of `summarise_campaign(...)["tolerances"]` for one tolerance.
+    """
     with rc_context(STYLE):
         figure = Figure(figsize=(10, 3.6), layout="constrained")
         axes = figure.subplots(1, len(FAULTS), sharey=True)
         for ax, fault in zip(axes, FAULTS, strict=True):
-            _curve(ax, fault, part["curves"][fault.name])
+            _draw_fault(ax, fault, part["curves"][fault.name])
         axes[0].set_ylabel("share of plants [%]")
         axes[0].set_ylim(-3, 103)
         handles, labels = axes[0].get_legend_handles_labels()
@@ -31,7 +34,7 @@ def detection(part: Mapping[str, Any]) -> str:
         return to_svg(figure, "detection")
 
 
-def _curve(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:
+def _draw_fault(ax: Axes, fault: Fault, points: Sequence[Mapping[str, Any]]) -> None:
     span = max([fault.most, *(point["size"] for point in points)]) - fault.healthy
     for i, (key, label, colour) in enumerate(LINES):
         known = [point for point in points if point[key]["of"]]

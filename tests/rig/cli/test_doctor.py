@@ -63,7 +63,7 @@ def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert command.run_command(arguments("--seconds", "0")) == 1
     out = capsys.readouterr().out
     assert "missing: no-such-distribution" in out
-    assert out.splitlines()[-1] == "rig doctor: the bench cannot run without: packages"
+    assert out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
 
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:

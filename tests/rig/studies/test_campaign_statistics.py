@@ -10,7 +10,9 @@ from scipy.stats import binomtest
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.binomial import measure_share
-from rig.studies.campaign import detection_figure, show_campaign, summary
+from fdi.report.terminal import print_report
+from rig.studies.campaign import detection_figure, summary
+from rig.studies.campaign.campaign_report import build_campaign_report
 
 
 @pytest.mark.parametrize(("good", "of"), [(0, 20), (1, 7), (137, 500), (3000, 3000)])
@@ -62,9 +64,9 @@ def test_statistics_count_what_was_said() -> None:
     figures = summary.summarise_campaign(found)
     json.dumps(figures, allow_nan=False)
     out = Console(width=100, record=True, quiet=False)
-    show_campaign.summary(figures, out)
+    print_report(build_campaign_report(figures), out)
     assert "3/402" in (text := out.export_text()) and "NOT met" in text and "95.0 %" in text
-    drawn = detection_figure.detection(figures["tolerances"][0])
+    drawn = detection_figure.draw_detection_curves(figures["tolerances"][0])
     assert drawn.startswith("<svg") and "MaxBand" in drawn and "maintenance or worse" in drawn
 
 

@@ -16,13 +16,15 @@ from places import SHARED
 from rich.console import Console
 from rig_command import rig
 
+from fdi.report.terminal import print_report
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from rig.studies.trial import cases, command, hidden, score, show_trial
+from rig.studies.trial import cases, command, hidden, score
 from rig.studies.trial.blackbox import RIG_EXPLAIN
 from rig.studies.trial.run_trial import load_explain, run_trial
+from rig.studies.trial.trial_report import build_trial_report, describe_progress
 from rig.studies.trial.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
 
 PRACTICE = SHARED / "practice"
@@ -207,7 +209,8 @@ def test_the_summary_tells_every_failure_and_is_json() -> None:
     figures = json.loads(json.dumps(score.summarise_trial(RECORDS)))
     assert [f["seed"] for f in figures["failures"]] == [0, 1, 3, 4, 7, 9]
     assert figures["rates"][0]["bad"] == [1] and figures["by_signals"]["xj"]["two effects: both named"] == [0, 0]
-    show_trial.summary(figures, Console(file=io.StringIO()))
+    print_report(build_trial_report(figures), Console(file=(shown := io.StringIO()), width=200))
+    assert "one effect: the truth is named" in shown.getvalue() and "NOT met" in shown.getvalue()
     assert figures["confusion"]["one: spool_friction"] == {
         "EXPLAINED right": 1, "AMBIGUOUS right": 1, "EXPLAINED wrong": 1}
     assert figures["confusion"]["outside: periodic torque (small)"] == {"EXPLAINED": 1}
@@ -231,7 +234,7 @@ def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
     run_trial(by, seeds[:1], tmp_path, processes=1)
     with (tmp_path / "results.jsonl").open("a") as results:
         results.write('{"seed": 3, "cut')  # a process that was killed
-    records = run_trial(by, seeds, tmp_path, processes=1, report_progress=lambda p: told.append(show_trial.line(p)))
+    records = run_trial(by, seeds, tmp_path, processes=1, report_progress=lambda p: told.append(describe_progress(p)))
     assert next(tmp_path.glob("cases-*/tally")).read_text() == ".."
     assert [r["answer"]["verdict"] for r in records] == ["EXPLAINED", "CRASHED"]
     assert "out of my depth" in records[1]["answer"]["error"]
