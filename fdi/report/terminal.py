@@ -112,7 +112,8 @@ def choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], wid
     liked = [max([own, cell_len(column.heading), *(cell_len(line) for row in rows for line in row[i].text.split("\n"))])
              for i, (column, own) in enumerate(zip(columns, needed, strict=True))]
     out, room = list(needed), max(0, width - sum(needed) - GAP * (len(columns) - 1))
-    words = sorted((i for i, column in enumerate(columns) if column.align == "left"), key=lambda i: liked[i] - needed[i])
+    words = [i for i, column in enumerate(columns) if column.align == "left"]
+    words.sort(key=lambda i: liked[i] - needed[i])
     for position, i in enumerate(words):  # narrow columns first, so that one long text does not fold the others
         more = min(liked[i] - needed[i], room // (len(words) - position))
         out[i] += more

@@ -44,7 +44,7 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
     items: list[Item] = [Table(columns, rows, "Python / C: time of the compiled Python step over that of C. Result: "
                                               "difference between both steps.")]
     if step is None:
-        items.append(Line("C", f"skipped: gcc is not installed; to install it: {GET_GCC}"))
+        items.append(Line("C", f"skipped: gcc is not installed; to get it: {GET_GCC}"))
     return items
 
 

@@ -30,7 +30,7 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setattr(run_benchmarks, "measure_bus_run_speed", lambda: 10.0)
     assert main.main(["bench"]) == 0
     words = " ".join(capsys.readouterr().out.split())
-    assert "step beside C: skipped, there is no gcc; to get it: apt-get install gcc" in words
+    assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
     assert "C, one run after the other: skipped, there is no gcc" in words
     assert "C, OpenMP: skipped, there is no gcc" in words
     assert "jax, vmap: skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
