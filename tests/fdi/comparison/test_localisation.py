@@ -10,7 +10,6 @@ from noisy_traces import LEVELS, healthy, noise
 from fdi.comparison.localisation import (
     Motion,
     combine_residuals,
-    derivative,
     describe_motion,
     find_condition,
     locate_error,
@@ -26,6 +25,7 @@ from fdi.comparison.residual_tests import (
     name_shape,
 )
 from fdi.estimation.preparation import read_cycles
+from fdi.estimation.replay import differentiate
 from fdi.trace.trace import Trace
 from plant import Model
 
@@ -49,8 +49,8 @@ def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
 def test_derivatives_of_a_parabola() -> None:
     k = np.arange(100.0)
     x = 3.0 + 2.0 * k + 0.5 * k**2
-    assert derivative(x, 21, 1)[20:80] == pytest.approx(2.0 + k[20:80])
-    assert derivative(x, 21, 2)[20:80] == pytest.approx(np.ones(60))
+    assert differentiate(x, 21, 1)[20:80] == pytest.approx(2.0 + k[20:80])
+    assert differentiate(x, 21, 2)[20:80] == pytest.approx(np.ones(60))
 
 
 def test_motion_of_the_ram(c: Trace, m: Motion) -> None:
