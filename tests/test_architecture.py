@@ -36,6 +36,7 @@ FOLDER_MAY_IMPORT = {
     "fdi.diagnosis": ESTIMATOR,
     "fdi.prognosis": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis"},
     "fdi.report": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis", "fdi.prognosis"},
+    "fdi.analysis": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     **dict.fromkeys(BENCH, BENCH),
     "rig.studies": BENCH,
     "rig.cli": {*BENCH, "rig.studies"},
@@ -72,7 +73,7 @@ CLOCK_FILES = (
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
     "plant.effects": {"CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"},
-    "fdi": {"Trace"},
+    "fdi": {"Trace", "add_effect", "compare", "diagnose", "explain", "read_trace"},
     "fdi.discovery": {"Explanation", "explain"},
     "rig.device": {
         "Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value",

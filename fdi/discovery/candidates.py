@@ -14,7 +14,6 @@ from fdi.discovery.search import REACHED, Hypothesis
 from fdi.discovery.significance import compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit
 from fdi.estimation.unknowns import UNREPLAYED, limit_friction_values
-from fdi.trace.signals import SIGNALS
 from plant.effects import CATALOGUE
 from plant.model import Model, meaning, offered
 
@@ -223,36 +222,3 @@ def _ledger(e: Explanation, hand: Sequence[Fingerprint]
             cor = {"cor": p.after * unit} if p in hand else cor
             rows.append((p.effect, e.base.errors | cor, e.holdout.get((), {})))
     return rows + [(h.effects[-1], h.errors | cor, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]
-
-
-def to_json(a: Answer) -> dict[str, Any]:
-    """`rig explain --json`; a number that is not there is null."""
-    e = a.explanation
-    several = len(e.effects) > 1 and e.verdict != "AMBIGUOUS"
-    found: dict[str, Any] = {
-        "verdict": e.verdict, "effects": list(e.effects), "candidates": [_row(c) for c in a.candidates],
-        "baseline": {**a.baseline, "ratio": e.base.ratio},
-        "blind_to": [{"effect": b.effect, "parameter": b.parameter, "smallest_visible": b.smallest, "unit": b.unit,
-                      "usual": b.usual} for b in a.blind],
-        "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
-        "separate": dict(a.separate), "pattern": a.pattern,
-        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNALS[s].symbol for s in e.floor}}
-    if several:
-        found["ledger"] = [{"effect": effect, "error": error, "holdout": held} for effect, error, held in a.ledger]
-    return dict(to_plain(found))
-
-
-def _row(c: Candidate) -> dict[str, Any]:
-    row = c._asdict() | {"parameters": {name: v._asdict() for name, v in c.parameters.items()}, "ratio": c.ratio}
-    return row | {"with": list(row.pop("beside"))}
-
-
-def to_plain(x: Any) -> Any:
-    """As JSON has it: dicts, lists, and null for a number that is none."""
-    if isinstance(x, Mapping):
-        return {key: to_plain(value) for key, value in x.items()}
-    if isinstance(x, (list, tuple)):
-        return [to_plain(value) for value in x]
-    if isinstance(x, (float, np.floating)):
-        return float(x) if math.isfinite(x) else None
-    return x

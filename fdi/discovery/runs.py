@@ -33,20 +33,48 @@ class Runs(NamedTuple):
 
 
 def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: str | None = None,
-         signals: Sequence[str] | None = None) -> Runs:
+              signals: Sequence[str] | None = None) -> Runs:
     """Read the files of a search.
 
     Raises:
         InputError: a file that cannot be used, a repeat that is none, or a run given twice, in one line.
     """
-    chosen = _chosen(signals)
-    sources = [read_source(file) for file in (trace, *repeats, *([holdout] if holdout else []))]
+    files = [trace, *repeats, *([holdout] if holdout else [])]
+    sources = [read_source(file) for file in files]
     _distinct(sources, len(repeats))
-    est = _prepare(Trace.read(trace), model, chosen, trace)
+    return _prepare_runs(model, [Trace.read(file) for file in files], sources, len(repeats), signals)
+
+
+def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
+                 signals: Sequence[str] | None = None) -> Runs:
+    """The runs of a search, from traces that have been read or simulated.
+
+    Raises:
+        InputError: a trace that cannot be used, a repeat that is none, or a run given twice, in one line.
+    """
+    traces = [trace, *repeats, *([holdout] if holdout is not None else [])]
+    sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
+    _distinct(sources, len(repeats))
+    return _prepare_runs(model, traces, sources, len(repeats), signals)
+
+
+def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Source], repeats: int,
+                  signals: Sequence[str] | None) -> Runs:
+    """The runs of a search: the one to explain, so many repeats, and a held-out one if there is one more."""
+    chosen, names = _chosen(signals), [s.file for s in sources]
+    est = _prepare(traces[0], model, chosen, names[0])
     model = match_period(model, est, SAME_PERIOD)
-    others = tuple(_prepare_repeat(est, Trace.read(file), model, file, n) for n, file in enumerate(repeats, 1))
-    unseen = _prepare_holdout(est, Trace.read(holdout), model, trace, holdout) if holdout else None
+    others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
+    unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
     return Runs(model, est, others, unseen, tuple(sources), est.notes)
+
+
+def hash_columns(trace: Trace) -> str:
+    """SHA-256 of the columns of a trace, which tells it from any other."""
+    content = hashlib.sha256()
+    for name in ("com", *OUTPUTS, "cor", "load"):
+        content.update(trace.column(name).tobytes())
+    return content.hexdigest()
 
 
 def read_source(file: str) -> Source:

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 def render_html(report: Report) -> str:
     """The page of a report as text. Everything in the report is escaped but the figures, which are SVG."""
-    sections = report.select_sections(Medium.PAGE)
-    return load_templates().get_template("page.html").render(
-        report=report, sections=sections, page=Medium.PAGE, title=report.title, verdict=report.verdict,
-        mood=report.mood, why=report.sentence, facts=report.facts, notes=report.notes)
+    template = load_templates().get_template("page.html")
+    return template.render(report=report, sections=report.select_sections(Medium.PAGE), page=Medium.PAGE)
 
 
 def write_html(report: Report, path: str | Path, option: str = "--out") -> None:
@@ -33,12 +31,12 @@ def write_html(report: Report, path: str | Path, option: str = "--out") -> None:
 
 @cache
 def load_templates() -> Environment:
-    """The page templates of this package with their filters; what is put in is escaped."""
+    """The page template of this package with its functions; what is put in is escaped."""
     from jinja2 import Environment, PackageLoader
 
     templates = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True,
                             lstrip_blocks=True)
-    templates.globals["group_by_kind"] = _group_by_kind  # not a filter: page.html is compiled by other environments too
+    templates.globals["group_by_kind"] = _group_by_kind
     return templates
 
 

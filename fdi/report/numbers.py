@@ -7,8 +7,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-SIGNAL_NAMES = {"xj": "XJ", "p12": "P12", "xs": "XS", "cor": "Cor"}
-SIGNAL_UNITS = {"xj": "m", "p12": "Pa", "xs": "m", "cor": "A"}
+from fdi.trace.signals import SIGNALS
+
+SIGNAL_NAMES = {name: signal.symbol for name, signal in SIGNALS.items()}
+SIGNAL_UNITS = {name: signal.unit for name, signal in SIGNALS.items()}
 READABLE_UNITS = {  # SI unit to the units that people use, the smallest first
     "m": ((1e-6, "um"), (1e-3, "mm")), "A": ((1e-6, "uA"), (1e-3, "mA")), "s": ((1e-6, "us"), (1e-3, "ms"), (1.0, "s")),
     "N": ((1.0, "N"), (1e3, "kN")), "Pa": ((1e5, "bar"),), "m/s": ((1e-3, "mm/s"),), "m/N": ((1e-9, "nm/N"),),

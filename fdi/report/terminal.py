@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from io import StringIO
 
 from rich.cells import cell_len
 from rich.console import Console
@@ -40,6 +41,13 @@ def print_report(report: Report, console: Console) -> None:
     if report.next_command:
         labels.append(Line("next", report.next_command, "neutral"))
     _flush_lines(labels, console)
+
+
+def format_report(report: Report, width: int = 100) -> str:
+    """A report as text without colours, for a console of so many characters."""
+    out = StringIO()
+    print_report(report, Console(file=out, width=width, highlight=False, color_system=None))
+    return out.getvalue()
 
 
 def _print_headline(report: Report, console: Console) -> None:

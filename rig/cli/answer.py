@@ -1,11 +1,74 @@
-"""How every command shows its answer: as one JSON object, as tables and sentences, or not at all."""
+"""Where the answer of a command goes: standard output as text or JSON, a page, a JSON file."""
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from fdi.report.report import Report
+
+
+class Places(NamedTuple):
+    """The files that a command writes, None for none."""
+
+    page: Path | None
+    answer: Path | None  # JSON
+
+    @property
+    def files(self) -> list[tuple[str, str]]:
+        """(label, path) of each file, as a report lists them."""
+        return [(label, str(path)) for label, path in (("page", self.page), ("answer", self.answer)) if path]
+
+
+def choose_file(out: str | None, suffixes: Sequence[str], source: str | Path | None, option: str = "--out",
+                expected: str = "") -> Path | None:
+    """The file that `option` names, once it is known that it can be written; None if the option was not given.
+
+    Raises:
+        InputError: a place that cannot be written, the `source` itself, or a suffix that is not one of `suffixes`.
+    """
+    from fdi.output import writable
+    from plant import InputError
+
+    if out is None:
+        return None
+    path = Path(out)
+    if path.suffix not in suffixes:
+        raise InputError(option, out, expected or " or ".join(f"FILE{suffix}" for suffix in suffixes))
+    return writable(path, option, source=source)
+
+
+def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Places:
+    """The page and the JSON file of --out, and the page that --report puts beside the trace as `page_name`.
+
+    Raises:
+        InputError: a place that cannot be written, or a kind of file that the command does not make.
+    """
+    out = choose_file(args.out or None, (".html", ".json"), source, expected="FILE.html for a page, or FILE.json")
+    page = out if out is not None and out.suffix == ".html" else None
+    if args.report and page is None:
+        folder = Path(source) if Path(source).is_dir() else Path(source).parent
+        page = choose_file(str(folder / page_name), (".html",), source, "--report")
+    return Places(page, out if out is not None and out.suffix == ".json" else None)
+
+
+def write_answer(report: Report, places: Places) -> None:
+    """Write the page and the JSON file of a report.
+
+    Raises:
+        InputError: a file that cannot be written.
+    """
+    if places.answer is not None:
+        from fdi.output import write_text
+        from fdi.report.json import to_json
+
+        write_text(places.answer, to_json(report.data) + "\n")
+    if places.page is not None:
+        from fdi.report.html import write_html
+
+        write_html(report, places.page)
 
 
 def show_answer(report: Report, args: argparse.Namespace) -> None:

@@ -1,41 +1,41 @@
-"""What `rig explain`, `rig add` and `rig remove` share: their options, runs, places for results."""
+"""Options that `rig compare`, `rig explain`, `rig add` and `rig remove` share: measured runs and the model."""
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.cli import options
+from rig.cli.answer import choose_file
 
 if TYPE_CHECKING:
     from fdi.discovery.model_file import Provenance
-    from fdi.discovery.runs import Runs
-    from fdi.progress import Progress
     from plant import Model
 
 
-def add_runs(parser: argparse.ArgumentParser) -> None:
+def add_run_options(parser: argparse.ArgumentParser) -> None:
     """--repeat, --holdout and --signals."""
     add = parser.add_argument
     add("--repeat", action="append", default=[], metavar="TRACE",
-        help="the same command again: tells noise from physics (repeatable)")
-    add("--holdout", metavar="TRACE", help="another command, which no fit sees: tells physics from luck")
+        help="the same command again: discriminates noise from physics (repeatable)")
+    add("--holdout", metavar="TRACE", help="another command, a held-out run that no fit sees: reveals overfitting")
     add("--signals", metavar="xj,p12,xs", help="what to explain (default: what the trace has)")
 
 
-def signals_of(args: argparse.Namespace) -> list[str] | None:
-    """The chosen signals, None for all there are."""
+def list_signals(args: argparse.Namespace) -> list[str] | None:
+    """The signals of --signals; None for all that the trace has."""
     return [name.strip() for name in args.signals.split(",")] if args.signals is not None else None
 
 
-def model_of(args: argparse.Namespace) -> tuple[Model, Provenance]:
-    """The model of --model, --set and --effects, and where it comes from.
+def load_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
+    """The model of --model, --set and --effects, with its provenance.
 
     Raises:
-        InputError: what cannot be used.
+        InputError: a file or a value that cannot be used.
     """
     from fdi.discovery.model_file import Provenance, load_model_file
 
@@ -46,80 +46,59 @@ def model_of(args: argparse.Namespace) -> tuple[Model, Provenance]:
     return options.model_of(args), Provenance()
 
 
-def effect_files(args: argparse.Namespace, known: Provenance) -> tuple[str, ...]:
-    """The user's effect files, of this command and of those before it."""
+def list_effect_files(args: argparse.Namespace, known: Provenance) -> tuple[str, ...]:
+    """The user's effect files, those of this command and of earlier ones."""
     return tuple(dict.fromkeys([*known.effect_files, *map(str, args.effects)]))
 
 
-def prepare(runs: Runs, progress: Progress, effects: Sequence[str] | None = None) -> None:
-    """Find sizes to start from for effects that say none, and compile what they need; by default all there are.
+def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[list[str], str | None]:
+    """The effects of a plant, and the trace, among the words of a command.
 
     Raises:
-        InputError: a user's law that cannot be compiled and run.
+        InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
     """
-    from fdi.discovery.refit import lean_model
-    from fdi.estimation.unknowns import UNREPLAYED, complete_model
-    from plant.effects import CATALOGUE
-    from plant.lanes import warm
-    from plant.model import offered
-    from plant.run import laws
-    from plant.starts import ensure_starts
-
-    for name in [e.name for e in offered(runs.model.plant)] if effects is None else effects:
-        if not CATALOGUE[name].starts and CATALOGUE[name].fitted:
-            progress(f"looking for sizes of {name}", 0.0)
-            ensure_starts(name, runs.est.com, runs.est.load)
-    replayed = [name for name in effects or () if CATALOGUE[name].port not in UNREPLAYED]
-    model = complete_model(runs.model) if effects is None else lean_model(runs.model, replayed)
-    with laws(model):
-        if effects is None:
-            warm(model, lambda stage, share: progress(stage, 0.0))
-        else:
-            progress("compiling the plant with it, once", 0.0)
-            _tried(model, replayed)
-
-
-def _tried(model: Model, effects: Sequence[str]) -> None:
-    """A replay of a few samples without and with each effect: compiles the kernels that these take, and no others."""
-    import numpy as np
-
-    from plant.effects import CATALOGUE
-    from plant.lanes import Lanes
-
-    sizes = {e.fitted[0]: e.starts[-1][e.fitted[0]] for e in map(CATALOGUE.__getitem__, effects) if e.starts}
-    names = list(sizes) or [next(iter(model.values))]
-    usual = np.array([model[name] for name in names])
-    rows = usual + np.vstack([0.0 * usual, np.diag([sizes.get(n, x) - x for n, x in zip(names, usual, strict=True)])])
-    Lanes(model, names, 1, 1).replay(rows, np.zeros(2), np.zeros(2))
-
-
-def place(out: str | None, suffixes: tuple[str, ...], source: str, option: str = "--out") -> Path | None:
-    """Where a result is to go; asked before long work.
-
-    Raises:
-        InputError: a place that cannot be written, or a kind of file that is not made here.
-    """
-    from fdi.output import writable
     from plant import InputError
+    from plant.model import offered
 
-    if out is None:
-        return None
-    path = Path(out)
-    if path.suffix not in suffixes:
-        raise InputError(option, out, " or ".join(f"FILE{suffix}" for suffix in suffixes))
-    return writable(path, option, source=source)
+    effects, known = [], [e.name for e in offered(plant)]
+    for word in words:
+        is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
+        if word in known:
+            effects.append(word)
+        elif trace is None and is_file:
+            trace = word
+        else:
+            near = get_close_matches(word, known, 1, 0.5)
+            hint = f"; did you mean {near[0]}?" if near else " (rig effects lists them)"
+            raise InputError("effect", word, f"an effect of the catalogue{hint}")
+    if not effects:
+        raise InputError("effect", "", "at least one effect (rig effects lists them)")
+    return effects, trace
 
 
-def typed() -> str:
-    """The command as it was typed, for provenance."""
-    return shlex.join(["rig", *sys.argv[1:]]) if Path(sys.argv[0]).name in ("rig", "cli.py") else "rig"
+def choose_model_file(args: argparse.Namespace, trace: str | None) -> Path:
+    """The model file to write: --out, else the file of --model, else model.toml.
+
+    Raises:
+        InputError: a place that cannot be written, or another kind of file.
+    """
+    own = args.model if args.model and Path(args.model).is_file() else "model.toml"
+    path = choose_file(args.out or own, (".toml",), trace)
+    assert path is not None
+    return path
 
 
-def words(trace: str, args: argparse.Namespace, model: str | None = None) -> str:
-    """The arguments that say which runs and which model, for a command to type next."""
-    found = [trace]
-    for option, values in (("--repeat", args.repeat), ("--holdout", [args.holdout]), ("--model", [model or args.model]),
-                           ("--set", [] if model else args.set), ("--effects", args.effects),
+def format_command_line() -> str:
+    """The command as the user typed it, for the history of a model file; "rig" in another program."""
+    is_command = Path(sys.argv[0]).name in ("rig", "cli.py")
+    return shlex.join(["rig", *sys.argv[1:]]) if is_command else "rig"
+
+
+def format_arguments(args: argparse.Namespace, trace: str) -> str:
+    """The runs and the model of a command, as arguments of the command to type next."""
+    words = [trace]
+    for option, values in (("--repeat", args.repeat), ("--holdout", [getattr(args, "holdout", None)]),
+                           ("--model", [args.model]), ("--set", args.set), ("--effects", args.effects),
                            ("--signals", [args.signals])):
-        found += [word for value in values if value for word in (option, str(value))]
-    return shlex.join(found)
+        words += [word for value in values if value for word in (option, str(value))]
+    return shlex.join(words)

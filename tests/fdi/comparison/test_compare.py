@@ -9,7 +9,7 @@ import pytest
 from noisy_traces import SHORT, backlash, healthy, lagging, recorded
 
 from fdi.comparison.compare import Comparison, compare
-from fdi.report.compare_text import lines, sentence, to_json
+from fdi.report.compare_report import collect_data, describe_findings, describe_verdict
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 
@@ -45,7 +45,7 @@ def at_floor(found: Comparison) -> bool:
 def test_a_perfect_model_is_at_the_floor(colour: str) -> None:
     """With a repeat and, where the noise is as the model says, without."""
     found = compare(healthy(2, colour), MODEL, [healthy(3, colour)])
-    assert at_floor(found), sentence(found)
+    assert at_floor(found), describe_verdict(found)
     for name, limit in {"xj": 0.05, "p12": 0.02, "xs": 0.02}.items():
         assert found.signals[name].ratio == pytest.approx(1.0, abs=limit)
         assert found.signals[name].floor.source == "repeats"
@@ -61,7 +61,7 @@ def test_seeds_do_not_matter(colour: str) -> None:
     traces = [recorded(com=SHORT, seed=seed, colour=colour) for seed in range(10)]
     found = [compare(trace, MODEL, repeats) for trace, other in zip(traces[::2], traces[1::2], strict=True)
              for repeats in ([other], [])]
-    assert [sentence(f) for f in found if not at_floor(f)] == []
+    assert [describe_verdict(f) for f in found if not at_floor(f)] == []
     ratios = np.array([[s.ratio for s in f.signals.values()] for f in found])
     assert ratios.mean(axis=0) == pytest.approx([1.0, 1.0, 1.0], abs=0.04)
     assert ratios.std(axis=0).max() < 0.06
@@ -71,29 +71,29 @@ def test_seeds_do_not_matter(colour: str) -> None:
 def test_the_block_with_the_fault_is_named(fault: str) -> None:
     block = fault.partition(":")[0]
     found = compare(faulty(fault), MODEL)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named == (block,), sentence(found)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named == (block,), describe_verdict(found)
     others = [ratio for name, ratio in found.blocks.items() if name != block]
     assert all(ratio is not None and ratio < 1.3 for ratio in others)
     assert found.blocks[block] > 1.5  # type: ignore[operator]
-    assert f"the {block} disagrees" in sentence(found)
+    assert f"the {block} disagrees" in describe_verdict(found)
 
 
 @pytest.mark.parametrize("fault", ["servovalve: spool friction", "jack: leakage", "jack: friction", "jack: mass"])
 def test_the_model_with_the_fault_is_at_the_floor(fault: str) -> None:
     found = compare(faulty(fault), MODEL.replace(FAULTS[fault][0]))
-    assert at_floor(found), sentence(found)
+    assert at_floor(found), describe_verdict(found)
 
 
 def test_another_firmware_is_the_controllers_fault_alone() -> None:
     found = compare(recorded({"controller.proportional_gain": 4.2}), MODEL)
     assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("controller",)
-    assert found.scatter is None and "the controller answers otherwise" in sentence(found)
+    assert found.scatter is None and "the output of the controller differs" in describe_verdict(found)
     assert found.answer.gain == pytest.approx(4.2, rel=1e-6)
 
 
 def test_a_sensors_gain_and_a_valves_cannot_be_told_apart() -> None:
     found = compare(recorded(sensor=lambda x: 1.02 * x), MODEL)
-    assert set(found.named) == {"jack", "sensor"} and "the jack or the sensor disagree" in sentence(found)
+    assert set(found.named) == {"jack", "sensor"} and "the jack or the sensor disagree" in describe_verdict(found)
     assert found.parts["gain"] == pytest.approx(0.02, abs=0.002)
 
 
@@ -121,7 +121,7 @@ def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
     silent = MODEL.replace({"sensors.position_noise": 0.0})
     found = compare(healthy(2, "hum"), silent)
     assert found.signals["xj"].floor.lower_bound and found.signals["xj"].floor.source == "data"
-    assert found.verdict == "CANNOT_TELL" and "only a lower bound" in sentence(found)
+    assert found.verdict == "CANNOT_TELL" and "only a lower bound" in describe_verdict(found)
     assert compare(healthy(2, "hum"), silent, [healthy(3, "hum")]).verdict == "WITHIN_FLOOR"
     assert compare(faulty("servovalve: clogged filter"), silent).verdict == "MODEL_INCOMPLETE"
 
@@ -147,7 +147,7 @@ def test_rows_lost_at_random_are_no_error() -> None:
     keep = np.random.default_rng(0).random(13_500) > 0.05
     columns = {name: np.where(keep, getattr(healthy(2), name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
     found = compare(Trace.of(columns, 1e-3, {}), MODEL)
-    assert found.verdict == "WITHIN_FLOOR", sentence(found)
+    assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
 
 
 @pytest.mark.parametrize(("name", "rows"), [("com", 4), ("cor", -3)])
@@ -162,11 +162,11 @@ def test_columns_out_of_step_are_moved(name: str, rows: int) -> None:
 
 def test_every_number_has_a_place_in_json_and_words() -> None:
     found = compare(faulty("sensor: play"), MODEL, [recorded(seed=9, sensor=backlash(60e-6))])
-    told = to_json(found)
+    told = collect_data(found)
     assert {"verdict", "signals", "solver_error", "where", "blocks"} <= set(told)
     assert set(told["signals"]["xj"]) >= {"unit", "error", "floor", "ratio", "closed_loop_error"}
     assert set(told["blocks"]) == {"controller", "servovalve", "jack", "sensor"}
     assert all({"section", "t0", "t1", "share", "condition"} <= set(place) for place in told["where"])
-    labels = [label for label, _ in lines(found)]
-    assert {"floor", "solver", "where", "when", "residual", "scatter"} <= set(labels)
-    assert "after a reversal" in dict(lines(found))["when"]
+    lines = {line.label: line.text for line in describe_findings(found)}
+    assert {"floor", "solver", "where", "when", "residual", "scatter"} <= set(lines)
+    assert "after a reversal" in lines["when"]

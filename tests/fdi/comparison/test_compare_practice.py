@@ -7,7 +7,7 @@ import pytest
 from places import SHARED
 
 from fdi.comparison.compare import Comparison, compare
-from fdi.report.compare_text import sentence
+from fdi.report.compare_report import describe_verdict
 from fdi.trace.trace import Trace
 from plant import Model, load_model
 
@@ -43,7 +43,7 @@ def test_the_truth_is_at_the_floor(case: str) -> None:
     model = Model().replace(TRUE[case])
     for name, repeats in (("est", [trace(case, "repeat")]), ("est", []), ("holdout", [])):
         found = compare(trace(case, name), model, repeats)
-        assert found.verdict == "WITHIN_FLOOR", sentence(found)
+        assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
         for signal in found.signals.values():
             assert signal.ratio == pytest.approx(1.0, abs=0.03)
             assert signal.floor.value == pytest.approx(LEVELS[signal.name], rel=0.03)
@@ -52,7 +52,7 @@ def test_the_truth_is_at_the_floor(case: str) -> None:
 @pytest.mark.parametrize("case", BLOCK)
 def test_the_nominal_model_lacks_something_in_the_right_block(case: str) -> None:
     found = nominal(case)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named[0] == BLOCK[case], sentence(found)
+    assert found.verdict == "MODEL_INCOMPLETE" and found.named[0] == BLOCK[case], describe_verdict(found)
     assert found.scatter is not None and not found.scatter.enough
     assert found.answer.ratio < 1.0
 
@@ -83,4 +83,4 @@ def test_measurements_of_another_plant() -> None:
     found = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
     assert found.verdict == "MODEL_INCOMPLETE" and set(found.blocks.values()) == {None} and not found.named
     assert found.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
-    assert "the model leaves" in sentence(found).lower() and len(found.where) > 3
+    assert "the model does not explain" in describe_verdict(found).lower() and len(found.where) > 3

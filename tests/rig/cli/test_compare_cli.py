@@ -51,8 +51,8 @@ def test_json_of_a_model_that_fits(folder: Path) -> None:
 def test_words_of_a_model_that_does_not(fault: Said, folder: Path) -> None:
     assert fault.status == 1 and fault.err == ""
     first, *rest = fault.out.splitlines()
-    assert re.match(r"MODEL_INCOMPLETE  The model leaves [\d.]+ um in XJ where noise explains 2.00 um; the servovalve "
-                    "disagrees; controller, jack and sensor fit.", first)
+    assert re.match(r"MODEL_INCOMPLETE  The model does not explain this trace: XJ error [\d.]+ um, noise floor "
+                    r"[\d.]+ um; the servovalve disagrees; controller, jack and sensor fit.", first)
     text = "\n".join(rest)
     for words in ("from the command alone", "servovalve", "equal to the last digit", "halving the step",
                   "floor     the model's sensor noise", "where     motion within 3 mm", "scatter   tolerances do not",
@@ -66,7 +66,8 @@ def test_a_page_that_needs_no_network(fault: Said, folder: Path) -> None:
     assert "MODEL_INCOMPLETE" in page and page.count("<svg") == 4 and "</html>" in page
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//|@import|<script""", page)
     assert "nan" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
-    for words in ("Com and XJ to Cor", "Is it noise", "What it goes with", "jack.damping", "share of the squared"):
+    for words in ("Com and XJ to Cor", "Is the residual noise", "What the residual depends on", "jack.damping",
+                  "share of the squared"):
         assert words in page, words
 
 
@@ -98,7 +99,7 @@ def test_results_go_where_they_should(folder: Path) -> None:
     (["{}/est.csv", "--out", "{}/none/x.html"], "a place that can be written"),
     (["{}/mm.csv"], "mm.csv: xj: expected values in m; the largest, 5.* times jack.travel"),
     (["{}/nocor.csv"], "nocor.csv: line 1: cor: expected a column of this name"),
-    (["{}/dead.csv"], "dead.csv: xs: expected a signal that lives"),
+    (["{}/dead.csv"], "dead.csv: xs: expected a signal that changes"),
 ])
 def test_bad_input_is_one_line(folder: Path, words: list[str], refusal: str) -> None:
     columns = {name: getattr(healthy(2), name) for name in ("t", "com", "xj", "cor", "xs")}

@@ -69,14 +69,14 @@ def test_blind_spots_have_sizes_and_units(found: Said) -> None:
 
 def test_the_page_needs_no_network(found: Said, biased: dict[str, Path]) -> None:
     page = biased["est"].with_name("page.html").read_text()
-    assert found.status == 1 and "null_bias explains it" in page and page.count("<svg") == 2
+    assert found.status == 1 and "null_bias explains the residual" in page and page.count("<svg") == 2
     assert "http" not in page.replace("http://www.w3.org", "")
 
 
 def test_nothing_missing_passes(healthy: dict[str, Path]) -> None:
     said = rig("explain", *words(healthy))
     assert said.status == 0 and said.out.startswith("NOTHING_MISSING")
-    assert "what is left is noise" in said.out and "blind to" in said.out and "next" not in said.out
+    assert "the residual is noise" in said.out and "not detectable" in said.out and "next" not in said.out
 
 
 FEW = ("null_bias", "constant_load", "friction_asymmetry", "spool_friction")
@@ -123,7 +123,7 @@ def csv(folder: Path) -> Path:
     (["--repeat", "est"], "the same command run again"),
     (["--repeat", "holdout"], "another command is no repeat"),
     (["--signals", "xj,q"], "--signals: q: expected some of xj,p12,xs"),
-    (["--out", "x.txt"], "FILE.html or FILE.json"),
+    (["--out", "x.txt"], "FILE.html for a page, or FILE.json"),
     (["--write-effect", "x.txt"], "FILE.py"),
     (["--holdout", "nowhere.csv"], "a trace that can be read"),
 ])

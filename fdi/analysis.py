@@ -1,0 +1,323 @@
+"""The public Python interface: load a trace, compare, explain, add an effect, diagnose, plot (docs/python.md).
+
+Each function answers with a `Result`. It can be printed, shown in a notebook, written as an HTML page, plotted and
+turned into the dictionary that the command of the same name prints with --json.
+"""
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fdi.output import write_text
+from fdi.report.report import Figure, Medium, Report
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from plant.model import Model, load_model
+
+if TYPE_CHECKING:
+    from fdi.comparison.compare import Comparison
+    from fdi.diagnosis.diagnosis import Diagnosis
+    from fdi.discovery.candidates import Answer
+    from fdi.discovery.model_file import Provenance
+    from fdi.discovery.runs import Runs
+    from fdi.discovery.update_model import ModelUpdate
+
+TraceOrPath = Trace | str | Path
+ModelOrPath = Model | str | Path
+
+
+class Plot(str):
+    """A figure as SVG text, with its caption. A notebook shows it as a picture."""
+
+    caption: str
+
+    def __new__(cls, svg: str, caption: str) -> Plot:
+        plot = super().__new__(cls, svg)
+        plot.caption = caption
+        return plot
+
+    def _repr_svg_(self) -> str:
+        return str(self)
+
+    def write(self, path: str | Path) -> None:
+        """Write the figure as an SVG file.
+
+        Raises:
+            InputError: a path that cannot be written.
+        """
+        write_text(path, str(self), "path")
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What an analysis found: a verdict in a word and in a sentence, tables, figures, and the JSON answer."""
+
+    report: Report = field(repr=False)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict word, as in the JSON answer."""
+        return self.report.verdict
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in plain English."""
+        return self.report.sentence
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Titles of the figures that `plot` can draw."""
+        return tuple(title for title, _ in self._list_figures())
+
+    def plot(self, title: str | None = None) -> Plot:
+        """Draw a figure of the page; by default the first.
+
+        Raises:
+            InputError: a title that is not one of `figures`.
+        """
+        figures = self._list_figures()
+        if not figures:
+            raise InputError("plot", title or "", "a result with figures; this one has none")
+        name = title if title is not None else figures[0][0]
+        for known, figure in figures:
+            if known == name:
+                return Plot(figure.draw(), figure.caption)
+        raise InputError("plot", name, f"one of {', '.join(self.figures)}")
+
+    def _list_figures(self) -> list[tuple[str, Figure]]:
+        """(title, figure) in the order of the page; a second figure of a section is numbered."""
+        found: list[tuple[str, Figure]] = []
+        for section, items in self.report.select_sections(Medium.PAGE):
+            figures = [item for item in items if isinstance(item, Figure)]
+            for number, figure in enumerate(figures, 1):
+                found.append((section.title if number == 1 else f"{section.title} {number}", figure))
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON answer as plain values: SI units, None for NaN and infinity."""
+        from fdi.report.json import to_plain
+
+        return dict(to_plain(self.report.data))
+
+    def to_html(self) -> str:
+        """The page as text; it needs no network."""
+        from fdi.report.html import render_html
+
+        return render_html(self.report)
+
+    def write_html(self, path: str | Path) -> None:
+        """Write the page.
+
+        Raises:
+            InputError: a path that cannot be written.
+        """
+        write_text(path, self.to_html(), "path")
+
+    def to_text(self, width: int = 100) -> str:
+        """The report as the terminal shows it, without colours; `width` in characters."""
+        from fdi.report.terminal import format_report
+
+        return format_report(self.report, width)
+
+    def __str__(self) -> str:
+        return self.to_text()
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.to_html(), quote=True)
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 720px; border: 0"></iframe>'
+
+
+@dataclass(frozen=True, eq=False)
+class ComparisonResult(Result):
+    """A model compared with a trace; `comparison` holds every number, as numpy columns where it has many."""
+
+    comparison: Comparison = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class ExplanationResult(Result):
+    """Which effect is missing from a model."""
+
+    answer: Answer = field(repr=False)
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The effects that explain the residual, or that the data cannot discriminate; () if none does."""
+        return self.answer.explanation.effects
+
+
+@dataclass(frozen=True, eq=False)
+class ModelResult(Result):
+    """A model with one more effect, fitted to a trace."""
+
+    update: ModelUpdate = field(repr=False)
+
+    @property
+    def model(self) -> Model:
+        """The fitted model."""
+        return self.update.model
+
+    @property
+    def helps(self) -> bool:
+        """Whether the effect explains more than noise."""
+        return bool(self.update.helps)
+
+    def write_model(self, path: str | Path) -> None:
+        """Write the model file, with intervals and provenance; a file that was there before gets the suffix .bak.
+
+        Raises:
+            InputError: a path that cannot be written.
+        """
+        from fdi.discovery.update_model import write_model_file
+
+        write_model_file(self.update, path)
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisResult(Result):
+    """Levels and sizes of the two faults of a servovalve."""
+
+    diagnosis: Diagnosis = field(repr=False)
+
+
+def read_trace(path: str | Path) -> Trace:
+    """Read a trace: trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load] in SI units.
+
+    Raises:
+        InputError: a file that cannot be read, naming its line or field.
+    """
+    return Trace.read(path)
+
+
+def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
+            signals: Sequence[str] | None = None) -> ComparisonResult:
+    """Compare a model with a trace: how large the error is beside the noise floor, where, when and in which block.
+
+    Args:
+        trace: the measured run, or its file.
+        model: a `Model`, a model file, or the name of a nominal plant.
+        repeats: runs of the same command; they measure the noise floor.
+        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+
+    Raises:
+        InputError: a trace, a model or a signal that cannot be used.
+    """
+    from fdi.comparison.compare import compare as compare_trace
+    from fdi.report.compare_report import build_comparison_report
+
+    measured = _load_trace(trace)
+    comparison = compare_trace(measured, _load_model(model), [_load_trace(r) for r in repeats], signals,
+                               source=_name_trace(trace))
+    return ComparisonResult(build_comparison_report(comparison), comparison)
+
+
+def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
+            holdout: TraceOrPath | None = None, signals: Sequence[str] | None = None, seed: int = 0,
+            effect_file: str | Path | None = None) -> ExplanationResult:
+    """Find the physical effect that a model lacks.
+
+    Args:
+        trace: the measured run, or its file.
+        model: a `Model`, a model file, or the name of a nominal plant.
+        repeats: runs of the same command; they discriminate noise from physics.
+        holdout: a run of another command that no fit sees; it reveals overfitting.
+        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        seed: of the simulated runs behind the p-values.
+        effect_file: where to write the shape of the residual as an effect to edit.
+
+    Raises:
+        InputError: a trace, a model or a signal that cannot be used.
+    """
+    from fdi.discovery.explain_runs import explain_runs
+    from fdi.report.explain_report import build_explanation_report
+
+    own_model = _load_model(model)
+    runs = _collect_runs(own_model, trace, repeats, holdout, signals)
+    answer, pattern = explain_runs(runs, seed, effect_file)
+    report = build_explanation_report(answer, _name_trace(trace), own_model.name, runs.sources, pattern=pattern,
+                                      notes=runs.notes)
+    return ExplanationResult(report, answer)
+
+
+def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPath = "eha", *,
+               repeats: Sequence[TraceOrPath] = (), holdout: TraceOrPath | None = None,
+               signals: Sequence[str] | None = None) -> ModelResult:
+    """Add an effect, or several in this order, to a model and fit everything; the file of a model keeps its ledger.
+
+    Args:
+        effect: a name of the catalogue, or several.
+        trace: the measured run to fit, or its file.
+        model: a `Model`, a model file, or the name of a nominal plant.
+        repeats: runs of the same command, which are fitted as well.
+        holdout: a run of another command that no fit sees.
+        signals: some of "xj", "p12", "xs"; default: all that the trace has.
+
+    Raises:
+        InputError: an effect that this model cannot take, or runs that cannot be used.
+    """
+    from fdi.discovery import model_file
+    from fdi.discovery.update_model import add_effects
+    from fdi.report.model_report import build_model_report
+
+    effects = [effect] if isinstance(effect, str) else list(effect)
+    own_model, known = _load_model_file(model)
+    runs = _collect_runs(model_file.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
+    command = f"fdi.add_effect({', '.join(map(repr, effects))})"
+    update = add_effects(effects, runs, own_model, known, command)
+    return ModelResult(build_model_report(update), update)
+
+
+def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None) -> DiagnosisResult:
+    """Judge filter clogging and spool friction: levels, sizes with 95 % intervals, other deviations.
+
+    Args:
+        trace: a run of any command, or its file.
+        model: the healthy unit: a `Model`, a model file, or "eha".
+        bands: a file of `rig fdi --learn-bands`; default: the bands that come with the software.
+
+    Raises:
+        InputError: a trace, a model or bands that cannot be used.
+    """
+    from fdi.diagnosis.bands_file import load_bands
+    from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
+    from fdi.report.diagnosis_report import build_diagnosis_report
+
+    known_bands = None if bands is None else load_bands(bands)
+    diagnosis = diagnose_trace(_load_trace(trace), _load_model(model), known_bands, source=_name_trace(trace))
+    return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
+
+
+def _load_trace(trace: TraceOrPath) -> Trace:
+    """The trace itself; one that was read gets the name of its file, so that messages can say it."""
+    if isinstance(trace, Trace):
+        return trace
+    found = Trace.read(trace)
+    return replace(found, provenance={**found.provenance, "source": str(trace)})
+
+
+def _name_trace(trace: TraceOrPath) -> str:
+    return trace.provenance.get("source", "trace") if isinstance(trace, Trace) else str(trace)
+
+
+def _load_model(model: ModelOrPath) -> Model:
+    return model if isinstance(model, Model) else load_model(model)
+
+
+def _load_model_file(model: ModelOrPath) -> tuple[Model, Provenance]:
+    """A model and where it comes from, which only a model file knows."""
+    from fdi.discovery.model_file import Provenance, load_model_file
+
+    if not isinstance(model, Model) and Path(model).is_file():
+        return load_model_file(Path(model))
+    return _load_model(model), Provenance()
+
+
+def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPath], holdout: TraceOrPath | None,
+                  signals: Sequence[str] | None) -> Runs:
+    from fdi.discovery.runs import collect_runs
+
+    unseen = None if holdout is None else _load_trace(holdout)
+    return collect_runs(model, _load_trace(trace), [_load_trace(r) for r in repeats], unseen, signals)

@@ -1,0 +1,188 @@
+"""Reports of explanations and of model updates: each verdict in a sentence, each error beside its noise floor."""
+from __future__ import annotations
+
+import math
+from io import StringIO
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from rich.console import Console
+
+from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious, Value
+from fdi.discovery.model_file import Provenance, Row
+from fdi.discovery.runs import Source
+from fdi.discovery.update_model import ModelUpdate
+from fdi.report.explain_report import (
+    MOODS,
+    build_explanation_report,
+    describe_blind,
+    describe_findings,
+    describe_suspicious,
+    describe_verdict,
+    list_sources,
+)
+from fdi.report.html import render_html
+from fdi.report.json import to_plain
+from fdi.report.model_report import build_model_report
+from fdi.report.terminal import print_report
+from plant import Model
+
+FLOOR = {"xj": 2e-6, "p12": 2e4}
+ERROR = {"xj": 45e-6, "p12": 3e5}
+NONE: dict[str, float] = {}
+
+
+def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
+    value = Value(1.5e-4, 1.4e-4, 1.6e-4, "A")
+    return Candidate(effect, beside, {f"{effect}.current": value}, dict(FLOOR), {"xj": 2.1e-6, "p12": 2e4},
+                     {"xj": 1.0, "p12": 1.0}, 1200.0, 1e-30, word)
+
+
+def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, reached: bool = False,
+           **fields: Any) -> Answer:
+    base = SimpleNamespace(reached=reached, ratio={"xj": 22.5, "p12": 15.0})
+    explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, controller=1.0,
+                                  ledger=[base], search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+    baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
+    blind = (Blind("null_bias", "null_bias.current", 1e-6, 1e-4, "A"),
+             Blind("sensor_offset", "sensor_offset.offset", math.inf, 1e-4, "m"))
+    return Answer(cast(Any, explanation), candidates, baseline, blind, ("quantisation",), (), (), **fields)
+
+
+CASES = {
+    "NOTHING_MISSING": (answer("NOTHING_MISSING", ()), "the residual is noise"),
+    "EXPLAINED": (answer("EXPLAINED", ("a",), candidate("a")), "a explains the residual"),
+    "EXPLAINED by two": (answer("EXPLAINED", ("a", "b"), candidate("a", "b"), candidate("b", "a")),
+                         "a and b together explain the residual"),
+    "AMBIGUOUS": (answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b")), "a or b: each explains the"),
+    "PARTLY": (answer("PARTLY", ("a",), candidate("a", word="part")), "a explains part of the residual"),
+    "PARTLY by none": (answer("PARTLY", (), candidate("a", word="part")), "No effect of the catalogue"),
+    "UNEXPLAINED": (answer("UNEXPLAINED", (), candidate("a", word="no")), "the best, a, leaves"),
+    "UNEXPLAINED without candidates": (answer("UNEXPLAINED", ()), "No effect of the catalogue"),
+    "NOT_RESOLVABLE": (answer("NOT_RESOLVABLE", ("a",), candidate("a")), "a may be present"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_sentence_has_error_and_noise_floor(case: str) -> None:
+    given, words = CASES[case]
+    sentence = describe_verdict(given)
+    assert words in sentence and sentence.endswith(".")
+    assert "XJ error 45.0 um" in sentence and "noise floor 2.00 um" in sentence
+
+
+def test_sizes_of_several_effects_are_told_apart() -> None:
+    sentence = describe_verdict(CASES["EXPLAINED by two"][0])
+    assert "a: current 150 uA (140 .. 160); b: current 150 uA (140 .. 160)" in sentence
+
+
+@pytest.mark.parametrize("case", ["EXPLAINED", "EXPLAINED by two", "PARTLY", "NOT_RESOLVABLE"])
+def test_a_size_has_its_interval(case: str) -> None:
+    assert "current 150 uA (140 .. 160)" in describe_verdict(CASES[case][0])
+
+
+def test_another_firmware_is_said_to_be_one() -> None:
+    sentence = describe_verdict(answer("UNEXPLAINED", (), reached=True))
+    assert sentence.startswith("The output of the controller differs from the model's")
+
+
+def test_all_verdicts_have_a_mood() -> None:
+    assert set(MOODS) == {case.split(" ")[0] for case in CASES}
+
+
+def test_findings() -> None:
+    lines = {line.label: line.text for line in describe_findings(CASES["AMBIGUOUS"][0])}
+    assert lines["to discriminate"].startswith("no sensor and no command")
+    assert lines["not detectable"] == "sensor_offset (at any size); 2 other effects would have been detected"
+    by = {"by": "measure XS too", "between": ("a", "b")}
+    lines = {line.label: line.text for line in describe_findings(answer(
+        "AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force"))}
+    assert lines["to discriminate"] == "measure XS too: in simulation this discriminates between a and b"
+    assert lines["residual"] == "a force"
+
+
+def test_long_lists_name_four_and_count_the_rest() -> None:
+    found = [Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)]
+    text = describe_suspicious(found)
+    assert text.startswith("group.field_5 1.00 N (+9.0 tolerances)") and " and 2 more: outside the range" in text
+    unseen = tuple(Blind(f"e{i}", "g.f", math.inf, 1.0, "N") for i in range(6))
+    many = Answer(cast(Any, None), (), {}, unseen, (), (), ())
+    assert "e3 (at any size) and 2 more" in describe_blind(many)
+
+
+def test_the_report_of_an_explanation_in_all_forms() -> None:
+    given, _ = CASES["EXPLAINED"]
+    sources = [Source("est.csv", "1"), Source("repeat.csv", "2"), Source("holdout.csv", "3")]
+    report = build_explanation_report(given, "est.csv", "eha", sources, "rig explain est.csv", "rig add a est.csv",
+                                      notes=["3 rows left out"])
+    out = StringIO()
+    print_report(report, Console(file=out, width=80, highlight=False))
+    text = out.getvalue()
+    assert "no effect" in text and "explains" in text and "<1e-99" not in text and "1e-30" in text
+    assert "note            3 rows left out" in text and "next            rig add a est.csv" in text
+    report = build_explanation_report(given, "est.csv", "eha", sources, "rig explain est.csv")
+    page = render_html(_without_figures(report))
+    for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "smallest detectable", "rig explain est.csv"):
+        assert words in page
+    data = to_plain(report.data)
+    assert data["verdict"] == "EXPLAINED" and data["candidates"][0]["with"] == [] and "ledger" not in data
+    assert data["blind_to"][1]["smallest_visible"] is None
+    several = build_explanation_report(CASES["EXPLAINED by two"][0], "est.csv", "eha", sources)
+    assert "ledger" in several.data
+
+
+def _without_figures(report: Any) -> Any:
+    """Their drawing needs whole traces; the commands' own tests draw them."""
+    from dataclasses import replace
+
+    sections = [replace(s, items=[i for i in s.items if i.kind != "figure"]) for s in report.sections]
+    return replace(report, sections=sections)
+
+
+@pytest.mark.parametrize(("count", "has_holdout", "roles"), [
+    (0, False, []), (1, False, ["trace"]), (1, True, ["trace"]), (2, False, ["trace", "repeat"]),
+    (2, True, ["trace", "held-out run"]), (3, True, ["trace", "repeat", "held-out run"])])
+def test_roles_of_runs(count: int, has_holdout: bool, roles: list[str]) -> None:
+    sources = [Source(f"{i}.csv", str(i)) for i in range(count)]
+    assert [role for role, _ in list_sources(sources, has_holdout)] == roles
+
+
+def update(helps: bool, removed: str = "") -> ModelUpdate:
+    steps = [SimpleNamespace(error=ERROR, holdout=ERROR, hypothesis=None),
+             SimpleNamespace(error=FLOOR, holdout=FLOOR, hypothesis=None)]
+    refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
+                            search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+    rows = (Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR, bool(removed)))
+    known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR, ledger=rows,
+                       history=("rig add a",), effects=("a",))
+    return ModelUpdate(Model(), known, () if removed else ("a",), removed, cast(Any, refit),
+                       {"a.current": Value(1.5e-4, 1.4e-4, 1.6e-4, "A")}, (), ())
+
+
+def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
+    report = build_model_report(update(True), tmp_path / "m.toml", tmp_path / "m.toml.bak", tmp_path / "m.html")
+    assert report.sentence == ("a added: XJ error 45.0 um -> 2.00 um, noise floor 2.00 um; held-out run 45.0 um -> "
+                               "2.00 um.")
+    out = StringIO()
+    print_report(report, Console(file=out, width=80, highlight=False))
+    text = out.getvalue()
+    for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak", "m.html"):
+        assert words in text.replace("\n", "")
+    assert max(line.count("█") for line in text.splitlines()) == 30
+    page = render_html(_without_figures(report))
+    assert "held-out" in page and "22.5" in page and "█" not in page
+    assert to_plain(report.data)["helps"] is True
+
+
+def test_an_update_that_does_not_help_says_so() -> None:
+    report = build_model_report(update(False))
+    assert report.mood == "doubtful" and report.sentence.endswith("a explains nothing but noise.")
+    assert report.data["model"] is None
+
+
+def test_a_removal_without_a_run_has_nothing_to_show() -> None:
+    nothing = ModelUpdate(Model(), Provenance(), (), "a", None, NONE, (), ("the rest stays",))  # type: ignore[arg-type]
+    report = build_model_report(nothing)
+    assert (report.verdict, report.sentence, report.data["helps"]) == ("", "a removed.", None)
+    assert "<svg" not in render_html(report)

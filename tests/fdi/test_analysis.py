@@ -1,0 +1,114 @@
+"""The public Python interface: the lines of docs/python.md as they stand there, and what results can do."""
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from effect_files import restored_catalogue
+from short_runs import HIDDEN, measured
+
+import fdi
+from fdi.analysis import Plot, Result
+from fdi.diagnosis.refine import SUSPECTS
+from plant import InputError, Model
+from plant.effects import CATALOGUE
+
+PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
+EXAMPLE = re.sub(r"^    ", "", re.findall(r"(?:^    .*\n|^\n(?=    ))+", PAGE, re.MULTILINE)[0], flags=re.MULTILINE)
+FEW = {"null_bias", "spool_friction", *(suspect.effect for suspect in SUSPECTS)}  # what `diagnose` needs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return measured(tmp_path_factory.mktemp("runs"), HIDDEN)
+
+
+@pytest.fixture(scope="module")
+def lines(runs: dict[str, Path]) -> Iterator[dict[str, Any]]:
+    """The names that the first block of docs/python.md leaves, run beside short traces with a small catalogue."""
+    names: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch, restored_catalogue():
+        patch.chdir(runs["est"].parent)
+        for name in set(CATALOGUE) - FEW:
+            del CATALOGUE[name]
+        exec(EXAMPLE, names)
+        yield names
+
+
+def test_the_lines_of_the_page_find_the_hidden_effect(lines: dict[str, Any], runs: dict[str, Path]) -> None:
+    folder = runs["est"].parent
+    assert lines["explanation"].effects == ("null_bias",) and lines["explanation"].verdict == "EXPLAINED"
+    result = lines["result"]
+    assert result.helps and result.model.effects == ("null_bias",)
+    interval = result.to_dict()["parameters"]["null_bias.current"]
+    assert interval["low"] < HIDDEN["null_bias.current"] < interval["high"]
+    assert fdi.compare(folder / "est.csv", folder / "model.toml", repeats=[folder / "repeat.csv"]
+                       ).verdict == "WITHIN_FLOOR"
+    assert (folder / "residual.svg").read_text().startswith("<svg")
+    assert "Faults" in (folder / "diagnosis.html").read_text()
+
+
+def test_the_example_is_short() -> None:
+    assert "fdi.diagnose" in EXAMPLE
+    assert len([line for line in EXAMPLE.splitlines() if line and not line.startswith("import")]) <= 10
+
+
+def test_every_result_prints_shows_plots_and_converts(lines: dict[str, Any]) -> None:
+    results = [lines["comparison"], lines["explanation"], lines["result"], fdi.diagnose(lines["trace"])]
+    for result in results:
+        assert isinstance(result, Result)
+        assert str(result).startswith(f"{result.verdict}  {result.sentence}\n")
+        assert result.verdict in result.to_html() and "</html>" in result.to_html()
+        assert result._repr_html_().startswith("<iframe srcdoc=") and "<script" not in result._repr_html_()
+        assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == result.to_dict()
+        drawn = [result.plot(title) for title in result.figures]
+        assert drawn and len(set(drawn)) == len(drawn)
+        assert all(isinstance(plot, Plot) and plot.startswith("<svg") and plot.caption for plot in drawn)
+        with pytest.raises(InputError, match=f"one of {re.escape(result.figures[0])}"):
+            result.plot("nothing of this name")
+
+
+def test_the_dictionary_is_the_answer_of_the_command(lines: dict[str, Any], runs: dict[str, Path]) -> None:
+    from rig_command import rig
+
+    said = rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json
+    own = fdi.compare(runs["est"], repeats=[runs["repeat"]]).to_dict()
+    assert own == said
+    from_memory = lines["comparison"].to_dict()
+    assert {**from_memory, "trace": said["trace"]} == said
+
+
+def test_traces_in_memory_do_for_files(runs: dict[str, Path]) -> None:
+    trace = fdi.read_trace(runs["est"])
+    with pytest.raises(InputError, match="the same command run again"):
+        fdi.explain(trace, repeats=[trace])
+    with pytest.raises(InputError, match="a run that no fit has seen"):
+        fdi.add_effect("null_bias", trace, holdout=trace)
+
+
+def test_a_model_is_a_value_a_file_or_a_name(runs: dict[str, Path], tmp_path: Path) -> None:
+    model = Model().replace(HIDDEN)
+    (tmp_path / "biased.toml").write_text(model.to_toml())
+    found = [fdi.compare(runs["est"], given).verdict for given in (model, tmp_path / "biased.toml", "eha")]
+    assert found == ["WITHIN_FLOOR", "WITHIN_FLOOR", "MODEL_INCOMPLETE"]
+
+
+def test_bad_input_names_the_file(tmp_path: Path, runs: dict[str, Path]) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.csv"):
+        fdi.compare(tmp_path / "nowhere.csv")
+    with pytest.raises(InputError, match="xq"):
+        fdi.compare(runs["est"], signals=["xq"])
+    with pytest.raises(InputError, match="path"):
+        fdi.compare(runs["est"]).write_html(tmp_path / "none" / "page.html")
+
+
+def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
+    code = "import sys, fdi; print([m for m in ('numba', 'matplotlib', 'numpy', 'rich', 'jinja2') if m in sys.modules])"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[]"
