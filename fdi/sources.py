@@ -1,4 +1,4 @@
-"""Code by name and by content: what judges a run, and whether it is still the code that judged another one."""
+"""Code by name and by content: functions named by the user, and hashes of the code that a result depends on."""
 from __future__ import annotations
 
 import hashlib
@@ -12,7 +12,7 @@ from typing import Any
 
 from plant.errors import InputError
 
-COUNTS = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; not pages and caches
+SUFFIXES = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; no pages, no caches
 
 
 def software() -> str:
@@ -20,11 +20,11 @@ def software() -> str:
     return f"eha-rig {version('eha-rig')}"
 
 
-def named(name: str, field: str, expected: str) -> Callable[..., Any]:
-    """The callable "module:function".
+def import_function(name: str, field: str, expected: str) -> Callable[..., Any]:
+    """The function "module:function".
 
     Raises:
-        InputError: there is no such thing; it names `field` and says what was `expected`.
+        InputError: there is no such function; the message names `field` and what was `expected`.
     """
     module, _, function = name.partition(":")
     try:
@@ -37,13 +37,13 @@ def named(name: str, field: str, expected: str) -> Callable[..., Any]:
 
 
 @cache
-def digest(*places: str) -> str:
-    """A hash of all code and data in packages and files, "plant", "rig/studies/trial": 16 digits."""
+def hash_sources(*places: str) -> str:
+    """A hash, 16 hexadecimal digits, of all code and data in packages and files: "plant", "rig/studies/trial"."""
     known = hashlib.sha256()
     for place in places:
         package, *rest = place.split("/")
         path = Path(str(files(package).joinpath(*rest)))
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-            if file.suffix in COUNTS:
+            if file.suffix in SUFFIXES:
                 known.update(f"{place}/{file.relative_to(path).as_posix()}\0".encode() + file.read_bytes() + b"\0")
     return known.hexdigest()[:16]

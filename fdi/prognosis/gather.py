@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from fdi.diagnosis.faults import FAULTS, Estimate
 from fdi.prognosis.dates import AXES, TABLE, Row, find_date_in_name, find_row, parse_date, read_dates_table
 from fdi.progress import Progress
-from fdi.sources import digest
+from fdi.sources import hash_sources
 from fdi.trace.trace import Trace
 from plant.compile import cache_folder
 from plant.effects import CATALOGUE
@@ -164,5 +164,5 @@ def _find_answer_file(file: Path, model: Model) -> Path:
         raise InputError(file, "", f"a readable file ({error.strerror})") from error
     theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
-    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, digest("plant", "fdi")])
+    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi")])
     return cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"

@@ -1,6 +1,7 @@
-"""Other ways to the fault sizes, one table: what each finds of a trace, its error, its simulations, its time."""
+"""Other methods for the fault sizes of a trace: what each one finds, its error, its simulations and its time."""
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,62 +15,65 @@ from rig.network.clock import WallClock
 
 
 class Row(NamedTuple):
-    """One method; None where it does not tell."""
+    """The result of one method; None for what the method does not give."""
 
     method: str
     kintas: float | None
     fss: float | None  # N
-    left: float | None  # RMS of what is left of the signals, in floors
-    error_kintas: float | None  # RMS on simulated units that training did not see
+    left: float | None  # RMS of the residual, in noise floors
+    error_kintas: float | None  # RMS on simulated units that were not used for training
     error_fss: float | None  # N
-    right: dict[str, float] | None  # share of right levels on these, by fault
+    right: dict[str, float] | None  # share of right levels on these units, by fault
     levels: dict[str, str] | None
     simulations: int
     seconds: float
 
 
-def optimisers(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
-    """Least squares and the global optimisers, each from the grid's answer."""
-    from fdi.diagnosis import optimisers as ways
+def apply_optimisers(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
+    """Least squares and the global optimisers, each started from the sizes of the RMS grid."""
+    from fdi.diagnosis import optimisers
 
-    trace, model = d.trace, d.model
-    start = (d.grid.merged.kintas, d.grid.merged.fss) if d.grid else (0.1, 15.0)
-    for number, (name, method) in enumerate(ways.METHODS.items()):
-        progress(name, number / len(ways.METHODS))
-        if not ways.is_available(name):
-            continue
-        found, seconds = timed(partial(method, model, trace, start, d.floor, seed))
-        yield Row(found.method, found.kintas, found.fss, found.left, None, None, None, None, found.simulations, seconds)
+    grid = diagnosis.grid
+    start = (grid.merged.kintas, grid.merged.fss) if grid else (0.1, 15.0)
+    for number, (name, method) in enumerate(optimisers.METHODS.items()):
+        progress(name, number / len(optimisers.METHODS))
+        if optimisers.is_available(name):
+            found, seconds = measure_time(
+                partial(method, diagnosis.model, diagnosis.trace, start, diagnosis.floor, seed))
+            yield Row(found.method, found.kintas, found.fss, found.left, error_kintas=None, error_fss=None, right=None,
+                      levels=None, simulations=found.simulations, seconds=seconds)
 
 
-def comparators(d: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
-    """The learners; the time of each holds that of simulating what both learn from.
+def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
+    """The learners; the time of each one includes the simulation of the units that both learn from.
 
     Raises:
         InputError: scikit-learn is not installed, or the trace shows no precursors.
     """
-    from fdi.diagnosis import comparators as learners
+    from fdi.diagnosis import comparators
 
-    if not learners.is_available():
+    if not comparators.is_available():
         raise InputError("--comparators", "scikit-learn", "installed: pip install 'eha-rig[learn]'")
-    data, before = timed(lambda: learners.simulate_lesson(d.trace, d.model, seed, progress))
-    for name, learner in learners.LEARNERS.items():
+    simulate = partial(comparators.simulate_lesson, diagnosis.trace, diagnosis.model, seed, progress)
+    lesson, simulation_seconds = measure_time(simulate)
+    for name, learner in comparators.LEARNERS.items():
         progress(name, 1.0)
-        found, seconds = timed(partial(learner, data, seed))
-        yield Row(found.method, _known(found.kintas), _known(found.fss), None, _known(found.error_kintas),
-                  _known(found.error_fss), found.right, {fault: level.word for fault, level in found.levels.items()},
-                  found.simulations, before + seconds)
+        found, seconds = measure_time(partial(learner, lesson, seed))
+        yield Row(found.method, _replace_nan(found.kintas), _replace_nan(found.fss), left=None,
+                  error_kintas=_replace_nan(found.error_kintas), error_fss=_replace_nan(found.error_fss),
+                  right=found.right, levels={fault: level.word for fault, level in found.levels.items()},
+                  simulations=found.simulations, seconds=simulation_seconds + seconds)
 
 
-def timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """What some work gives, and how long it took, s."""
+def measure_time(work: Callable[[], Any]) -> tuple[Any, float]:
+    """The result of `work`, and the time it took, s."""
     clock = WallClock()
     start = clock.now()
     return work(), 1e-9 * (clock.now() - start)
 
 
-def _known(x: float) -> float | None:
-    return x if x == x else None
+def _replace_nan(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def build_methods_section(rows: Sequence[Row]) -> Section:

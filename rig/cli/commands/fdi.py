@@ -72,8 +72,12 @@ def apply_other_methods(args: argparse.Namespace, diagnosis: Diagnosis, progress
         return []
     from rig.studies import fault_size_methods
 
-    rows = list(fault_size_methods.optimisers(diagnosis, args.seed, progress)) if args.optimisers else []
-    return rows + (list(fault_size_methods.comparators(diagnosis, args.seed, progress)) if args.comparators else [])
+    rows: list[Row] = []
+    if args.optimisers:
+        rows += fault_size_methods.apply_optimisers(diagnosis, args.seed, progress)
+    if args.comparators:
+        rows += fault_size_methods.apply_learners(diagnosis, args.seed, progress)
+    return rows
 
 
 def add_methods(report: Report, rows: Sequence[Row]) -> Report:

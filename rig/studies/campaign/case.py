@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.sources import digest, named
+from fdi.sources import hash_sources, import_function
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.errors import InputError, RigError
@@ -147,10 +147,10 @@ def load_judgement(name: str) -> Judgement:
     Raises:
         InputError: there is no such function.
     """
-    return named(name, "--work", "a judgement")
+    return import_function(name, "--work", "a judgement")
 
 
 def hash_campaign_sources() -> str:
     """A hash of all code and data that a row depends on."""
     campaign = (f"rig/studies/campaign/{name}.py" for name in ("case", "judge", "matrix"))
-    return digest("plant", "fdi", *campaign, "rig/studies/trial")
+    return hash_sources("plant", "fdi", *campaign, "rig/studies/trial")

@@ -1,7 +1,7 @@
-"""Simulated units whose fault grows by a known law: what a trend is scored on.
+"""Simulated units whose fault grows by a known law, for scoring the prognosis.
 
-Three of the laws are among those that are fitted, four are not. Sizes are measured with the errors that `rig fdi` has:
-most of an error is the unit's own (its tolerances) and the same in each of its traces.
+Three of the laws are among those that the prognosis fits, four are not. Sizes have the errors of `rig fdi`: most of an
+error comes from the tolerances of the unit, and is the same in all its traces.
 """
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
+from fdi.thresholds import INTERVAL_95_SD
 
 Floats = NDArray[np.float64]
 Law = Callable[[Floats, np.random.Generator], Floats]
 
-WIDTH = 1.96
-FINE = 4000  # points of a true course
-INTERVAL = 7.0  # days between traces, about
+INTERVAL = 7.0  # days between traces, on average
 
 
 class Error(NamedTuple):
-    """Of a refined size: deviation `base + share * size`, and the part of its variance that is the unit's own."""
+    """Error of a refined size: standard deviation `base + share * size`."""
 
     base: float
     share: float
-    common: float
+    common: float  # part of the variance that is the same in all traces of a unit
 
 
 # as measured with rig fdi on XJ, P12 and XS: twelve traces of each of two units, tolerances of 1.5 %, coloured noise
@@ -34,14 +33,14 @@ ERRORS = {CLOGGING.name: Error(0.03, -0.03, 0.995), FRICTION.name: Error(0.0, 0.
 
 
 class Unit(NamedTuple):
-    """One unit: its true course over its life, and what the traces say of it."""
+    """One unit: the true course of its fault, and the sizes that its traces give."""
 
     law: str
     fault: Fault
     onset: float  # days
     course_t: Floats  # days
     course: Floats
-    t: Floats  # days, of the traces
+    t: Floats  # days, times of the traces
     sizes: tuple[Estimate, ...]
 
     def time_of_size(self, limit: float) -> float:
@@ -50,30 +49,30 @@ class Unit(NamedTuple):
 
 
 def grow_linearly(x: Floats, rng: np.random.Generator) -> Floats:
-    """Of a fault from its onset, x = 0, to MaxBand, x = 1."""
+    """In proportion to time; x runs from 0 at the onset to 1 at MaxBand, and so does the result."""
     return x
 
 
 def grow_exponentially(x: Floats, rng: np.random.Generator) -> Floats:
-    """1.5 to 4.5 e-foldings."""
+    """Exponentially, by 1.5 to 4.5 e-foldings."""
     bend = rng.uniform(1.5, 4.5)
     return np.asarray(np.expm1(bend * x) / np.expm1(bend))
 
 
 def grow_by_power(x: Floats, rng: np.random.Generator) -> Floats:
-    """An exponent from 0.6 to 2.8."""
+    """A power of time with an exponent from 0.6 to 2.8."""
     return np.asarray(x ** rng.uniform(0.6, 2.8))
 
 
 def grow_like_crack(x: Floats, rng: np.random.Generator) -> Floats:
-    """Growth in proportion to the size to the power 1.5, as a crack's by Paris with an exponent of 3."""
+    """At a rate in proportion to the size to the power 1.5, as a crack by the law of Paris with an exponent of 3."""
     start = rng.uniform(0.08, 0.25)
     root = 1.0 - (1.0 - np.sqrt(start)) * x
     return np.asarray((start / root ** 2 - start) / (1.0 - start))
 
 
 def grow_logistically(x: Floats, rng: np.random.Generator) -> Floats:
-    """An S that would flatten at 1.15 to 1.6 times MaxBand."""
+    """An S-shaped curve that would flatten at 1.15 to 1.6 times MaxBand."""
     steep, middle = rng.uniform(4.0, 8.0), rng.uniform(0.4, 0.7)
     s = 1.0 / (1.0 + np.exp(-steep * (np.linspace(0.0, 1.5, 3000) - middle)))
     s = s - s[0]
@@ -83,14 +82,14 @@ def grow_logistically(x: Floats, rng: np.random.Generator) -> Floats:
 
 
 def grow_at_two_rates(x: Floats, rng: np.random.Generator) -> Floats:
-    """Two rates: the second, 1.5 to 4 times the first, begins somewhere in the middle of the life."""
-    at, ratio = rng.uniform(0.25, 0.6), rng.uniform(1.5, 4.0)
-    s = x + (ratio - 1.0) * np.maximum(x - at, 0.0)
+    """At two rates: the second one, 1.5 to 4 times the first, begins between 25 % and 60 % of the life."""
+    change, ratio = rng.uniform(0.25, 0.6), rng.uniform(1.5, 4.0)
+    s = x + (ratio - 1.0) * np.maximum(x - change, 0.0)
     return np.asarray(s / s[-1])
 
 
 def grow_by_jumps(x: Floats, rng: np.random.Generator) -> Floats:
-    """A gamma process: many small jumps, 60 of the mean size to MaxBand."""
+    """By a gamma process: many small jumps, of which 60 of the mean size reach MaxBand."""
     s = np.cumsum(rng.gamma(60.0 / len(x), size=len(x)))
     return np.asarray(s / s[-1])
 
@@ -102,14 +101,18 @@ LAWS = FITTED | OTHERS
 
 
 def simulate_unit(law: str, seed: int) -> Unit:
-    """A unit whose fault begins in the first third of the traces and ends at MaxBand after 15 to 40 more of them."""
+    """A unit whose fault grows from its onset to MaxBand within 15 to 40 traces.
+
+    The healthy time before the onset is up to 40 % of the time of growth.
+    """
     rng = np.random.default_rng([seed, 17])
     fault = (CLOGGING, FRICTION)[seed % 2]
     traces = int(rng.integers(15, 41))
     onset = INTERVAL * traces * rng.uniform(0.0, 0.4)
     life = INTERVAL * traces
-    course_t = np.concatenate([[0.0], onset + life * np.linspace(0.0, 1.0, FINE)])
-    shape = np.concatenate([[0.0], LAWS[law](np.linspace(0.0, 1.0, FINE), rng)])
+    x = np.linspace(0.0, 1.0, 4000)
+    course_t = np.concatenate([[0.0], onset + life * x])
+    shape = np.concatenate([[0.0], LAWS[law](x, rng)])
     course = fault.healthy + (fault.most - fault.healthy) * shape
     t = np.arange(0.0, onset + life, INTERVAL)
     t = np.sort(np.maximum(t + rng.uniform(-2.0, 2.0, len(t)), 0.0))
@@ -126,11 +129,11 @@ def simulate_healthy_unit(seed: int, traces: int = 25) -> Unit:
 
 
 def measure_sizes(fault: Fault, true: Floats, rng: np.random.Generator) -> tuple[Estimate, ...]:
-    """What the refinement would say of true sizes, shape (n,), in traces of one unit."""
+    """The sizes that `rig fdi` would give for true sizes, (n,), in traces of one unit."""
     error = ERRORS[fault.name]
     sigma = error.base + error.share * true
     own = rng.standard_normal()
     noise = np.sqrt(error.common) * own + np.sqrt(1.0 - error.common) * rng.standard_normal(len(true))
     found = np.maximum(true + sigma * noise, 0.0)  # neither size can be less
-    half = WIDTH * (error.base + error.share * found)
+    half = INTERVAL_95_SD * (error.base + error.share * found)
     return tuple(Estimate(float(x), max(float(x - h), 0.0), float(x + h)) for x, h in zip(found, half, strict=True))

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fdi.sources import digest, named
+from fdi.sources import hash_sources, import_function
 from rig.network.clock import WallClock
 from rig.studies.resumable.batch import Batch, BatchProgress, Workers, run_batch
 from rig.studies.resumable.row_file import Row, RowFile
@@ -86,7 +86,7 @@ def describe_crash(reason: str) -> dict[str, Any]:
 
 def prepare_case(seed: int, folder: Path) -> Path:
     """The folder with the traces of a seed; they are made if they are missing."""
-    target = folder / f"cases-{digest(*CASE_SOURCES)[:8]}" / f"{seed:05d}"
+    target = folder / f"cases-{hash_sources(*CASE_SOURCES)[:8]}" / f"{seed:05d}"
     if not target.exists():
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
@@ -115,9 +115,9 @@ def load_explain(name: str) -> Explain:
     Raises:
         InputError: there is no such function.
     """
-    return named(name, "the blind trial", "an explanation")
+    return import_function(name, "the blind trial", "an explanation")
 
 
 def hash_trial_sources() -> str:
     """A hash of all code and data that an answer depends on."""
-    return digest("plant", "fdi", *CASE_SOURCES)
+    return hash_sources("plant", "fdi", *CASE_SOURCES)
