@@ -289,7 +289,7 @@ class Event(NamedTuple):
     excess: float  # furthest beyond the band, m or m/s
 
 
-class Judged(NamedTuple):
+class BandVerdict(NamedTuple):
     """What the bands say. A fault whose sections the command lacks, or the trace lost, has no level."""
 
     levels: Mapping[str, Level]  # by the effect's name
@@ -301,7 +301,7 @@ class Judged(NamedTuple):
 
 
 def judge_trace(source: Trace, bands: Bands | None = None, model: Model | None = None,
-                progress: Progress = ignore_progress, where: object = "trace") -> Judged:
+                progress: Progress = ignore_progress, where: object = "trace") -> BandVerdict:
     """Judge a trace; rows that its preparation found unusable are left out.
 
     Without `bands` the preflight's own are taken if they are of this command, load and model. Otherwise bands are
@@ -321,7 +321,7 @@ def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
 
 
 def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,
-                   where: object = "trace", parts: list[Section] | None = None) -> Judged:
+                   where: object = "trace", parts: list[Section] | None = None) -> BandVerdict:
     """Judge a command and sensed position, (n,) m, NaN where missing, one row per `period` s from `t0` s.
 
     `parts` are the command's sections, for callers that judge many runs of one command.
@@ -340,7 +340,7 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
     events = sorted((event for e in found for event in _find_events(e, t0, period)), key=lambda event: event.t_in)
     levels, severity = {}, {}
     for fault in FAULTS:
-        own = [e for e in found if e.fault == fault.name and e.signal == "position" and e.judged]
+        own = [e for e in found if e.fault == fault.name and e.signal == "position" and e.is_judged]
         if not own:
             reason = _explain_no_level(fault.name, found, friction, bands)
             notes.append(f"{fault.name} is not judged by bands: {reason}")
@@ -351,7 +351,7 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
         notes.append("the spool slips faster than its static friction accounts for: its dynamic friction is low")
     gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
     ruling = max(gone, key=lambda f: gone[f]) if gone else None
-    return Judged(levels, ruling, tuple(events), severity, friction, tuple(notes))
+    return BandVerdict(levels, ruling, tuple(events), severity, friction, tuple(notes))
 
 
 def _choose_level(left: set[str]) -> Level:
@@ -387,7 +387,7 @@ class Excursion(NamedTuple):
     fault: str
 
     @property
-    def judged(self) -> bool:
+    def is_judged(self) -> bool:
         """Whether a limit applies to known samples for as long as an event lasts."""
         limited = np.isfinite(self.departure) & np.isfinite(self.middle)
         return bool(find_lasting_peak(limited.astype(float)) > 0.0)

@@ -25,7 +25,7 @@ from plant.model import Model
 Floats = NDArray[np.float64]
 
 
-class Learnt(NamedTuple):
+class LearnerAnswer(NamedTuple):
     """A learner's answer on a trace, and its errors on units that it was not trained on."""
 
     method: str
@@ -94,7 +94,7 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     return Lesson(x[:-1], sizes[:, 0], sizes[:, 1], unseen, x[-1:])
 
 
-def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] = (24, 12)) -> Learnt:
+def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] = (24, 12)) -> LearnerAnswer:
     """A small multilayer perceptron on standardised precursors, trained on Kintas and ln FSS."""
     from sklearn.neural_network import MLPRegressor
 
@@ -113,11 +113,11 @@ def train_neural_network(data: Lesson, seed: int = 0, neurons: tuple[int, ...] =
     right = {CLOGGING.name: _count_right(CLOGGING, k, data.kintas[data.unseen]),
              FRICTION.name: _count_right(FRICTION, f, data.fss[data.unseen])}
     levels = {CLOGGING.name: classify_size(CLOGGING, own_k), FRICTION.name: classify_size(FRICTION, own_f)}
-    return Learnt("neural network", own_k, own_f, levels, _compute_rms(k - data.kintas[data.unseen]),
+    return LearnerAnswer("neural network", own_k, own_f, levels, _compute_rms(k - data.kintas[data.unseen]),
                   _compute_rms(f - data.fss[data.unseen]), right, len(data.x))
 
 
-def train_logistic_regression(data: Lesson, seed: int = 0) -> Learnt:
+def train_logistic_regression(data: Lesson, seed: int = 0) -> LearnerAnswer:
     """Multinomial logistic regression on standardised precursors and their products, one for each fault's levels."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.preprocessing import PolynomialFeatures, StandardScaler
@@ -131,7 +131,7 @@ def train_logistic_regression(data: Lesson, seed: int = 0) -> Learnt:
         right[fault.name] = float(np.mean(learner.predict(data.x[data.unseen]) == true[data.unseen]))
         levels[fault.name] = Level(int(learner.predict(data.own)[0]))
     unknown = float("nan")
-    return Learnt("logistic regression", unknown, unknown, levels, unknown, unknown, right, len(data.x))
+    return LearnerAnswer("logistic regression", unknown, unknown, levels, unknown, unknown, right, len(data.x))
 
 
 LEARNERS = {"neural network": train_neural_network, "logistic regression": train_logistic_regression}

@@ -3,15 +3,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from fdi.diagnosis.bands import Bands, Event, Judged, is_loaded, is_nominal_plant, judge_trace, matches_command
+from fdi.diagnosis.bands import Bands, BandVerdict, Event, is_loaded, is_nominal_plant, judge_trace, matches_command
 from fdi.diagnosis.bands_file import load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
 from fdi.diagnosis.precursors import Precursor, measure_precursors
-from fdi.diagnosis.refine import COARSE_STARTS, LARGEST_FSS, LARGEST_KINTAS, Refined, get_positive, refine_sizes
+from fdi.diagnosis.refine import COARSE_STARTS, LARGEST_FSS, LARGEST_KINTAS, Refinement, get_positive, refine_sizes
 from fdi.diagnosis.rms_grid import Grid, search_grid
 from fdi.estimation.noise import sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
@@ -41,10 +41,10 @@ class Diagnosis:
     levels: Mapping[str, Level | None]  # by fault; None: cannot be judged
     ruling: str | None  # the fault that is further gone; None if neither is
     sizes: Mapping[str, Estimate]  # by fault, Kintas and N, as the levels are judged by them
-    refined: Refined
+    refinement: Refinement
     grid: Grid | None  # None: the command has neither steps nor ramps
     precursors: Mapping[str, Precursor]
-    judged: Judged | None  # the verdict of the bands; None: there are none of this command
+    band_verdict: BandVerdict | None  # None: there are no bands of this command
     others: Mapping[str, Estimate]  # suspects outside the healthy range, by parameter, SI
     trace: Trace  # prepared for replay
     model: Model  # at the cycle of the trace
@@ -55,10 +55,10 @@ class Diagnosis:
     @property
     def events(self) -> tuple[Event, ...]:
         """Stays outside the bands."""
-        return self.judged.events if self.judged else ()
+        return self.band_verdict.events if self.band_verdict else ()
 
     @property
-    def passed(self) -> bool:
+    def is_acceptable(self) -> bool:
         """Whether both faults are known to be acceptable."""
         return self.verdict == "ACCEPTABLE"
 
@@ -89,27 +89,25 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
     notes = list(trace.notes)
     progress("bands", 0.25)
-    bands, judged, seen = _judge_by_bands(trace, model, bands, notes)
+    if bands is None:
+        bands = _find_own_bands(trace, model, notes)
+    band_verdict = None
+    if bands is not None:
+        band_verdict = judge_trace(trace, bands, model)
+        notes += band_verdict.notes
+    precursors = measure_precursors(trace, bands)
     progress("grid", 0.5)
     grid = _search_grid(trace, model, notes)
     progress("refinement", 0.75)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
-    found = refine_sizes(model, trace, (*_list_starts(grid), *COARSE_STARTS), floor, workers)
+    refinement = refine_sizes(model, trace, (*_list_starts(grid), *COARSE_STARTS), floor, workers)
+    sizes = _widen_intervals(refinement)
+    levels = _judge_sizes(sizes, refinement)
     progress("done", 1.0)
-    return _conclude(Diagnosis(source, "", {}, None, {}, found, grid, seen, judged, {}, trace, model, floor, bands,
-                               tuple(notes)))
-
-
-def _judge_by_bands(trace: Trace, model: Model, bands: Bands | None, notes: list[str]
-                    ) -> tuple[Bands | None, Judged | None, dict[str, Precursor]]:
-    """Bands, their verdict, and the precursors."""
-    if bands is None:
-        bands = _find_own_bands(trace, model, notes)
-    judged = None
-    if bands is not None:
-        judged = judge_trace(trace, bands, model)
-        notes += judged.notes
-    return bands, judged, measure_precursors(trace, bands)
+    return Diagnosis(source=source, verdict=_decide_verdict(levels, refinement.is_explained), levels=levels,
+                     ruling=find_ruling_fault(sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
+                     precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
+                     trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes))
 
 
 def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:
@@ -147,24 +145,31 @@ def _list_starts(grid: Grid | None) -> list[tuple[float, float]]:
     return [(grid.merged.kintas, grid.merged.fss), *((p.kintas, p.fss) for p in minima)]
 
 
-def _conclude(d: Diagnosis) -> Diagnosis:
-    """Levels, verdict, and what else is off."""
-    sizes = _widen_intervals(d.refined)
+def _judge_sizes(sizes: Mapping[str, Estimate], refinement: Refinement) -> dict[str, Level | None]:
+    """Level of each fault; where physics is missing in the fit, a fault is acceptable at most, or cannot be judged."""
     levels = {f.name: judge_size(f, sizes[f.name]) for f in FAULTS}
-    is_useless = max(d.refined.ratio.values()) > RESIDUAL_JUDGES_NOTHING
-    if not d.refined.reached:
-        kept = () if is_useless else (Level.ACCEPTABLE,)
-        levels = {name: found if found in kept else None for name, found in levels.items()}
-    others = {}
-    if not is_useless:
-        others = {name: e for name, e in d.refined.others.items() if _is_unhealthy(name, e, d.model)}
-    return replace(d, levels=levels, sizes=sizes, ruling=find_ruling_fault(sizes, levels), others=others,
-                   verdict=_decide_verdict(levels, d.refined.reached))
+    if refinement.is_explained:
+        return levels
+    if _is_useless(refinement):
+        return dict.fromkeys(levels)
+    return {name: level if level == Level.ACCEPTABLE else None for name, level in levels.items()}
 
 
-def _widen_intervals(found: Refined) -> dict[str, Estimate]:
+def _is_useless(refinement: Refinement) -> bool:
+    """Whether the fit leaves so much that it says nothing of any size."""
+    return max(refinement.ratio.values()) > RESIDUAL_JUDGES_NOTHING
+
+
+def _find_unhealthy(refinement: Refinement, model: Model) -> dict[str, Estimate]:
+    """The suspects outside the healthy range, by parameter."""
+    if _is_useless(refinement):
+        return {}
+    return {name: e for name, e in refinement.others.items() if _is_unhealthy(name, e, model)}
+
+
+def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
     """The sizes of both faults; where more than noise is left, their intervals are wider by as much."""
-    wider = 1.0 if found.reached else max(found.ratio.values())
+    wider = 1.0 if found.is_explained else max(found.ratio.values())
 
     def widen(e: Estimate, most: float) -> Estimate:
         low, high = e.value - wider * (e.value - e.low), e.value + wider * (e.high - e.value)
@@ -173,9 +178,9 @@ def _widen_intervals(found: Refined) -> dict[str, Estimate]:
     return {CLOGGING.name: widen(found.kintas, LARGEST_KINTAS), FRICTION.name: widen(found.fss, LARGEST_FSS)}
 
 
-def _decide_verdict(levels: Mapping[str, Level | None], reached: bool) -> str:
+def _decide_verdict(levels: Mapping[str, Level | None], is_explained: bool) -> str:
     known = [found for found in levels.values() if found is not None]
-    if not reached:
+    if not is_explained:
         return "SOMETHING_ELSE"
     worst = max(known, default=Level.ACCEPTABLE)
     if worst > Level.ACCEPTABLE:

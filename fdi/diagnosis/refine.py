@@ -171,7 +171,7 @@ def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping
 # ---------------------------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class Refinement:
     """What the refinement found."""
 
     kintas: Estimate
@@ -190,7 +190,7 @@ class Refined:
         return {name: self.errors[name] / self.floor[name] for name in self.errors}
 
     @property
-    def reached(self) -> bool:
+    def is_explained(self) -> bool:
         """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
         usual = compute_typical_rms(self.fit.residuals)
         near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
@@ -221,7 +221,7 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
 
 
 def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
-                 floor: Mapping[str, float] | None = None, workers: int = 2) -> Refined:
+                 floor: Mapping[str, float] | None = None, workers: int = 2) -> Refinement:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
@@ -384,7 +384,7 @@ def _learn_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     return replace(problem, noise=tuple(learnt), _lanes={})
 
 
-def _report_fit(last: Fit, problem: CountedProblem) -> Refined:
+def _report_fit(last: Fit, problem: CountedProblem) -> Refinement:
     outputs = problem.trace.outputs
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
@@ -392,7 +392,7 @@ def _report_fit(last: Fit, problem: CountedProblem) -> Refined:
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
-    return Refined(estimate_parameter(last, CLOGGING.parameter),
+    return Refinement(estimate_parameter(last, CLOGGING.parameter),
                    estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
                    {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
                    sum(problem.counts))

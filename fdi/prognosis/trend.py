@@ -33,11 +33,11 @@ class Remaining(NamedTuple):
     value: float  # median
     low: float
     high: float
-    drawn: Floats  # as many equally probable times
+    draws: Floats  # equally probable times
 
     def within(self, t: float) -> float:
         """Probability that the limit is reached within t."""
-        return float((self.drawn <= t).mean())
+        return float((self.draws <= t).mean())
 
 
 class Curve(NamedTuple):
@@ -133,16 +133,16 @@ def _draw_paths(found: Cleaned, posterior: Posterior, own: remaining_life.UnitEr
     return remaining_life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
 
-def _summarise_draws(drawn: Floats) -> Estimate:
-    low, value, high = np.quantile(drawn, [0.025, 0.5, 0.975], method="nearest")
+def _summarise_draws(draws: Floats) -> Estimate:
+    low, value, high = np.quantile(draws, [0.025, 0.5, 0.975], method="nearest")
     return Estimate(float(value), float(low), float(high))
 
 
 def _summarise_remaining(limit: float, fault: Fault, unit: float, paths: remaining_life.Paths, span: float
                          ) -> Remaining:
-    drawn = remaining_life.find_first_passage(paths, (limit - fault.healthy) / unit) * span
-    value, low, high = _summarise_draws(drawn)
-    return Remaining(limit, value, low, high, drawn)
+    draws = remaining_life.find_first_passage(paths, (limit - fault.healthy) / unit) * span
+    value, low, high = _summarise_draws(draws)
+    return Remaining(limit, value, low, high, draws)
 
 
 def _make_forecast(fault: Fault, unit: float, paths: remaining_life.Paths, start: float, span: float) -> Curve:

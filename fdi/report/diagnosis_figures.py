@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import (
     Bands,
+    BandVerdict,
     Event,
-    Judged,
     RampBand,
     StepBand,
     Width,
@@ -38,7 +38,7 @@ UM, MM, MS = 1e6, 1e3, 1e3
 ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
 
 
-def overview(trace: Trace, judged: Judged) -> str:
+def overview(trace: Trace, judged: BandVerdict) -> str:
     """Command and position of the whole trace, the stays outside the bands shaded."""
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 2.4), layout="constrained")
@@ -53,7 +53,7 @@ def overview(trace: Trace, judged: Judged) -> str:
         return to_svg(figure, "overview")
 
 
-def steps(trace: Trace, bands: Bands, judged: Judged) -> str:
+def steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
     """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
     if not bands.steps:
         return ""
@@ -71,7 +71,7 @@ def steps(trace: Trace, bands: Bands, judged: Judged) -> str:
         return to_svg(figure, "steps")
 
 
-def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: Judged) -> None:
+def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: BandVerdict) -> None:
     xj, t = trace.measured("xj"), step.t * MS
     centre, spread = step.centre(judged.friction, bands.friction)
     middle, most, there = bands.margins(step, spread)
@@ -90,7 +90,7 @@ def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judg
     ax.set_ylabel("off the healthy\nresponse [µm]")
 
 
-def ramps(trace: Trace, bands: Bands, judged: Judged) -> str:
+def ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
     """Each judged ramp: following error and speed within their limits, and events."""
     if not bands.ramps:
         return ""
@@ -106,7 +106,7 @@ def ramps(trace: Trace, bands: Bands, judged: Judged) -> str:
         return to_svg(figure, "ramps")
 
 
-def _ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: Judged) -> None:
+def _ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: BandVerdict) -> None:
     rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
     error = way * (trace.com[rows] - xj[rows])
     fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
@@ -150,7 +150,7 @@ def _shade(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal:
                            zorder=-1)
 
 
-def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: Judged | None) -> str:
+def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerdict | None) -> str:
     """Both faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
     marks: dict[str, list[tuple[str, Estimate]]] = {}
     for fault in (CLOGGING, FRICTION):

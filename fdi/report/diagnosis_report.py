@@ -120,7 +120,7 @@ def format_limits_of_fault(fault: Fault) -> tuple[str, str]:
 
 def describe_residual(d: Diagnosis) -> str:
     """The residual of the best fit: "XJ 1.00, P12 1.02 times the noise floor"."""
-    ratios = ", ".join(f"{SIGNAL_NAMES[s]} {format_ratio(ratio)}" for s, ratio in d.refined.ratio.items())
+    ratios = ", ".join(f"{SIGNAL_NAMES[s]} {format_ratio(ratio)}" for s, ratio in d.refinement.ratio.items())
     return f"{ratios} times the noise floor"
 
 
@@ -128,7 +128,7 @@ def describe_overruled_bands(d: Diagnosis) -> list[str]:
     """A sentence for each fault that the fit judges better than the bands do: which result to trust, and why."""
     sentences = []
     for fault in FAULTS:
-        by_bands = d.judged.levels.get(fault.name) if d.judged else None
+        by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
         level = d.levels[fault.name]
         if by_bands is not None and level is not None and by_bands > level:
             others = "; ".join(describe_deviation(name, size) for name, size in d.others.items())
@@ -176,7 +176,7 @@ def _show_faults(d: Diagnosis) -> list[Item]:
     def draw() -> str:
         from fdi.report import diagnosis_figures  # here: matplotlib takes half a second to import
 
-        return diagnosis_figures.estimates(d.sizes, d.grid, d.judged)
+        return diagnosis_figures.estimates(d.sizes, d.grid, d.band_verdict)
 
     return [Table(columns, rows, caption),
             Figure("Each estimate of the two sizes over the three levels: green acceptable, amber maintenance, red "
@@ -185,7 +185,7 @@ def _show_faults(d: Diagnosis) -> list[Item]:
 
 def _list_fault_cells(d: Diagnosis, fault: Fault) -> list[Cell | str]:
     level = d.levels[fault.name]
-    by_bands = d.judged.levels.get(fault.name) if d.judged else None
+    by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
     at_grid = float(getattr(d.grid.merged, fault.symbol)) if d.grid else math.nan
     unit = "" if fault.unit == "1" or d.grid is None else f" {fault.unit}"
     mark = " *" if d.ruling == fault.name else ""
@@ -196,7 +196,7 @@ def _list_fault_cells(d: Diagnosis, fault: Fault) -> list[Cell | str]:
 
 
 def _draw_bands(d: Diagnosis) -> list[Item]:
-    judged, bands = d.judged, d.bands
+    judged, bands = d.band_verdict, d.bands
     if judged is None:
         return []
 
@@ -220,7 +220,7 @@ def _draw_bands(d: Diagnosis) -> list[Item]:
 
 
 def _tabulate_events(d: Diagnosis) -> list[Item]:
-    if d.judged is None:
+    if d.band_verdict is None:
         return []
     if not d.events:
         return [Paragraph("None: the response stays within MidBand.", medium=Medium.PAGE)]
@@ -315,8 +315,8 @@ def _format_deviation(x: float) -> str:
 def _describe_fit(d: Diagnosis) -> list[Item]:
     lines: list[Item] = [
         Line("residual", describe_residual(d)),
-        Line("fit", f"{d.refined.method}, {d.refined.simulations} simulations; correlation of the two sizes "
-                    f"{d.refined.correlation:+.2f}")]
+        Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; correlation of the two sizes "
+                    f"{d.refinement.correlation:+.2f}")]
     return [*lines, *(Line("deviation", describe_deviation(name, size)) for name, size in d.others.items())]
 
 
@@ -329,22 +329,22 @@ def _list_bands_provenance(d: Diagnosis) -> list[Item]:
 
 def collect_data(d: Diagnosis) -> dict[str, Any]:
     """The answer of `rig fdi --json`; SI units."""
-    g, r = d.grid, d.refined
+    g, r = d.grid, d.refinement
     return {
         "verdict": d.verdict, "sentence": describe_verdict(d),
         "level": {name: level.word if level is not None else None for name, level in d.levels.items()},
         "ruling": d.ruling,
         "severity": {f.name: compute_severity(f, d.sizes[f.name].value) for f in FAULTS},
         "events": [e._asdict() for e in d.events],
-        "bands": {"level": {name: level.word for name, level in d.judged.levels.items()}, "ruling": d.judged.ruling}
-        if d.judged else None,
+        "bands": {"level": {name: level.word for name, level in d.band_verdict.levels.items()},
+                  "ruling": d.band_verdict.ruling} if d.band_verdict else None,
         "precursors": {name: p._asdict() for name, p in d.precursors.items()},
         "grid": {"step": _collect_point(g.step and g.step.minimum), "ramp": _collect_point(g.ramp and g.ramp.minimum),
                  "joint": _collect_point(g.joint.minimum), "merged": g.merged._asdict(), "simulations": g.simulations}
         if g else None,
         "refined": {"kintas": d.sizes[CLOGGING.name]._asdict(), "fss": d.sizes[FRICTION.name]._asdict(),
                     "correlation": r.correlation, "method": r.method, "simulations": r.simulations,
-                    "reached": r.reached},
+                    "reached": r.is_explained},
         "signals": {s: {"error": r.errors[s], "floor": r.floor[s], "ratio": r.ratio[s]} for s in r.errors},
         "others": {name: {**e._asdict(), "unhealthy": name in d.others} for name, e in r.others.items()},
         "notes": list(d.notes),

@@ -88,7 +88,7 @@ def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Tr
     Returns:
         SVG, or "" where there is no such section.
     """
-    chosen = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.judged]
+    chosen = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.is_judged]
     if not chosen:
         return ""
     with rc_context(STYLE):

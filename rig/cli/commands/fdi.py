@@ -63,7 +63,7 @@ def run_command(args: argparse.Namespace) -> int:
             progress("writing", 0.0)
             write_answer(report, out)
     show_answer(report, args)
-    return 0 if diagnosis.passed else 1
+    return 0 if diagnosis.is_acceptable else 1
 
 
 def apply_other_methods(args: argparse.Namespace, diagnosis: Diagnosis, progress: Progress) -> list[Row]:

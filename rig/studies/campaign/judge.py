@@ -28,16 +28,16 @@ def judge_by_fdi(trace: Trace, model: Model) -> dict[str, Any]:
         size = found.sizes[fault.name]
         row[f"level_{fault.name}"] = _format_level(found.levels[fault.name])
         row |= {fault.symbol: size.value, f"{fault.symbol}_low": size.low, f"{fault.symbol}_high": size.high}
-    if found.judged is not None:
-        levels, by = found.judged.levels, found.judged.severity
+    if found.band_verdict is not None:
+        levels, by = found.band_verdict.levels, found.band_verdict.severity
         row |= {f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in FAULTS}
         row |= {f"severity_{fault.name}": by[fault.name] for fault in FAULTS if fault.name in by}
     if found.grid is not None:
         row |= {"grid_kintas": found.grid.merged.kintas, "grid_fss": found.grid.merged.fss}
     return row | {
         "events": [event._asdict() for event in found.events], "event_count": len(found.events),
-        "correlation": found.refined.correlation, "left_over": max(found.refined.ratio.values()),
-        "simulations": found.refined.simulations, "others": sorted(found.others),
+        "correlation": found.refinement.correlation, "left_over": max(found.refinement.ratio.values()),
+        "simulations": found.refinement.simulations, "others": sorted(found.others),
         "precursors": {name: precursor.value for name, precursor in found.precursors.items()},
         "notes": list(found.notes)}
 

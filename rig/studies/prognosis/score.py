@@ -50,8 +50,8 @@ def predict_unit(unit: Unit, traces: int) -> Prediction:
     trend = fit_trend(unit.fault, list(unit.t[:traces]), unit.sizes[:traces])
     if not trend.remaining:
         return Prediction(False, np.full(2, np.inf), np.full(2, np.inf))
-    return Prediction(trend.verdict == "TREND", trend.remaining["maintenance"].drawn,
-                      trend.remaining["non_nominal"].drawn)
+    return Prediction(trend.verdict == "TREND", trend.remaining["maintenance"].draws,
+                      trend.remaining["non_nominal"].draws)
 
 
 def score_unit(unit: Unit, predict: Predict = predict_unit, every: int = 2) -> Score:

@@ -12,7 +12,7 @@ import pytest
 from fdi.diagnosis import bands as judging
 from fdi.diagnosis.bands import (
     Bands,
-    Judged,
+    BandVerdict,
     check_command,
     find_stays,
     judge_position,
@@ -52,11 +52,11 @@ def units(clogging: float = NAN, friction: float = NAN, sliding: float = 1 / 1.5
     return simulate_units(load_model(), com, np.zeros_like(com), kind, count, seed=4321)
 
 
-def judged(x: np.ndarray, bands: Bands | None = None) -> Judged:
+def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
     return judge_position(command(), x, 1e-3, bands or load_default_bands(), parts=parts())
 
 
-def levels(found: list[Judged], fault: str) -> list[Level | None]:
+def levels(found: list[BandVerdict], fault: str) -> list[Level | None]:
     return [j.levels.get(fault) for j in found]
 
 

@@ -10,7 +10,7 @@ from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level, compute_se
 from fdi.diagnosis.refine import (
     LARGEST_FSS,
     LARGEST_KINTAS,
-    Refined,
+    Refinement,
     list_unknowns,
     make_problem,
     make_start,
@@ -32,19 +32,19 @@ def faulty(kintas: float, fss: float, **more: float) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def off_grid() -> Refined:
+def off_grid() -> Refinement:
     return refine_sizes(MODEL, hold_inputs(recorded(faulty(0.17, 45.0))))
 
 
-def test_a_pair_between_the_cells_of_a_grid(off_grid: Refined) -> None:
+def test_a_pair_between_the_cells_of_a_grid(off_grid: Refinement) -> None:
     """(0.17, 9 FSS_NC), no scatter: Kintas within 5 %, FSS within 2 %."""
-    assert off_grid.reached and off_grid.simulations > 300
+    assert off_grid.is_explained and off_grid.simulations > 300
     assert off_grid.kintas.value == pytest.approx(0.17, rel=0.05)
     assert off_grid.fss.value == pytest.approx(45.0, rel=0.02)
     assert off_grid.kintas.low < 0.17 < off_grid.kintas.high and off_grid.fss.low < 45.0 < off_grid.fss.high
 
 
-def test_tolerances_decide_how_wide_an_interval_is(off_grid: Refined) -> None:
+def test_tolerances_decide_how_wide_an_interval_is(off_grid: Refinement) -> None:
     """A gain of 1.5 % is 3 % of what the filter lets through, as flow goes with its square root."""
     spread = (off_grid.kintas.high - off_grid.kintas.low) / 2 / 1.96 / (1 - off_grid.kintas.value)
     assert spread == pytest.approx(2 * 0.015, rel=0.1)
@@ -60,7 +60,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     trace = recorded({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
     found = refine_sizes(MODEL, hold_inputs(trace))
     true = case.effects[0].value
-    assert found.reached and found.fss.low * 0.98 < true < found.fss.high * 1.02
+    assert found.is_explained and found.fss.low * 0.98 < true < found.fss.high * 1.02
     assert found.kintas.low == pytest.approx(0.0, abs=0.03) and found.kintas.high < 0.2
 
 
@@ -70,7 +70,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     ({"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}, "jack.dynamic_friction", 1000.0)])
 def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], name: str, value: float) -> None:
     found = refine_sizes(MODEL, hold_inputs(recorded(settings)))
-    assert found.reached
+    assert found.is_explained
     assert judge_size(CLOGGING, found.kintas) == judge_size(FRICTION, found.fss) == Level.ACCEPTABLE
     other = found.others[name]
     assert other.value == pytest.approx(value, rel=0.05) and abs(other.high - other.low) < 0.5 * abs(value)
@@ -87,7 +87,7 @@ def test_flat_directions_change_no_signal() -> None:
     assert moved[:4].max() < 100 and moved[4 + [f.name for f in free].index("pilot.flow_gain")] > 1000
 
 
-def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refined) -> None:
+def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refinement) -> None:
     problem, found = make_problem(MODEL, hold_inputs(recorded({}))), off_grid.fit
     flat = find_flat_directions(problem, found.free, found.x)
     here = linearise_across(problem, found.free, found.x, found.covariance, flat)
@@ -134,6 +134,6 @@ def test_a_fit_that_ends_behind_a_ridge_begins_again_from_the_other_side(seed: i
     """Strongly clogged units with scatter, which a first descent leaves at up to 3.5 times the noise."""
     drawn = build_matrix({"case": [{"filter_clogging": 0.35}], "seeds": 1, "first": seed}, MODEL, "", "test")
     found = diagnose(simulate_case(drawn.cases[0], drawn.spec, MODEL))
-    assert found.refined.reached and found.levels[CLOGGING.name] == Level.NON_NOMINAL
-    assert found.refined.kintas.low < 0.35 < found.refined.kintas.high
+    assert found.refinement.is_explained and found.levels[CLOGGING.name] == Level.NON_NOMINAL
+    assert found.refinement.kintas.low < 0.35 < found.refinement.kintas.high
     assert found.levels[FRICTION.name] == Level.ACCEPTABLE

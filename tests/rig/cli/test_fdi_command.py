@@ -70,7 +70,7 @@ def other_command(folder: Path) -> Diagnosis:
 
 def test_another_command_is_judged_without_bands(other_command: Diagnosis) -> None:
     assert other_command.levels == {CLOGGING.name: Level.ACCEPTABLE, FRICTION.name: Level.MAINTENANCE}
-    assert other_command.judged is None and other_command.events == ()
+    assert other_command.band_verdict is None and other_command.events == ()
     assert any(note.startswith("no bands") for note in other_command.notes)
     assert other_command.sizes[FRICTION.name].value == pytest.approx(45.0, rel=0.06)
 
@@ -90,7 +90,7 @@ def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: 
 def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     """Spool and ram see a lag of the transducer that no fault and no tolerance explains."""
     found = diagnose(recorded({"sensor_lag.time": 3e-3}, SHORT))
-    assert found.verdict == "SOMETHING_ELSE" and not found.passed and found.ruling is None
+    assert found.verdict == "SOMETHING_ELSE" and not found.is_acceptable and found.ruling is None
     assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
     assert "Something else is wrong" in describe_verdict(found)
 
