@@ -81,7 +81,7 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     try:
         assert load_effects(tmp_path / "my_effects.py") == ["seal_drag", "rod_play"]
         said = rig("effects", "--effects", tmp_path / "my_effects.py", "seal_drag")
-        assert said.status == 0 and "sound seal_drag" in said.out
+        assert said.status == 0 and "seal_drag: exact at its off value" in said.out
         for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):
             assert " ".join(row.split()) in " ".join(said.out.split())
         command = np.full(100, 1e-3)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
+    """Add the options of `rig campaign`."""
     add = parser.add_argument
     add("what", nargs="?", metavar="MATRIX.toml|FOLDER",
         help="a matrix file, a shipped matrix by name (statistics), a folder of traces, or the folder of a campaign "

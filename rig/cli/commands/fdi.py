@@ -106,7 +106,7 @@ def learn_bands(args: argparse.Namespace) -> int:
     from fdi.report.diagnosis_report import build_bands_report
     from plant import InputError
     from rig.cli.answer import show_answer
-    from rig.cli.commands.simulate import command_of
+    from rig.cli.commands.simulate import load_command
     from rig.cli.progress_bar import show_progress
 
     if args.trace is not None:
@@ -114,7 +114,7 @@ def learn_bands(args: argparse.Namespace) -> int:
     if not args.out or Path(args.out).suffix != ".toml":
         raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
     model = options.model_of(args)
-    com, _, name = command_of(args.command_file, model["controller.period"])
+    com, _, name = load_command(args.command_file, model["controller.period"])
     with show_progress(is_silent=args.json or args.quiet) as progress:
         made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress)
     show_answer(build_bands_report(made), args)

@@ -2,20 +2,21 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
-    parser.add_argument("file", metavar="FILE", help="what to import")
-    parser.add_argument("--dbc", metavar="FILE", help="decodes the raw frames (default: the rig's own eha.dbc)")
+    """Add the options of `rig import`."""
+    parser.add_argument("file", metavar="FILE", help="a CSV of signals, or a CAN log: .log (candump), .blf, .asc, .trc")
+    parser.add_argument("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the shipped eha.dbc)")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: FILE with .mcap in place of its suffix)."""
     import dbc
+    from fdi.report.report import Report
     from plant.errors import InputError
+    from rig.cli.answer import show_answer
     from rig.recorder.convert import RAW, import_csv, import_frames
 
     source = Path(args.file)
@@ -24,8 +25,6 @@ def run_command(args: argparse.Namespace) -> int:
     if not csv and source.suffix not in RAW:
         raise InputError(source, "", f"a file that ends in .csv, .csv.gz, {', '.join(RAW)}")
     cycles = import_csv(source, out) if csv else import_frames(source, out, Path(args.dbc) if args.dbc else dbc.DBC)
-    if args.json:
-        print(json.dumps({"trace": str(out), "cycles": cycles}))
-    elif not args.quiet:
-        print(f"{out}: {cycles} cycles")
+    data = {"trace": str(out), "cycles": cycles}
+    show_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles", data=data), args)
     return 0

@@ -13,18 +13,19 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
-    parser.add_argument("node", choices=("plant", "controller"), help="which node to be")
+    """Add the options of `rig node`."""
+    parser.add_argument("node", choices=("plant", "controller"),
+                        help="plant: the plant emulator, node 3; controller: the reference firmware, node 2")
     parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
-                        help="such as socketcan:vcan0 or udp_multicast (default: what EHA_RIG_BUS names)")
-    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # ends when this process does
+                        help="for example socketcan:vcan0 or udp_multicast (default: the value of EHA_RIG_BUS)")
+    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # the node ends when this process ends
     options.add_model(parser)
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Be the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it.
+    """Run the plant emulator (node 3) or the reference firmware (node 2) until a signal ends it.
 
-    --model, --set and --seed are what it is until a rig loads something else, for a bus with another master.
+    It runs with --model, --set and --seed until a rig loads another scenario.
     """
     import signal
 
@@ -39,7 +40,7 @@ def run_command(args: argparse.Namespace) -> int:
     bus, _ = choose(args.bus)
     if bus.partition(":")[0] in EMBEDDED:
         raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
-    make = maker(args)
+    make = choose_node(args)
     clock = WallClock()
     link = Link(open_can(bus), clock.now)
     ended: list[int] = []
@@ -54,13 +55,13 @@ def run_command(args: argparse.Namespace) -> int:
     finally:
         link.close()
     if not args.quiet:
-        print(f"{args.node}: frames lost on the way in {link.overflows}, not sent {link.unsent}, "
+        print(f"{args.node}: incoming frames lost {link.overflows}, not sent {link.unsent}, "
               f"error frames {link.error_frames}")
     return 0
 
 
-def maker(args: argparse.Namespace) -> Callable[[Send], Node]:
-    """What builds the node that the options describe."""
+def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
+    """A function that builds the node which the options describe."""
     from rig.nodes.emulator import Emulator
     from rig.nodes.firmware import Firmware, gains_of
     from rig.nodes.scenario import Scenario, require_servovalve

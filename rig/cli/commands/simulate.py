@@ -2,32 +2,34 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from rig.cli import options
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
+    """Add the options of `rig simulate`."""
     options.add_model(parser)
     parser.add_argument("--command", dest="command_file", metavar="FILE",
-                        help="CSV with t,com and optionally load; default: the main phase of preflight. Of rows up to "
+                        help="CSV with t,com and optionally load (default: the main phase of preflight); of rows up to "
                              "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
     parser.add_argument("--steps", type=options.whole, default=None, metavar="N",
-                        help="plant steps a cycle (default 100)")
+                        help="steps of the plant per cycle (default 100)")
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Run a model closed loop over a command and write t,com,xj,cor,p12,xs,load (default: simulation.csv)."""
+    """Simulate a model in closed loop on a command; write t,com,xj,cor,p12,xs,load (default: simulation.csv)."""
     from pathlib import Path
 
+    from fdi.report.numbers import format_amount
+    from fdi.report.report import Report
     from fdi.trace.trace import Trace
     from plant import InputError, simulate
     from plant.model import STEPS
+    from rig.cli.answer import show_answer
 
     model = options.model_of(args)
-    com, load, name = command_of(args.command_file, model["controller.period"])
+    com, load, name = load_command(args.command_file, model["controller.period"])
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
@@ -45,16 +47,18 @@ def run_command(args: argparse.Namespace) -> int:
     error = columns.com - columns.xj
     summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * model["controller.period"],
                "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
-    if args.json:
-        print(json.dumps(summary))
-    elif not args.quiet:
-        print(f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
-              f"{summary['rms_error'] * 1e6:.1f} um RMS, {summary['max_error'] * 1e6:.0f} um at most")
+    sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
+                f"{format_amount(summary['rms_error'], 'm')} RMS, {format_amount(summary['max_error'], 'm')} at most")
+    show_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
     return 0
 
 
-def command_of(file: str | None, period: float) -> tuple[Any, Any, str]:
-    """Demand and load of every cycle of `period` s, and what to call them."""
+def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
+    """Demand, m, and load, N, of every cycle of `period` s, and their name; by default those of preflight.
+
+    Raises:
+        InputError: a file that cannot be read.
+    """
     import numpy as np
 
     from plant.profile import on_cycles, read_command

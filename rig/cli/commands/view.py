@@ -2,27 +2,28 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this command alone."""
+    """Add the options of `rig view`."""
     parser.add_argument("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV")
-    parser.add_argument("--save", metavar="FILE.rrd", help="write the recording and do not open the viewer")
-    parser.add_argument("--headless", action="store_true", help="open no window; with --screenshot")
+    parser.add_argument("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it")
+    parser.add_argument("--headless", action="store_true", help="open no window (together with --screenshot)")
     parser.add_argument("--screenshot", metavar="FILE.png",
-                        help="draw without a display, check that every view holds its lines, save the picture")
+                        help="draw without a display, check that every view shows its lines, and save the picture")
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Open the viewer on 127.0.0.1, or do what --save and --screenshot say."""
+    """Open the viewer on 127.0.0.1, or write what --save and --screenshot ask for."""
     from plant.errors import InputError
 
     if args.headless and not args.screenshot:
         raise InputError("--headless", "", "--screenshot FILE.png with it")
     from fdi.output import writable
+    from fdi.report.report import Report
     from fdi.trace.trace import Trace
+    from rig.cli.answer import show_answer
     from rig.view import rerun_log, viewer
 
     source = Path(args.trace)
@@ -43,8 +44,6 @@ def run_command(args: argparse.Namespace) -> int:
         answer["pixels"] = viewer.screenshot(trace, rrd, Path(args.screenshot))
     elif save is None:
         viewer.open_viewer(rrd)
-    if args.json:
-        print(json.dumps(answer))
-    elif not args.quiet:
-        print("\n".join(str(path) for path in (rrd, args.screenshot) if path))
+    written = "\n".join(str(path) for path in (rrd, args.screenshot) if path)
+    show_answer(Report("view", str(source), sentence=written, data=answer), args)
     return 0
