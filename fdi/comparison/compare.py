@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.comparison import blocks, controller_block
-from fdi.comparison.controller_block import ControllerBlock
+from fdi.comparison import blocks
+from fdi.comparison.blocks import ControllerBlock
 from fdi.comparison.localisation import Motion, Place, combine_residuals, describe_motion, find_condition, locate_error
 from fdi.comparison.residual_tests import ResidualTests, examine_residuals
 from fdi.estimation.noise import Floor, find_floors, sensor_floors, simulate_reading_noise
-from fdi.estimation.preparation import match_period, prepare_trace
-from fdi.estimation.repeats import Repeat, align_columns, find_repeat
+from fdi.estimation.preparation import Repeat, align_columns, find_repeat, match_period, prepare_trace
 from fdi.estimation.replay import (
     Columns,
     Replay,
@@ -101,7 +100,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, signals, source)
     model = match_period(model, trace)
-    trace, found = _in_step(trace, model, controller_block.compare_controller(trace, model))
+    trace, found = _in_step(trace, model, blocks.compare_controller(trace, model))
     others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
     noise = sensor_floors(trace, model)
@@ -192,7 +191,7 @@ def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Re
 
 def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
     def limit(name: str) -> float:
-        return controller_block.DISAGREES if name == "controller" else BLOCK
+        return blocks.CONTROLLER_DISAGREES if name == "controller" else BLOCK
 
     over = [(ratio, name) for name, ratio in ratios.items() if ratio is not None and ratio > limit(name)]
     return tuple(name for _, name in sorted(over, reverse=True))
@@ -215,7 +214,7 @@ def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios
         if any(s.floor.lower_bound for s in table.values()) else \
         f"{100 * edgy:.0f} % of the trace {_hangs(replay)}" if edgy > UNDECIDED else ""
     sure = any(s.ratio > (BOUNDED if edgy > UNDECIDED or s.floor.lower_bound else 0.0) for s in above)
-    if doubt and not sure and (ratios["controller"] or 0.0) <= controller_block.DISAGREES:
+    if doubt and not sure and (ratios["controller"] or 0.0) <= blocks.CONTROLLER_DISAGREES:
         return "CANNOT_TELL", doubt
     return "MODEL_INCOMPLETE", ""
 

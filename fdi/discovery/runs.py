@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fdi.estimation.preparation import SAME_PERIOD, hold_inputs, match_period, prepare_trace
-from fdi.estimation.repeats import align_repeat, find_repeat
+from fdi.estimation.preparation import SAME_PERIOD, align_repeat, find_repeat, hold_inputs, match_period, prepare_trace
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.errors import InputError

@@ -1,13 +1,15 @@
-"""A recording made ready for replay: one row a controller cycle, inputs without gaps, unusable rows flagged.
+"""Recordings made ready for replay: one row a controller cycle, inputs without gaps, unusable rows flagged.
+
+A repeat of a test is found by its command, which is the same, and put on the rows of the first run.
 
 A recording that no replay can use is refused here in one line: no current, a dead sensor, millimetres for metres.
 """
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ STILL = 5e-5  # m; a ram that moves further than that moves every sensor
 LIMITS = (("xj", 3.0, "jack.travel"), ("com", 5.0, "jack.travel"), ("xs", 3.0, "spool.travel"),
           ("p12", 3.0, "supply.pressure"), ("cor", 20.0, "controller.current_limit"))  # signal, times, parameter
 FAINT = {"p12": 1e3, "xs": 1e-9}  # a signal whose range is smaller is in another unit
+SAME_DEMAND = 2e-6  # m; demands that differ by less are the same
 COLUMNS = ("t", "com", "cor", "load", *OUTPUTS, "phase", "usable", "filled", "incomplete")
 
 
@@ -292,3 +295,69 @@ def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
     k = np.arange(rows)
     parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
     return abs(float(parabola[1] @ first) / trace.period) > fast
+
+
+class Repeat(NamedTuple):
+    """A prepared repeat and its place: its row k corresponds to row k + `late` of the first run."""
+
+    trace: Trace
+    late: int
+
+
+def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Repeat:
+    """Prepare a repeat of the prepared run `first`, and find its place by its command.
+
+    Args:
+        first: the prepared run.
+        trace: the repeat as it was recorded.
+        model: as for `first`.
+        number: of the repeat, for error messages.
+        same_share: share of the rows in which both commands must be the same.
+
+    Raises:
+        InputError: another command, other cycles, or no signal in common.
+    """
+    source = f"--repeat {trace.provenance.get('source', number)}"
+    outputs = [name for name in first.outputs if name in trace.signals]
+    if not outputs:
+        raise InputError(source, ", ".join(first.outputs), "a signal that the trace has too")
+    ways = [way for way in read_cycles(trace, model, outputs, source) if way.period == first.period]
+    if not ways:
+        raise InputError(source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
+    repeat = ways[0]
+    for late in (0, _find_first_move(first.com) - _find_first_move(repeat.com)):
+        if _measure_agreement(first.com, repeat.com, late) >= same_share:
+            return Repeat(repeat, late)
+    raise InputError(source, "com", "the command of the trace it repeats; another command is no repeat")
+
+
+def _find_first_move(com: Floats) -> int:
+    return int(np.argmax(np.abs(com - com[0]) > SAME_DEMAND))
+
+
+def _measure_agreement(a: Floats, b: Floats, late: int, overlap: float = 0.5) -> float:
+    """The share of the common rows in which b, `late` rows later, is a; 0 if these are less than `overlap` of a."""
+    first, last = max(0, late), min(len(a), len(b) + late)
+    if last - first < overlap * len(a):
+        return 0.0
+    return float(np.mean(np.abs(a[first:last] - b[first - late:last - late]) <= SAME_DEMAND))
+
+
+def align_columns(columns: Mapping[str, Floats], late: int, rows: int) -> dict[str, Floats]:
+    """A repeat's columns on the `rows` of the first run, NaN where it has none."""
+    out = {}
+    for name, column in columns.items():
+        out[name] = np.full(rows, np.nan)
+        first, last = max(0, late), min(rows, len(column) + late)
+        out[name][first:last] = column[first - late:last - late]
+    return out
+
+
+def align_repeat(repeat: Repeat, rows: int) -> Trace:
+    """A repeat on the `rows` of the first run; before its own first row the ram rests, and nothing was measured."""
+    trace = repeat.trace
+    wanted = np.arange(rows) - repeat.late
+    place = np.clip(wanted, 0, len(trace) - 1)
+    columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in COLUMNS}
+    usable = (wanted == place) & trace.usable[place]
+    return replace(trace, **columns | {"usable": usable, "incomplete": columns["incomplete"] | ~usable})

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from fdi.comparison.blocks import CONTROLLER_DISAGREES
 from fdi.comparison.compare import BALANCED, BLOCK, Comparison, SignalError
-from fdi.comparison.controller_block import DISAGREES
 from fdi.comparison.residual_tests import LEAST_SHARE, ResidualTests
 from fdi.report import compare_figures
 from fdi.report.numbers import (
@@ -162,7 +162,7 @@ def _describe_controller(c: Comparison) -> str:
             if lag > 0]
     if lags:
         path += f" (from {' and '.join(lags)})"
-    if a.ratio <= DISAGREES:
+    if a.ratio <= CONTROLLER_DISAGREES:
         return f"{path}: equal to the last digit"
     found = f"{path}: error {1e6 * a.error:.3g} uA RMS, floor {1e6 * a.floor:.3g} uA"
     gain = c.model["controller.proportional_gain"]

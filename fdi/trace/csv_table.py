@@ -1,4 +1,4 @@
-"""A trace as plain CSV: SI units, one row per cycle, empty fields for missing samples."""
+"""CSV files of traces: SI units, one row per cycle, empty fields for missing samples; or a plant's own columns."""
 from __future__ import annotations
 
 import csv
@@ -6,25 +6,42 @@ import gzip
 import io
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
+from plant.plants import Plant, Table, Term, find, names
 
 Floats = NDArray[np.float64]
 
 
-def read_csv(path: Path, required: Iterable[str], optional: Iterable[str],
-             separator: str = ",") -> tuple[dict[str, Floats], tuple[str, ...]]:
-    """-> the known columns, shape (rows,), NaN where a field is empty; and the names of columns that are not known.
+class CsvColumns(NamedTuple):
+    """What a CSV file holds: known columns, shape (rows,), NaN where a field is empty; and the names of all others."""
+
+    columns: dict[str, Floats]
+    unknown: tuple[str, ...]
+    plant: Plant | None  # whose rig wrote the file in its own columns; None for a trace of this software
+
+
+def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> CsvColumns:
+    """Read a CSV of the columns `required` and `optional`, or of a plant's own rig, told by the names in its header.
 
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
     try:
         with open_text(path) as stream:
-            return _parse(path, csv.reader(stream, delimiter=separator), tuple(required), tuple(optional))
+            header = stream.readline()
+            plant = _find_recorder(header)
+            table = plant.table if plant else None
+            rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
+            if table is None:
+                return CsvColumns(*_parse(path, rows, tuple(required), tuple(optional)), None)
+            sources, unknown = _parse(path, rows, tuple(sorted(table.sources)), ())
+            return CsvColumns(_combine_columns(sources, table), unknown, plant)
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
     except (OSError, EOFError) as error:
@@ -88,3 +105,29 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     if math.isinf(value):
         raise InputError(f"{path}: line {line}", name, f"a finite number or an empty field, not {text!r}")
     return value
+
+
+def _find_recorder(header: str) -> Plant | None:
+    """The plant whose rig writes a CSV with this first line; None for a trace of this software or any other."""
+    for plant in map(find, names()):
+        if plant.table and plant.table.sources <= set(_split_header(header, plant.table)):
+            return plant
+    return None
+
+
+def _split_header(line: str, table: Table) -> list[str]:
+    return [name.strip() for name in next(csv.reader([line], delimiter=table.separator), [])]
+
+
+def _combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
+    """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
+    columns = {name: sum((_shift_term(sources, term) for term in terms), start=np.zeros(1))[table.skip:]
+               for name, terms in table.columns.items()}
+    if table.load:
+        columns["load"] = table.load(columns)
+    return columns
+
+
+def _shift_term(sources: Mapping[str, Floats], term: Term) -> Floats:
+    values = term.factor * sources[term.source]
+    return np.concatenate([values[term.later:], np.full(term.later, np.nan)])

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from fdi.trace.columns import shift_rows
 from fdi.trace.csv_table import read_csv, write_csv
-from fdi.trace.foreign import read_foreign, recorded_by
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.signals import OUTPUTS, SIGNALS
@@ -199,11 +198,7 @@ class Trace:
 
 
 def _from_csv(path: Path) -> Trace:
-    plant = recorded_by(path)
-    if plant and plant.table:
-        columns, unknown = read_foreign(path, plant.table)
-    else:
-        columns, unknown = read_csv(path, REQUIRED, OPTIONAL)
+    columns, unknown, plant = read_csv(path, REQUIRED, OPTIONAL)
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")

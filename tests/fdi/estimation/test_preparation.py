@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.estimation.preparation import FEWEST_ROWS, read_cycles
-from fdi.estimation.repeats import align_columns, find_repeat
+from fdi.estimation.preparation import FEWEST_ROWS, align_columns, find_repeat, read_cycles
 from fdi.trace.columns import bridge_gaps, hold_last, shift_rows
 from fdi.trace.trace import Trace
 from plant import InputError, Model
