@@ -73,19 +73,21 @@ class Result:
         return tuple(title for title, _ in self._list_figures())
 
     def plot(self, title: str | None = None) -> Plot:
-        """Draw a figure of the page; by default the first.
+        """Draw a figure of the page; by default the first that has something to show.
 
         Raises:
-            InputError: a title that is not one of `figures`.
+            InputError: a title that is not one of `figures`, or a figure that this trace leaves empty.
         """
         figures = self._list_figures()
-        if not figures:
-            raise InputError("plot", title or "", "a result with figures; this one has none")
-        name = title if title is not None else figures[0][0]
-        for known, figure in figures:
-            if known == name:
-                return Plot(figure.draw(), figure.caption)
-        raise InputError("plot", name, f"one of {', '.join(self.figures)}")
+        chosen = [figure for known, figure in figures if title in (None, known)]
+        if not chosen:
+            known_titles = f"one of {', '.join(self.figures)}" if figures else "a result with figures"
+            raise InputError("plot", title or "", known_titles)
+        for figure in chosen:
+            svg = figure.draw()
+            if svg:
+                return Plot(svg, figure.caption)
+        raise InputError("plot", title or "", "a figure for which the trace has data")
 
     def _list_figures(self) -> list[tuple[str, Figure]]:
         """(title, figure) in the order of the page; a second figure of a section is numbered."""

@@ -16,6 +16,7 @@ from short_runs import HIDDEN, measured
 import fdi
 from fdi.analysis import Plot, Result
 from fdi.diagnosis.refine import SUSPECTS
+from fdi.report.report import Figure, Report, Section
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 
@@ -60,18 +61,31 @@ def test_the_example_is_short() -> None:
 
 
 def test_every_result_prints_shows_plots_and_converts(lines: dict[str, Any]) -> None:
-    results = [lines["comparison"], lines["explanation"], lines["result"], fdi.diagnose(lines["trace"])]
-    for result in results:
+    results = [lines["comparison"], lines["explanation"], lines["result"]]
+    for result in [*results, fdi.diagnose(lines["trace"])]:
         assert isinstance(result, Result)
         assert str(result).startswith(f"{result.verdict}  {result.sentence}\n")
         assert result.verdict in result.to_html() and "</html>" in result.to_html()
         assert result._repr_html_().startswith("<iframe srcdoc=") and "<script" not in result._repr_html_()
         assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == result.to_dict()
-        drawn = [result.plot(title) for title in result.figures]
-        assert drawn and len(set(drawn)) == len(drawn)
-        assert all(isinstance(plot, Plot) and plot.startswith("<svg") and plot.caption for plot in drawn)
+        drawn = result.plot()
+        assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in result.to_html()
         with pytest.raises(InputError, match=f"one of {re.escape(result.figures[0])}"):
             result.plot("nothing of this name")
+    for result in results:
+        plots = [result.plot(title) for title in result.figures]
+        assert len(plots) > 1 and len({str(plot) for plot in plots}) == len(plots)
+
+
+def test_a_figure_without_data_is_an_error() -> None:
+    empty = Figure("caption", lambda: "")
+    result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty])]))
+    with pytest.raises(InputError, match="for which the trace has data"):
+        result.plot()
+    drawn = Figure("a line", lambda: "<svg></svg>")
+    result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty, drawn])]))
+    assert result.figures == ("Empty", "Empty 2")
+    assert result.plot() == result.plot("Empty 2") == "<svg></svg>" and result.plot().caption == "a line"
 
 
 def test_the_dictionary_is_the_answer_of_the_command(lines: dict[str, Any], runs: dict[str, Path]) -> None:
