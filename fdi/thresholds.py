@@ -22,6 +22,137 @@ The solver's error at the 20 steps a cycle of the last fits is up to 0.5 um besi
 3 %. The noise itself is known to 3 % from one repeat (docs/compare.md). 317 of 320 fits of simulated units stayed
 below (docs/fdi.md)."""
 
+SOLVER_ERROR_SHARE = 0.2
+"""Share of the noise floor that the solver's error may reach: added in squares, a fifth makes 2 %.
+
+A replay halves its step until it moves by less; an explanation takes finer steps where its error is larger."""
+
+ANCHOR_RATE = 20.0
+"""Rate, 1/s, at which a replay's ram is pulled to the measured position.
+
+A free replay adds up every bias without end; this one forgets within 50 ms. White noise of the position comes back as
+1.005 times itself, an error of speed as 50 ms of it (docs/compare.md)."""
+
+BLOCK_FITTED_SQUARE = 2.0
+"""Mean square of whitened residuals up to which a block of 100 cycles counts as fitted; noise alone gives 1 +- 0.14.
+
+A block above it enters the misfit by its logarithm, so that one stop of the ram does not outweigh a whole run."""
+
+CONVERGED_GAIN = 0.5
+"""Gain in -2 log likelihood below which a fit has converged: a quarter of a unit of log likelihood."""
+
+CONVERGED_SHARE = 1e-4
+"""Gain, as a share of the cost, below which a fit has converged; it decides where the cost is large."""
+
+FLAT_DIRECTION_MISFIT = 500.0
+"""Sum of squares of whitened residuals, in a run of 13 500 cycles, that a step of 1 % along a flat direction may add.
+
+A direction that a signal shows adds more."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Noise: which part of a residual the sensors explain
+# ---------------------------------------------------------------------------------------------------------------------
+
+NOISE_WINDOW_CONFIDENCE = 0.995
+"""A window belongs to the noise unless it is larger than this share of all noise windows."""
+
+HUM_LINE_RATIO = 5.0
+"""Power of a mains line over that of its neighbours from which on it is hum; chance reaches it in one line of 150."""
+
+NOISE_COEFFICIENT_GAIN = 4.0
+"""Gain in -2 log likelihood that a further coefficient of the noise model must bring; Akaike's criterion asks for 2."""
+
+CALM_BLOCK_RATIO = 1.8
+"""Variance over that of the median block up to which a block holds noise alone; the rest holds a shifted stop."""
+
+NOISIER_THAN_MODEL = 1.3
+"""Noise of a signal over that of the model's sensor above which the signal's own noise counts."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Scatter: what healthy units of one design differ by
+# ---------------------------------------------------------------------------------------------------------------------
+
+HEALTHY_TOLERANCES = 5.0
+"""Tolerances by which a parameter of a healthy unit may be off in a fit; beyond that, physics is missing.
+
+One parameter in two million of a normal distribution is further off."""
+
+SCATTER_TOLERANCES = 3.0
+"""Tolerances by which a parameter may be off for a comparison to call the error scatter."""
+
+SCATTER_LARGE_RESIDUAL = 6.0
+"""Residual over noise from which on samples count less in the refit of scatter: single stops of the ram."""
+
+RESIDUAL_IS_SCATTER = 1.15
+"""RMS residual over noise up to which scatter within the tolerances is the whole explanation of an error.
+
+More than `RESIDUAL_IS_NOISE`, as the refit takes two steps only."""
+
+FRICTION_UNCERTAINTY = 1e-3
+"""Share by which a friction level may be off; a stop that depends on less is undecided.
+
+No simulator, no oil and no seal is known better than that."""
+
+UNDECIDED_SMALLEST = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}
+"""Changes, m and Pa, that `FRICTION_UNCERTAINTY` makes without any change of a stop; larger ones are undecided."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Effects: when missing physics is found. Gains are in -2 log likelihood.
+# ---------------------------------------------------------------------------------------------------------------------
+
+GAIN_SEEN = 30.0
+"""Gain with which an effect is seen: the charge for choosing among all candidates, and ten more."""
+
+GAIN_CONVINCES = 60.0
+"""Gain, on the run and on its repeat, with which an effect is named although the model is at the floor without it."""
+
+GAIN_DOUBTFUL = 500.0
+"""Gain up to which an effect may only make up for what the base's own fit has left; the base is fitted again then."""
+
+GAIN_TIE = 14.0
+"""Difference below which two explanations are equally good: odds of 1000 to 1."""
+
+GAIN_WORTH_A_FIT = 20.0
+"""Expected gain of an effect below which no full fit is made."""
+
+ERROR_PARTLY_EXPLAINED = 0.8
+"""Excess error over that before, below which an effect is a part of the explanation."""
+
+FURTHER_EFFECT_SHARE = 0.1
+"""Share of the excess cost that an effect must remove for another one to be looked for on top of it."""
+
+RESIDUAL_HELD_OUT = 1.2
+"""RMS residual over noise in the typical block of a held-out run, up to which an explanation holds there.
+
+More than `RESIDUAL_IS_NOISE`, as no parameter is fitted to that run."""
+
+WHITE_SQUARE_POOR = 1.02
+"""Mean square of whitened residuals from which on a last fit is tried again from a healthy unit."""
+
+MISFIT_DISCRIMINATES = 50.0
+"""Misfit of the wrong explanation, fitted to the prediction of the other one, from which on a test discriminates."""
+
+NULL_DRAWS = 4000
+"""Simulated runs in which nothing is missing, for the p-value; beyond their reach a Bonferroni bound holds."""
+
+EFFECT_INTERVAL_FACTOR = 1.6
+"""Factor on the standard deviation of an effect's parameter at the end of a fit, which stops in a rough valley.
+
+Measured with `EFFECT_SYSTEMATIC_SD` on cases of another simulator with 1.5 % scatter; without them one interval in four
+misses the true value."""
+
+EFFECT_SYSTEMATIC_SD = 0.01
+"""Standard deviation, as a share of an effect's size, that the solver's step and unfitted parameters add."""
+
+SUSPICIOUS_TOLERANCES = 3.0
+"""Tolerances by which a fitted parameter may be off before it is reported as suspicious."""
+
+PATTERN_VISIBLE_RATIO = 1.3
+"""Missing force, flow or current over what sensor noise alone gives, from which on its pattern is shown."""
+
+PATTERN_EXPLAINED_SHARE = 0.25
+"""Share of the missing force, flow or current that a curve must explain to be reported."""
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Bands: when a response has left the healthy range
 # ---------------------------------------------------------------------------------------------------------------------

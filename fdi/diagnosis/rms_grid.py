@@ -1,8 +1,8 @@
 """The RMS grid: the monitor run for every pair of fault sizes, compared with the measured ram (Figs. 13-15).
 
 There is one map of the step sections, one of the ramp sections and one of both. The monitor is driven by the measured
-current, and its ram is pulled to the measured one at ANCHOR; a constant offset does not count. In closed loop, as in
-the paper, the maps of this plant are useless: with spool friction the loop limit-cycles, two runs differ in phase, and
+current, and its ram is pulled to the measured one at ANCHOR_RATE; a constant offset does not count. In closed loop, as
+in the paper, the maps of this plant are useless: with spool friction the loop limit-cycles, two runs differ in phase, and
 a monitor that does not oscillate at all is nearer to the trace than the right one (`drive="command"` shows it).
 """
 from __future__ import annotations
@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.preparation import read_cycles
-from fdi.estimation.replay import ANCHOR, has_known_start
+from fdi.estimation.replay import has_known_start
+from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -149,7 +150,7 @@ def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, slidin
         out = monitor.closed_loop(values, trace.com, start, reduced=reduce_runs)
     else:
         position = trace.xj if has_known_start(trace) else None
-        out = monitor.replay(values, trace.cor, position, ANCHOR, reduced=reduce_runs)
+        out = monitor.replay(values, trace.cor, position, ANCHOR_RATE, reduced=reduce_runs)
     return dict(zip(rows, out.T, strict=True))
 
 

@@ -8,20 +8,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.explain import BETTER, HELD_OUT, Explanation, measure_gain
+from fdi.discovery.explain import Explanation, measure_gain
 from fdi.discovery.fingerprints import Fingerprint, firmware_resolution
-from fdi.discovery.search import REACHED, Hypothesis
+from fdi.discovery.search import Hypothesis
 from fdi.discovery.significance import compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit
 from fdi.estimation.unknowns import UNREPLAYED, limit_friction_values
+from fdi.thresholds import (
+    EFFECT_INTERVAL_FACTOR,
+    EFFECT_SYSTEMATIC_SD,
+    ERROR_PARTLY_EXPLAINED,
+    INTERVAL_95_SD,
+    RESIDUAL_HELD_OUT,
+    RESIDUAL_IS_NOISE,
+    SUSPICIOUS_TOLERANCES,
+)
 from plant.effects import CATALOGUE
 from plant.model import Model, meaning, offered
 
-NORMAL = 1.96  # standard deviations on either side that hold 95 %
-ROUGH = 1.6  # true standard deviation over that at the end of a fit, which ends in one of the dents of a rough valley
-SYSTEMATIC = 0.01  # of an effect's size, standard deviation: what the solver's step and unfitted parameters are worth
-"""Both measured on cases of another simulator with 1.5 % scatter: without them one interval in four missed."""
-FAR = 3.0  # tolerances that a parameter may be off before it is suspicious
 LEAST = 1e-300
 
 
@@ -132,7 +136,7 @@ def fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
         if f.name in entry.fitted:
             value = values[f.name]
             size = abs(value - entry.off.get(f.name, model.kind.nominal.get(f.name, 0.0)))
-            half = NORMAL * math.hypot(ROUGH * fit.spread(f.name), SYSTEMATIC * size)
+            half = INTERVAL_95_SD * math.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(f.name), EFFECT_SYSTEMATIC_SD * size)
             found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
                                   entry.parameters[f.name].unit)
     for name, v in found.items():  # dynamic friction is not above static friction, nor is its interval
@@ -142,9 +146,10 @@ def fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
 
 
 def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
-    """Parameters that are more than `FAR` tolerances from where a healthy unit has them."""
+    """Parameters that are more than `SUSPICIOUS_TOLERANCES` tolerances from where a healthy unit has them."""
     return [Suspicious(f.name, f.value(float(x)), meaning(f.name, plant=plant).unit, float(x))
-            for f, x in zip(fit.free, fit.x, strict=True) if np.isfinite(f.prior) and abs(x) > FAR * f.prior]
+            for f, x in zip(fit.free, fit.x, strict=True)
+            if np.isfinite(f.prior) and abs(x) > SUSPICIOUS_TOLERANCES * f.prior]
 
 
 def _candidates(e: Explanation, seed: int) -> list[Candidate]:
@@ -178,11 +183,11 @@ def _word(e: Explanation, h: Hypothesis, effect: str) -> str:
     if effect in e.effects and e.verdict in words:
         return words[e.verdict]
     worst, before = max(h.ratio.values()), max(e.base.ratio.values())
-    if worst <= REACHED and not e.base.reached:
+    if worst <= RESIDUAL_IS_NOISE and not e.base.reached:
         held = e.holdout.get(h.effects, {})
-        fails = any(error > HELD_OUT * e.floor[s] for s, error in held.items())
+        fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in held.items())
         return "fails on the held-out run" if fails else "less likely"
-    return "part" if worst - 1.0 < BETTER * (before - 1.0) and not e.base.reached else "no"
+    return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.reached else "no"
 
 
 def _firmware(e: Explanation) -> list[Fingerprint]:

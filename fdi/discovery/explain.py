@@ -9,9 +9,19 @@ from numpy.typing import NDArray
 
 from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
 from fdi.discovery.search import Hypothesis, Search
-from fdi.discovery.significance import SEEN, Sensitivity, compute_sensitivity
+from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import (
+    ERROR_PARTLY_EXPLAINED,
+    FURTHER_EFFECT_SHARE,
+    GAIN_CONVINCES,
+    GAIN_DOUBTFUL,
+    GAIN_SEEN,
+    GAIN_TIE,
+    RESIDUAL_HELD_OUT,
+    SOLVER_ERROR_SHARE,
+)
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, offered
@@ -21,15 +31,8 @@ Floats = NDArray[np.float64]
 FINE = 20  # steps a cycle of the last fits
 FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
 TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
-COARSE = 0.2  # times the floor; a solver's error beyond it is not hidden by the noise
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
 MOST = 3  # effects looked for one after the other
-EQUAL = 14.0  # difference in -2 log likelihood below which two explanations are equally good: odds of 1000 to 1
-CONVINCING = 60.0  # gain on the run and on its repeat with which an effect at the floor is named
-BETTER = 0.8  # times the error before: what counts as a part of the explanation
-FAIR = 0.1  # of the excess cost that an effect has to take away if another one is to be looked for on top of it
-DOUBTFUL = 500.0  # gain up to which it may be what the base's own fit has left lying about
-HELD_OUT = 1.2  # times the floor, in the typical block of a run with another command
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace 
 def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
     """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
     noise = float(np.isfinite(search.problem.trace.measurements).sum())
-    return before.cost - after.cost >= FAIR * (before.cost - noise)
+    return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
 
 
 def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Trace) -> bool:
@@ -124,7 +127,7 @@ def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Tr
     noise = np.array([floor[s] for s in holdout.outputs])
     left = [compute_typical_rms(_unseen(search, h, holdout)) / noise for h in (before, after)]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
-    return excess[1] < BETTER * excess[0]
+    return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
 
 def _distinct(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -140,7 +143,7 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
     return min(own, 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
-def _significant(parent: Hypothesis, h: Hypothesis, least: float = SEEN) -> bool:
+def _significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN) -> bool:
     return measure_gain(parent, h) > least
 
 
@@ -149,14 +152,14 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], CONVINCING):
+    if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
         depth = 1
     depth = _pruned(search, levels, depth)
     search.refine(FINE, TRUEST)
     base = search.settle(levels[0][0], 2 if depth or levels[0][0].reached else LONG)  # nothing helps: beyond doubt
-    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * EQUAL][:4] if depth else []
+    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
     close = sorted(search.each(search.settle, close), key=lambda h: h.cost + h.repeat_cost)
-    if close and base.cost - close[0].cost < DOUBTFUL:
+    if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
         base = search.settle(search.without(base, close[:1]), LONG)
         if depth == 1 and not _significant(base, close[0]):
             close, depth = [], 0
@@ -164,7 +167,7 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
               if h.effects not in [c.effects for c in close]]
     ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.floor(close[0] if close else base)
-    if search.solver_error(close[0] if close else base, floor) > COARSE:
+    if search.solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
         search.refine(FINEST, TRUEST)
         base, close = search.settle(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
@@ -181,7 +184,7 @@ def _pruned(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:
     """The depth, after what was added first and is no longer wanted has gone: a later effect may do alone."""
     while depth > 1:
         best = search.lighter(levels[depth][0])[0]
-        if _significant(best, levels[depth][0], CONVINCING):
+        if _significant(best, levels[depth][0], GAIN_CONVINCES):
             break
         depth -= 1
         levels[depth] = _distinct([best, *levels[depth]])
@@ -208,15 +211,15 @@ def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hy
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
     least = measure_gain(base, best)
-    if base.reached and least < CONVINCING:
+    if base.reached and least < GAIN_CONVINCES:
         return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
     there = [h for h in holding if h.reached]
     if best.reached and there and not firmware_left:
-        equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * EQUAL]
+        equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * GAIN_TIE]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
         return "EXPLAINED", (*prints, *there[0].effects)
-    better = min(_error(best, floor), 1e9) < BETTER * _error(base, floor)
+    better = min(_error(best, floor), 1e9) < ERROR_PARTLY_EXPLAINED * _error(base, floor)
     return ("PARTLY", (*prints, *best.effects)) if better and part else ("PARTLY" if prints else "UNEXPLAINED", prints)
 
 
@@ -227,7 +230,7 @@ def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
 
 def _holds(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
     left = compute_typical_rms(_unseen(search, h, trace))
-    return all(e <= HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
+    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
 
 
 def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:

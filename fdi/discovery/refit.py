@@ -25,6 +25,7 @@ from fdi.estimation.unknowns import (
     silence_readings,
 )
 from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import GAIN_SEEN, WHITE_SQUARE_POOR
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
@@ -36,8 +37,6 @@ Floats = NDArray[np.float64]
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
 LAST, BEFORE = 8, 2  # of the last fit, and of those before it in the ledger
 STEPS = 50  # a cycle, of the last fits' residuals; their slopes make do with those of the first
-POOR = 1.02  # mean square of whitened residuals from which on a last fit is tried from a healthy unit once more
-HELPS = 30.0  # gain in -2 log likelihood below which an effect takes away nothing but noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,7 @@ class Refit:
         if CATALOGUE[name].port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
         worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
-        return measure_gain(before.hypothesis, after.hypothesis) > HELPS and not worse
+        return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and not worse
 
 
 def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
@@ -123,7 +122,7 @@ def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     search.refine(STEPS, STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
     last = finish_fit(search.problem, chain[-1].fit, LAST, slopes)
-    if last.misfit > POOR * np.count_nonzero(last.white):
+    if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):
         again = replace(last, x=np.where(_healthy(last.free), 0.0, last.x))
         last = min(last, finish_fit(search.problem, again, LAST, slopes), key=lambda fit: fit.cost)
     done = [search.judged(chain[-1].effects, last)]

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from fdi.discovery.balance import EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search
 from fdi.output import write_text
+from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 
 Floats = NDArray[np.float64]
 
 KNOTS = 15  # of a curve
 FEWEST = 20  # samples in a bin
-VISIBLE = 1.3  # times what sensor noise alone gives
-FOLLOWS = 0.25  # share of what is missing that a curve has to explain to be told
 PERIODS = np.geomspace(2.0, 60.0, 600)  # over the range of the position
 
 WORDS = {"force": "a force on the ram, against extension", "flow": "a flow that leaves the jack",
@@ -74,7 +73,7 @@ def find_pattern(search: Search, h: Hypothesis) -> Pattern:
 
 
 def _shape(best: Balance, states: States) -> Pattern:
-    if best.ratio < VISIBLE:
+    if best.ratio < PATTERN_VISIBLE_RATIO:
         none = np.empty(0)
         return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
     missing = best.missing[EDGE:-EDGE]
@@ -84,11 +83,11 @@ def _shape(best: Balance, states: States) -> Pattern:
     share, at, height, doubt = curves[name]
     waves = {name: fit_wave(missing, seen[name], best.noise) for name in ("position", "time")}
     over = max(waves, key=lambda n: waves[n][1])
-    if waves[over][1] > max(share + 0.05, FOLLOWS):
+    if waves[over][1] > max(share + 0.05, PATTERN_EXPLAINED_SHARE):
         shape, share = waves[over]
         _, at, height, doubt = fit_curve(missing, np.mod(seen[over], shape[1]), best.noise)
         return Pattern(best.place, best.unit, best.size, over, share, at, height, doubt, shape, best.missing)
-    state = name if share >= FOLLOWS else ""
+    state = name if share >= PATTERN_EXPLAINED_SHARE else ""
     return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, None, best.missing)
 
 

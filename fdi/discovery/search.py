@@ -15,6 +15,7 @@ from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
 from fdi.estimation.likelihood import Problem, compute_misfit
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import Free, all_unknowns, complete_model, silence_readings
+from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -25,11 +26,9 @@ Floats = NDArray[np.float64]
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
-WORTH = 20.0  # expected gain in cost that makes a full fit worth its time
 BEAM = 3  # hypotheses from which the next missing effect is looked for
 EASED = (30.0, 6.0)  # times the noise, stage by stage
 SETTLING = 5  # rounds of the last fit
-REACHED = 1.08  # times the floor; what is left above it is physics
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class Hypothesis:
     @property
     def reached(self) -> bool:
         """True when nothing but noise is left."""
-        return max(self.ratio.values()) <= REACHED
+        return max(self.ratio.values()) <= RESIDUAL_IS_NOISE
 
     @property
     def cost(self) -> float:
@@ -117,7 +116,7 @@ class Search:
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
             nominal = linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
             prospects = _merged(prospects, scan_effects(self.problem, nominal, effects, self.workers))
-        worth = [p for p in prospects if p.cost < start.cost - WORTH][:fitted]
+        worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
         fits = list(zip([p.effect for p in worth], self.each(self._begun, worth), strict=True))
         for rounds, kept in RACE:
             fits.sort(key=lambda each: each[1].cost)

@@ -14,13 +14,13 @@ from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import Noise
 from fdi.estimation.preparation import hold_inputs
+from fdi.thresholds import MISFIT_DISCRIMINATES
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 
 Floats = NDArray[np.float64]
 
-SPLITS = 50.0  # misfit, in -2 log likelihood, of the wrong explanation fitted to what the other one predicts
 ROUNDS = 3  # of that fit
 PAIRS = 3  # looked at of a larger set
 SECONDS = 3.0
@@ -47,12 +47,12 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
     own = search.problem.trace
     for more in _sensors(own.outputs):
         left = min(_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
-        if left > SPLITS:
+        if left > MISFIT_DISCRIMINATES:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
     for words, command, play in list_commands(search.problem.model.values["controller.period"]):
         left = min(_misfit(search, a, b, _played(search, a, play, own.outputs)) for a, b in pairs)
-        if left > SPLITS and (best is None or left > best.misfit):
+        if left > MISFIT_DISCRIMINATES and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
     return best
 

@@ -11,12 +11,11 @@ from scipy.special import chdtrc
 
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem
+from fdi.thresholds import GAIN_SEEN, NULL_DRAWS
 from plant.effects import CATALOGUE
 
 Floats = NDArray[np.float64]
 
-DRAWS = 4000  # simulated runs in which nothing is missing
-SEEN = 30.0  # gain in -2 log likelihood with which an effect is seen: the charge for the candidates and ten more
 THINNED = 3
 
 
@@ -59,14 +58,14 @@ def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int 
     """
     rng = np.random.default_rng(seed)
     weight, vectors = np.linalg.eigh(s.gram)
-    draws = rng.standard_normal((DRAWS, len(weight))) @ (vectors * np.sqrt(np.maximum(weight, 0.0))).T
+    draws = rng.standard_normal((NULL_DRAWS, len(weight))) @ (vectors * np.sqrt(np.maximum(weight, 0.0))).T
     best = (np.maximum(draws, 0.0) ** 2).max(axis=1)
     simulated = float(np.mean(best >= gain))
     bound = len(set(s.names)) * float(chdtrc(parameters, max(gain, 0.0)))
-    return simulated if simulated > 10.0 / DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / DRAWS))
+    return simulated if simulated > 10.0 / NULL_DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / NULL_DRAWS))
 
 
-def find_smallest_visible(s: Sensitivity, seen: float = SEEN) -> Mapping[str, float]:
+def find_smallest_visible(s: Sensitivity, seen: float = GAIN_SEEN) -> Mapping[str, float]:
     """Size of each effect's first parameter, from its off value, at which it would be seen; inf: at none tried.
 
     Between the sizes tried, log gain is linear in log size; below the smallest, the gain falls with its square.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import NORMAL, ROUGH, Suspicious, Value, fitted_parameters, list_suspicious
+from fdi.discovery.candidates import Suspicious, Value, fitted_parameters, list_suspicious
 from fdi.discovery.explain_runs import prepare_effects
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, check_addable, fitted_model, refit_effects
@@ -15,6 +15,7 @@ from fdi.estimation.unknowns import limit_friction_values
 from fdi.output import write_text
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import software
+from fdi.thresholds import EFFECT_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
 from plant.model import Model, meaning
 
@@ -52,7 +53,7 @@ class ModelUpdate:
         if self.refit is None:
             return {}
         fit = self.refit.last.hypothesis.fit
-        halves = {f.name: NORMAL * ROUGH * fit.spread(f.name) for f in fit.free}
+        halves = {f.name: INTERVAL_95_SD * EFFECT_INTERVAL_FACTOR * fit.spread(f.name) for f in fit.free}
         values = limit_friction_values(fit.values)
         own = {name: Value(v, v - halves[name], v + halves[name], "") for name, v in values.items()}
         return own | dict(self.parameters)

@@ -17,10 +17,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import DAMPINGS, ENOUGH, Fit, cut_at_bounds, step_within_bounds
+from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, step_within_bounds
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
 from fdi.estimation.unidentifiable import choose_across, find_tangents, relax_along, relax_fit, remove_slope
 from fdi.estimation.unknowns import Free
+from fdi.thresholds import CONVERGED_GAIN
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem
     for _ in range(rounds):
         here = linearise_along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
         there = take_best_step(problem, here)
-        idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
+        idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = there
         if idle >= PATIENCE:
             break
@@ -101,7 +102,7 @@ def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> F
     for _ in range(rounds):
         here = linearise_across(problem, now.free, now.x, now.covariance, flat)
         there = take_best_step(problem, here)
-        idle = idle + 1 if here.cost - there.cost < ENOUGH else 0
+        idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = replace(there, covariance=here.covariance)
         if idle >= PATIENCE:
             break

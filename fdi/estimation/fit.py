@@ -10,15 +10,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
 from fdi.estimation.unknowns import Free, scaled_bounds
+from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 
 Floats = NDArray[np.float64]
 
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 WIDTH = 3.0  # of a difference, in standard deviations of a parameter: wide enough for stick-slip, narrow at the end
 NARROWEST = 0.01  # times the first width
-ENOUGH = 0.5  # improvement in cost below which a fit has converged: a quarter of a unit of log likelihood
 ROUNDS = 12
-CLOSE = 1e-4  # the same as a fraction of the cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ def continue_fit(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
         costs = compute_misfit(white) + (trials**2) @ _prior(now.free)
         k = int(np.argmin(costs))
         gained = now.cost - float(costs[k])
-        if gained < max(ENOUGH, CLOSE * now.cost):
+        if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
             final = _moved(problem, now, trials[k]) if gained > 0.0 else now
             return replace(final, converged=True)
         now = linearise(problem, now.free, trials[k], _widths(now.free, hessian))

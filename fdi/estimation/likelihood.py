@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise import Noise
-from fdi.estimation.replay import ANCHOR
 from fdi.estimation.unknowns import Free, limit_dynamic_friction
+from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model
@@ -26,7 +26,6 @@ Floats = NDArray[np.float64]
 STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 BLOCK = 100  # cycles
-FITTED = 2.0  # mean square of a block up to which it counts as fitted: noise alone gives 1 +- 0.14
 
 
 @dataclass
@@ -40,7 +39,7 @@ class Problem:
     trace: Trace
     noise: tuple[Noise, ...]  # of each signal
     steps: int = STEPS
-    anchor: float = ANCHOR
+    anchor: float = ANCHOR_RATE
     workers: int = 1
     bare: Model | None = None  # the same without the effects at off values: five times as fast where it will do
     also: tuple[Trace, ...] = ()  # further runs, of the same signals, that a fit takes in
@@ -108,7 +107,7 @@ def sum_blocks(white: Floats) -> Floats:
 def compute_misfit(white: Floats) -> Floats:
     """-2 log likelihood of whitened residuals (m, s, n), up to a constant: (m,)."""
     sums = sum_blocks(white)
-    limit = FITTED * BLOCK
+    limit = BLOCK_FITTED_SQUARE * BLOCK
     beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
     total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
     return total
@@ -117,7 +116,7 @@ def compute_misfit(white: Floats) -> Floats:
 def compute_weights(white: Floats) -> Floats:
     """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
     sums = sum_blocks(white)
-    each = np.minimum(1.0, FITTED * BLOCK / np.maximum(sums, 1e-300))
+    each = np.minimum(1.0, BLOCK_FITTED_SQUARE * BLOCK / np.maximum(sums, 1e-300))
     return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]
 
 

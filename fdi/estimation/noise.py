@@ -18,6 +18,13 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 from scipy.special import gammainc, gammaincinv, ndtri
 
+from fdi.thresholds import (
+    CALM_BLOCK_RATIO,
+    HUM_LINE_RATIO,
+    NOISE_COEFFICIENT_GAIN,
+    NOISE_WINDOW_CONFIDENCE,
+    NOISIER_THAN_MODEL,
+)
 from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
@@ -29,20 +36,15 @@ Floats = NDArray[np.float64]
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
 QUIET = 0.2  # the part of all windows that the first guess rests on
-BELIEVED = 0.995  # a window belongs to the noise if noise is as large as that in at most 0.5 % of all windows
 LAGS = 40  # samples, of the noise's autocorrelation
 MAINS = (50.0, 60.0, 400.0)  # Hz, and what is an odd or even multiple of them below half the sampling rate
 HARMONICS = 4
 NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it would look without hum
-LINE = 5.0  # times its neighbours' power; chance does that in one line of 150
 FEWEST = 10  # windows that a search for hum needs
 WHITE_DIFFERENCE = 6.0  # variance of the second difference of white noise, over its own
 FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
-NOISIER = 1.3  # times the noise that the model gives: a signal with more shows its own
 SWEEP = 4000  # positions
 ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
-PARSIMONY = 4.0  # gain in -2 log likelihood that a further coefficient has to bring (Akaike asks for 2)
-CALM = 1.8  # times the median block's variance, up to which a block holds noise alone
 CONSISTENT = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
 
 
@@ -102,7 +104,7 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     for name in trace.outputs:
         given, seen = model[SIGNALS[name].noise], floor_from_data(trace.measured(name))
         given = simulate_reading_noise(model, trace.xj) if name == "xj" else given
-        found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER * given else seen
+        found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
         out[name] = found._replace(value=max(found.value, FINEST[name]))
     return out
 
@@ -147,9 +149,10 @@ def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[
             break
         if len(kept) == max(1, round(QUIET * len(order))):
             level = float(np.quantile(power, QUIET)) / _mean_square(QUIET, freedom)
-        limit = _mean_square(BELIEVED, freedom)
+        limit = _mean_square(NOISE_WINDOW_CONFIDENCE, freedom)
         now = np.flatnonzero(power <= limit * level)
-        below = float(gammainc(freedom / 2 + 1, freedom * limit / 2)) / BELIEVED  # mean of what the limit leaves
+        # mean of the windows below the limit
+        below = float(gammainc(freedom / 2 + 1, freedom * limit / 2)) / NOISE_WINDOW_CONFIDENCE
         if len(now) == 0 or np.array_equal(now, kept):
             break
         kept, level = now, float(power[now].mean()) / below
@@ -194,7 +197,7 @@ def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, f
         rows = loud <= np.nanquantile(loud, 0.5)
         power += np.abs(_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
     line, beside = power[:, 0], power[:, 1:].mean(axis=1)
-    return [(f, float(a - b)) for f, a, b in zip(mains, line, beside, strict=True) if a > LINE * b > 0.0]
+    return [(f, float(a - b)) for f, a, b in zip(mains, line, beside, strict=True) if a > HUM_LINE_RATIO * b > 0.0]
 
 
 def _loudness(x: Floats) -> Floats:
@@ -286,7 +289,7 @@ def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
         return white_noise(float(np.finfo(float).tiny))
     size = WINDOW * (len(x) // WINDOW) or len(x)
     blocks = x[:size].reshape(-1, min(WINDOW, size))
-    calm = blocks[(blocks**2).mean(axis=1) <= CALM * sigma**2]  # the others hold a stop that came a little later
+    calm = blocks[(blocks**2).mean(axis=1) <= CALM_BLOCK_RATIO * sigma**2]  # the others hold a stop that came later
     n = calm.size
     pairs = [np.einsum("ij,ij->", calm[:, k:], calm[:, :calm.shape[1] - k]) for k in range(order + 1)]
     covariance = np.array(pairs) / n
@@ -295,7 +298,7 @@ def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
     for p in range(1, order + 1):
         a = solve_toeplitz(covariance[:p], covariance[1:p + 1])
         variance = covariance[0] - a @ covariance[1:p + 1]
-        gain = n * np.log(covariance[0] / variance) - PARSIMONY * p
+        gain = n * np.log(covariance[0] / variance) - NOISE_COEFFICIENT_GAIN * p
         if gain > cost:
             whitener = np.concatenate([[1.0], -a])
             best, cost = Noise(float(np.sqrt(covariance[0])), whitener, float(np.sqrt(variance))), gain

@@ -1,9 +1,10 @@
 """The model run on what was measured: from the current (the plant alone) and from the command alone (the whole loop).
 
 A replay from the current keeps the phase of stick-slip and leaves the controller out of the question. Its position
-adds up every bias for ever, so the ram is drawn to the measured position at ANCHOR; what it would drift without is told
-as a speed. The solver is checked first: with steps half as long the replay must not move; and where a ram that stops or
-goes on hangs on a thousandth of its friction, neither model nor solver can say which, so such windows are not judged.
+adds up every bias for ever, so the ram is pulled to the measured position at ANCHOR_RATE; the drift without that pull is
+reported as a speed. The solver is checked first: with steps half as long the replay must not move; and where a ram that
+stops or goes on hangs on a thousandth of its friction, neither model nor solver can say which, so such windows are not
+judged.
 """
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from fdi.estimation.noise import WINDOW
 from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction
+from fdi.thresholds import ANCHOR_RATE, FRICTION_UNCERTAINTY, SOLVER_ERROR_SHARE, UNDECIDED_SMALLEST
 from fdi.trace.columns import bridge_gaps, rms
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
@@ -26,12 +28,8 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Columns = dict[str, Floats]  # by signal, (n,)
 
-ANCHOR = 20.0  # 1/s; white noise of the position comes back as 1.005 times itself, a bias of speed as 50 ms of it
 STEPS, FINEST = 50, 800  # a cycle
-WELL_BELOW = 0.2  # of the floor, that halving the step may move a replay
 FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
-KNIFE = 1e-3  # of a friction level; no simulator, no oil and no seal is known as well as that
-EDGE = {"xj": 1e-6, "p12": 5e3, "xs": 5e-7}  # less than that is moved by a little friction without any edge
 SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
 
 
@@ -46,7 +44,7 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
 
 
-def replay_current(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR) -> Columns:
+def replay_current(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR_RATE) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
     out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if has_known_start(trace) else None, anchor)
@@ -69,20 +67,21 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     values = vary_frictions(model)
     lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), STEPS)
     position = trace.xj if has_known_start(trace) else None
-    runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
-    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR) for cor in guess_current(trace)]
+    runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR_RATE)
+    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR_RATE) for cor in guess_current(trace)]
     runs = np.concatenate([runs, *others])
     undecided = np.zeros(len(trace), bool)
     for i, name in enumerate(OUTPUTS):
         if name in floor:
             moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-            undecided |= _windows_above(moved, max(floor[name], EDGE[name])) & ~np.isnan(trace.measured(name))
+            large = _windows_above(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
+            undecided |= large & ~np.isnan(trace.measured(name))
     coarse, steps = runs[0], STEPS
     while True:
         finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
-        fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR)[0]
+        fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR_RATE)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
-        small = all(error[name] <= WELL_BELOW * floor[name] for name in error)
+        small = all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error)
         coarse, steps = fine, 2 * steps
         if small or steps >= FINEST:
             break
@@ -124,7 +123,7 @@ def vary_frictions(model: Model) -> Floats:
     """(m, frictions) values: the model's, and each level a little higher and lower; dynamic stays below static."""
     names = list_frictions(model)
     base = np.array([model[name] for name in names])
-    shifts = KNIFE * np.eye(len(names))
+    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))
     values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
     return limit_dynamic_friction(names, values)
 

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.replay import ANCHOR, has_known_start
+from fdi.estimation.replay import has_known_start
 from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerance_sizes
+from fdi.thresholds import ANCHOR_RATE, RESIDUAL_IS_SCATTER, SCATTER_LARGE_RESIDUAL, SCATTER_TOLERANCES
 from fdi.trace.columns import rms
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
@@ -24,10 +25,7 @@ Floats = NDArray[np.float64]
 STEPS = 20  # a cycle; only sizes matter here
 ROUNDS = 2
 STEP = 0.3  # tolerances, of the differences that the Jacobian is made of
-FURTHEST = 3.0  # tolerances; a parameter that would have to go further is no scatter
 ALIKE = 20  # neighbouring samples that say the same thing
-LARGE = 6.0  # floors; residuals beyond count less, the refit shall not chase single stops of the ram
-SCATTER = 1.15  # floors, that scatter may leave to count as the whole explanation
 
 
 class Scatter(NamedTuple):
@@ -53,7 +51,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     def residual(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
         values = limit_dynamic_friction(list(known), base + x * size)
-        out = lanes.replay(values, trace.cor, trace.load, position, ANCHOR)
+        out = lanes.replay(values, trace.cor, trace.load, position, ANCHOR_RATE)
         left: Floats = np.nan_to_num((measured - out.transpose(0, 2, 1)[:, columns]) / scale)
         return left.reshape(len(x), -1)
 
@@ -61,12 +59,13 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     now = residual(x[None])[0]
     for _ in range(ROUNDS):
         slope = (residual(x + STEP * np.eye(len(base))) - now) / STEP
-        weight = 1.0 / np.sqrt(1.0 + (now / LARGE) ** 2)
+        weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
         step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
-        tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -FURTHEST, FURTHEST)
+        tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -SCATTER_TOLERANCES, SCATTER_TOLERANCES)
         found = residual(tried)
-        costs = 2 * LARGE**2 * (np.sqrt(1 + (found / LARGE) ** 2) - 1).sum(axis=1) / ALIKE
+        large = SCATTER_LARGE_RESIDUAL
+        costs = 2 * large**2 * (np.sqrt(1 + (found / large) ** 2) - 1).sum(axis=1) / ALIKE
         best = int(np.argmin(costs + (tried**2).sum(axis=1)))
         x, now = tried[best], found[best]
     rows = now.reshape(len(scale), -1)
@@ -74,4 +73,4 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
              for name, r, y in zip(trace.outputs, rows, measured, strict=True)}
     error = {name: ratio[name] * floor[name] for name in ratio}
     moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
-    return Scatter(error, ratio, moved, max(ratio.values()) < SCATTER)
+    return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from fdi.estimation.fit import Fit, cut_at_bounds
 from fdi.estimation.likelihood import Problem, compute_misfit
 from fdi.estimation.unknowns import Free, scaled_bounds
+from fdi.thresholds import FLAT_DIRECTION_MISFIT
 
 Floats = NDArray[np.float64]
 
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
-LEVEL = 500.0  # sum of squares in whitened units, that this way may change; what shows makes more
 ROUNDS = 6
 LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
 # Powers with which parameters move together; that of Kintas is one of what the filter lets through, 1 - Kintas.
@@ -75,7 +75,7 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
     if not found:
         return [], np.empty((len(x), 0))
     white = problem.whitened(problem.residuals(free, np.vstack([x, *trials])))
-    flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < LEVEL * white.shape[2] / 13500.0
+    flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < FLAT_DIRECTION_MISFIT * white.shape[2] / 13500.0
     held = [said for said, level in zip(found, flat, strict=True) if level]
     ways = [(scale_together(free, x, said, 1e-6) - x) / 1e-6 for said in held]
     return held, np.array(ways).T if ways else np.empty((len(x), 0))
@@ -131,7 +131,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats) -> F
     full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)
     white = problem.whitened(problem.residuals(free, np.vstack([x, x + trials])))
     moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
-    found: Floats = ways[full & (moved < LEVEL)].T
+    found: Floats = ways[full & (moved < FLAT_DIRECTION_MISFIT)].T
     return found
 
 

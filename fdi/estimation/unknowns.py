@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.thresholds import HEALTHY_TOLERANCES
 from plant.effects import CATALOGUE, Effect
 from plant.model import Model, meaning, offered
 
 Floats = NDArray[np.float64]
 
-FURTHEST = 5.0  # tolerances that a healthy unit may be off; beyond, something is wrong with it
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
 WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
 
@@ -62,7 +62,7 @@ def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
     for name, tolerance in relative_tolerances(model, model.values).items():
         value, q = model.values[name], meaning(name, plant=model.plant)
         scale = tolerance * (abs(usual.get(name, value)) or 1.0)
-        low, high = value - FURTHEST * scale, value + FURTHEST * scale
+        low, high = value - HEALTHY_TOLERANCES * scale, value + HEALTHY_TOLERANCES * scale
         free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
     return tuple(free)
 
@@ -104,7 +104,7 @@ def all_unknowns(model: Model) -> tuple[Free, ...]:
 def _off_nominal(e: Effect, model: Model) -> bool:
     usual = model.kind.nominal
     tolerance = model.kind.tolerance
-    return any(abs(model[name] - usual[name]) > (FURTHEST * tolerance(name, q) + 1e-12) * abs(usual[name])
+    return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])
                for name, q in e.parameters.items())
 
 

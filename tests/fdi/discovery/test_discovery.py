@@ -14,9 +14,10 @@ from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_e
 from fdi.discovery.scan import find_tones
 from fdi.discovery.search import Search, measure_repeating
 from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
-from fdi.estimation.likelihood import BLOCK, FITTED, compute_misfit, compute_weights
+from fdi.estimation.likelihood import BLOCK, compute_misfit, compute_weights
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.preparation import hold_inputs
+from fdi.thresholds import BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant import InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
@@ -58,7 +59,7 @@ def test_the_likelihood_is_squares_where_fitted_and_logarithms_where_not() -> No
     assert compute_misfit(noise)[0] == pytest.approx((noise**2).sum())
     spoilt = noise.copy()
     spoilt[0, 0, :BLOCK] = 1e3
-    expected = FITTED * BLOCK * (1 + np.log(1e6 / FITTED)) - (noise[0, 0, :BLOCK] ** 2).sum()
+    expected = BLOCK_FITTED_SQUARE * BLOCK * (1 + np.log(1e6 / BLOCK_FITTED_SQUARE)) - (noise[0, 0, :BLOCK] ** 2).sum()
     assert compute_misfit(spoilt)[0] - compute_misfit(noise)[0] == pytest.approx(expected)
 
 
