@@ -2,8 +2,8 @@
 
 There is one map of the step sections, one of the ramp sections and one of both. The monitor is driven by the measured
 current, and its ram is pulled to the measured one at ANCHOR_RATE; a constant offset does not count. In closed loop, as
-in the paper, the maps of this plant are useless: with spool friction the loop limit-cycles, two runs differ in phase, and
-a monitor that does not oscillate at all is nearer to the trace than the right one (`drive="command"` shows it).
+in the paper, the maps of this plant are useless: with spool friction the loop limit-cycles, two runs differ in phase,
+and a monitor that does not oscillate at all is nearer to the trace than the right one (`drive="command"` shows it).
 """
 from __future__ import annotations
 

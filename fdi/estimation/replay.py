@@ -1,7 +1,7 @@
 """The model run on what was measured: from the current (the plant alone) and from the command alone (the whole loop).
 
 A replay from the current keeps the phase of stick-slip and leaves the controller out of the question. Its position
-adds up every bias for ever, so the ram is pulled to the measured position at ANCHOR_RATE; the drift without that pull is
+adds up every bias for ever, so the ram is pulled to the measured position at ANCHOR_RATE; the drift without it is
 reported as a speed. The solver is checked first: with steps half as long the replay must not move; and where a ram that
 stops or goes on hangs on a thousandth of its friction, neither model nor solver can say which, so such windows are not
 judged.
