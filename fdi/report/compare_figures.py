@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 
 from fdi.comparison.compare import Comparison
 from fdi.comparison.residual_tests import Depends, ResidualTests
-from fdi.report.drawing import COMMAND, INK, RED, start_figure, thin_line, to_svg
+from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, RED, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES, format_ratio
-from fdi.trace.sections import find_sections
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 
-DRAWN_UNITS = {"xj": ("um", 1e6), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}  # unit of an axis, and SI value to it
 COLOURS = {"xj": "#1f6feb", "p12": "#0f8b8d", "xs": "#bf3989"}
 MODEL, NOISE = "#d9730d", "#2b8a3e"
 QUANTITIES = {"speed": ("speed [mm/s]", 1e3), "position": ("position [mm]", 1e3), "P12": ("P12 [bar]", 1e-5),
@@ -40,7 +38,8 @@ def draw_overview(c: Comparison) -> str:
             _draw_replay(axes[1 + 2 * i], c, name)
             _draw_residual(axes[2 + 2 * i], c, name)
         for ax in axes:
-            _shade_sections(ax, c)
+            shade_sections(ax, run)
+            _shade_rows_left_out(ax, c)
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(run.t[0]), float(run.t[-1]) + run.period)
         figure.align_ylabels()
@@ -64,15 +63,12 @@ def _draw_residual(ax: Axes, c: Comparison, name: str) -> None:
     ax.set_ylabel(f"residual of\n{label} [{unit}]")
 
 
-def _shade_sections(ax: Axes, c: Comparison) -> None:
-    run = c.trace
-    for section in find_sections(run.com, run.period):
-        if section.kind in ("ramp", "dynamic"):
-            ax.axvspan(float(run.t[section.start]), float(run.t[section.stop - 1]),
-                       color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
-    out = (c.replay.undecided | ~run.usable).astype(int)
+def _shade_rows_left_out(ax: Axes, c: Comparison) -> None:
+    """Rows that are not judged, in red."""
+    t = c.trace.t
+    out = (c.replay.undecided | ~c.trace.usable).astype(int)
     for a, b in np.flatnonzero(np.diff(out, prepend=0, append=0)).reshape(-1, 2):
-        ax.axvspan(float(run.t[a]), float(run.t[b - 1]), color=RED, alpha=0.12, lw=0, zorder=-1)
+        ax.axvspan(float(t[a]), float(t[b - 1]), color=RED, alpha=0.12, lw=0, zorder=-1)
 
 
 def draw_shares(c: Comparison) -> str:

@@ -13,7 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.trace.sections import find_sections
+from fdi.trace.trace import Trace
+
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
@@ -22,6 +26,7 @@ STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
     "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+DRAWN_UNITS = {"xj": ("um", 1e6), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}  # unit of an axis, and SI value to it
 LINE_COLUMNS = 1400  # a line is drawn by its extremes in this many columns; a page shows no more
 
 
@@ -33,6 +38,14 @@ def start_figure(height: float, width: float = 11.0) -> Iterator[Figure]:
 
     with rc_context(STYLE):
         yield Figure(figsize=(width, height), layout="constrained")
+
+
+def shade_sections(ax: Axes, trace: Trace) -> None:
+    """Shade the ramps (blue) and the dynamic sections (violet) of the command."""
+    for section in find_sections(trace.com, trace.period):
+        if section.kind in ("ramp", "dynamic"):
+            ax.axvspan(float(trace.t[section.start]), float(trace.t[section.stop - 1]),
+                       color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
 
 
 def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:

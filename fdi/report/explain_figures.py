@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from fdi.discovery.candidates import Candidate
 from fdi.discovery.model_file import Row
 from fdi.discovery.search import Hypothesis
-from fdi.report.drawing import COMMAND, INK, start_figure, thin_line, to_svg
+from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES
-from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
     from fdi.discovery.residual_pattern import Pattern
 
@@ -24,7 +22,6 @@ Floats = NDArray[np.float64]
 
 AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar"), "spool": (1e6, "um"),
         "current": (1e3, "mA"), "time": (1.0, "s")}
-DRAWN_UNITS = {"xj": (1e6, "um"), "p12": (1e-5, "bar"), "xs": (1e6, "um")}
 BEFORE, AFTER, HELD, FLOOR = "#c9ced6", "#1f6feb", "#d9730d", "#2b8a3e"
 BAND = 2.0  # noise floors: noise stays within for 95 % of the time
 
@@ -39,7 +36,7 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
         axes[0].plot(*thin_line(t, trace.com * 1e3), color=COMMAND, lw=1.6)
         axes[0].set_ylabel("Com [mm]")
         for i, (ax, name) in enumerate(zip(axes[1:], trace.outputs, strict=True)):
-            scale, unit = DRAWN_UNITS[name]
+            unit, scale = DRAWN_UNITS[name]
             line = thin_line(t, before.fit.residuals[i, :n] * scale)
             ax.plot(*line, color=BEFORE, lw=0.9, label="model as it was")
             if after is not None:
@@ -51,19 +48,11 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
             ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
         axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
         for ax in axes:
-            _shade_sections(ax, trace)
+            shade_sections(ax, trace)
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(float(t[0]), float(t[-1]))
         figure.align_ylabels()
         return to_svg(figure, "left")
-
-
-def _shade_sections(ax: Axes, trace: Trace) -> None:
-    """Ramps and dynamic sections of the command."""
-    for s in find_sections(trace.com, trace.period):
-        if s.kind in ("ramp", "dynamic"):
-            ax.axvspan(float(trace.t[s.start]), float(trace.t[s.stop - 1]),
-                       color="#f1f3f8" if s.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
 
 
 def draw_ranking(candidates: Sequence[Candidate], floor: Mapping[str, float], most: int = 12) -> str:

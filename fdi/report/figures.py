@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from fdi.report.drawing import COMMAND, GREEN, INK, LINE_COLUMNS, RED, STYLE, thin_line, to_svg
+from fdi.report.drawing import COMMAND, GREEN, INK, LINE_COLUMNS, RED, STYLE, shade_sections, thin_line, to_svg
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def signals(trace: Trace) -> str:
             ax.set_ylabel(label)
             if name == "close":
                 ax.set_ylim(-calm * scale, calm * scale)
-            _sections(ax, trace)
+            shade_sections(ax, trace)
             for fault, t0, t1 in faults(trace):
                 ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
                 if ax is axes[0]:
@@ -146,13 +146,6 @@ def _calm(trace: Trace) -> float:
     error = np.abs(trace.com - trace.xj)[np.concatenate(ramps)] if ramps else np.empty(0)
     error = error[~np.isnan(error)]
     return 2.0 * float(np.percentile(error, 99)) if len(error) else 0.0
-
-
-def _sections(ax: Axes, trace: Trace) -> None:
-    for section in trace.sections():
-        if section.kind in ("ramp", "dynamic"):
-            ax.axvspan(float(trace.t[section.start]), float(trace.t[section.stop - 1]),
-                       color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
 
 
 def _windows(ax: Axes, trace: Trace) -> None:
