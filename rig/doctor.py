@@ -34,25 +34,26 @@ class Finding(NamedTuple):
     needed: bool = False  # without it not even the embedded bench runs
 
 
-def survey(seconds: float = 1.0) -> list[Finding]:
+def examine_machine(seconds: float = 1.0) -> list[Finding]:
     """Look at everything; `seconds` is how long each timer measurement takes, 0 leaves them out."""
-    areas: list[Callable[[], Iterator[Finding]]] = [python, can, viewer, tools, storage]
+    areas: list[Callable[[], Iterator[Finding]]] = [
+        examine_python, examine_buses, examine_viewer, examine_tools, examine_storage]
     found = [finding for area in areas for finding in area()]
-    return found + list(rights()) + list(timers(seconds) if seconds > 0 else ())
+    return found + list(examine_rights()) + list(measure_timers(seconds) if seconds > 0 else ())
 
 
-def _finding(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
+def _make_finding(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
     """A thing that is there (`value` says so) or missing (`value` is empty)."""
     if value:
         return Finding(area, name, "ok", value, purpose, needed=needed)
     return Finding(area, name, "missing", "not found", purpose, remedy, needed)
 
 
-def _apt(packages: str) -> str:
+def _advise_apt(packages: str) -> str:
     return f"apt-get install {packages}"
 
 
-def requirements() -> dict[str, list[str]]:
+def read_requirements() -> dict[str, list[str]]:
     """The project's declared dependencies by extra ('' for the plain ones): names only."""
     named: dict[str, list[str]] = {"": []}
     for line in metadata.requires("eha-rig") or []:
@@ -63,7 +64,7 @@ def requirements() -> dict[str, list[str]]:
     return named
 
 
-def versions(names: list[str]) -> dict[str, str]:
+def read_versions(names: list[str]) -> dict[str, str]:
     """Installed version of each distribution; empty if it is not installed."""
     found = {}
     for name in names:
@@ -74,24 +75,25 @@ def versions(names: list[str]) -> dict[str, str]:
     return found
 
 
-def python() -> Iterator[Finding]:
+def examine_python() -> Iterator[Finding]:
     """The interpreter and the packages of each extra."""
     version = f"{platform.python_implementation()} {platform.python_version()}"
     new_enough = sys.version_info >= (3, 11)
-    yield _finding("python", "Python", version if new_enough else "", "runs everything", "Python 3.11 or newer", True)
+    yield _make_finding("python", "Python", version if new_enough else "", "runs everything",
+                        "Python 3.11 or newer", needed=True)
     extras = {"": "the bench", "view": "the rerun viewer", "dev": "the tests", "fleet": "rig campaign",
               "learn": "comparators of rig fdi", "bench": "rivals of rig bench"}
-    for extra, names in requirements().items():
-        found = versions(names)
+    for extra, names in read_requirements().items():
+        found = read_versions(names)
         absent = [name for name, installed in found.items() if not installed]
         target = f"pip install 'eha-rig[{extra}]'" if extra else "pip install eha-rig"
         text = "" if absent else ", ".join(f"{name} {installed}" for name, installed in found.items())
         label = f"packages: {extra}" if extra else "packages"
-        finding = _finding("python", label, text, extras.get(extra, extra), target, needed=not extra)
+        finding = _make_finding("python", label, text, extras.get(extra, extra), target, needed=not extra)
         yield finding._replace(found="missing: " + ", ".join(absent)) if absent else finding
 
 
-def multicast_works(group: str = "239.74.163.2", port: int = 43113) -> bool:
+def is_multicast_working(group: str = "239.74.163.2", port: int = 43113) -> bool:
     """True if a datagram sent to a multicast group on the loopback interface comes back."""
     local = socket.inet_aton("127.0.0.1")
     try:
@@ -109,22 +111,24 @@ def multicast_works(group: str = "239.74.163.2", port: int = 43113) -> bool:
         return False
 
 
-def can() -> Iterator[Finding]:
+def examine_buses() -> Iterator[Finding]:
     """Every way to a bus: embedded needs nothing; between processes udp_multicast or a CAN interface."""
     yield Finding("bus", "embedded", "ok", "always", "the bench in one process (rig run)", needed=True)
-    multicast = "multicast on lo" if multicast_works() else ""
+    multicast = "multicast on lo" if is_multicast_working() else ""
     remedy = "ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo"
-    yield _finding("bus", "udp_multicast", multicast, "nodes in processes of their own, without CAN", remedy)
-    yield _finding("bus", "CAN in the kernel", _af_can(), "socketcan: real and virtual CAN", "a kernel with CONFIG_CAN")
-    up = ", ".join(bus.can_interfaces())
-    remedy = bus.socketcan_problem("vcan0")
-    yield _finding("bus", "CAN interface", up, "rig run --bus socketcan:vcan0, or hardware", remedy)
-    absent = [package for tool, package in GUEST_TOOLS.items() if shutil.which(tool, path=_PATH) is None]
+    yield _make_finding("bus", "udp_multicast", multicast, "nodes in processes of their own, without CAN", remedy)
+    yield _make_finding("bus", "CAN in the kernel", _describe_kernel_can(), "socketcan: real and virtual CAN",
+                        "a kernel with CONFIG_CAN")
+    up = ", ".join(bus.list_can_interfaces())
+    remedy = bus.explain_socketcan_problem("vcan0")
+    yield _make_finding("bus", "CAN interface", up, "rig run --bus socketcan:vcan0, or hardware", remedy)
+    absent = [package for tool, package in GUEST_TOOLS.items() if shutil.which(tool, path=_SEARCH_PATH) is None]
     guest = "" if absent else "User-Mode Linux with a vcan0"
-    yield _finding("bus", "CAN guest", guest, "the socketcan tests on a kernel without CAN", _apt(" ".join(absent)))
+    yield _make_finding("bus", "CAN guest", guest, "the socketcan tests on a kernel without CAN",
+                        _advise_apt(" ".join(absent)))
 
 
-def _af_can() -> str:
+def _describe_kernel_can() -> str:
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (OSError, AttributeError):
@@ -132,25 +136,26 @@ def _af_can() -> str:
     return "AF_CAN"
 
 
-_PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  # users seldom have the last three
+_SEARCH_PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  # users seldom have the last three
 GUEST_TOOLS = {"linux.uml": "user-mode-linux", "insmod": "kmod", "ip": "iproute2"}
 
 
-def viewer() -> Iterator[Finding]:
+def examine_viewer() -> Iterator[Finding]:
     """What `rig view` needs: the viewer, and something that draws."""
-    found = versions(["rerun-sdk"])["rerun-sdk"]
-    yield _finding("viewer", "rerun", found, "rig view TRACE", "pip install 'eha-rig[view]'")
+    found = read_versions(["rerun-sdk"])["rerun-sdk"]
+    yield _make_finding("viewer", "rerun", found, "rig view TRACE", "pip install 'eha-rig[view]'")
     screen = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or ""
-    yield _finding("viewer", "display", screen, "the viewer's window; screenshots need none", "a desktop session")
+    yield _make_finding("viewer", "display", screen, "the viewer's window; screenshots need none", "a desktop session")
     drivers = [file for folder in ("/usr/share", "/etc") for file in Path(folder, "vulkan/icd.d").glob("*.json")]
     library = ctypes.util.find_library("vulkan") or ""
     text = f"{library}, {len(drivers)} drivers" if library and drivers else ""
-    yield _finding("viewer", "Vulkan", text, "draws it, also without a screen", _apt("mesa-vulkan-drivers libvulkan1"))
+    yield _make_finding("viewer", "Vulkan", text, "draws it, also without a screen",
+                        _advise_apt("mesa-vulkan-drivers libvulkan1"))
 
 
-def _first_line(*command: str) -> str:
+def _read_version_line(*command: str) -> str:
     """First line a tool prints about its version; empty if there is no such tool."""
-    path = shutil.which(command[0], path=_PATH)
+    path = shutil.which(command[0], path=_SEARCH_PATH)
     if path is None:
         return ""
     try:
@@ -160,18 +165,19 @@ def _first_line(*command: str) -> str:
     return next(iter((out.stdout + out.stderr).splitlines()), path)
 
 
-def tools() -> Iterator[Finding]:
+def examine_tools() -> Iterator[Finding]:
     """Programs of the system that some commands and tests use."""
-    compiler = next((text for name in ("cc", "gcc", "clang") if (text := _first_line(name, "--version"))), "")
-    yield _finding("tools", "C compiler", compiler, "rig bench compares with C", _apt("gcc libc6-dev"))
-    candump = shutil.which("candump", path=_PATH) or ""
-    yield _finding("tools", "candump", candump, "an independent log of a CAN interface", _apt("can-utils"))
-    tshark = shutil.which("tshark", path=_PATH) or ""
-    yield _finding("tools", "tshark", tshark, "an independent CANopen decoding", _apt("tshark"))
-    yield _finding("tools", "git", _first_line("git", "--version"), "the project's state in each log", _apt("git"))
+    compiler = next((text for name in ("cc", "gcc", "clang") if (text := _read_version_line(name, "--version"))), "")
+    yield _make_finding("tools", "C compiler", compiler, "rig bench compares with C", _advise_apt("gcc libc6-dev"))
+    candump = shutil.which("candump", path=_SEARCH_PATH) or ""
+    yield _make_finding("tools", "candump", candump, "an independent log of a CAN interface", _advise_apt("can-utils"))
+    tshark = shutil.which("tshark", path=_SEARCH_PATH) or ""
+    yield _make_finding("tools", "tshark", tshark, "an independent CANopen decoding", _advise_apt("tshark"))
+    yield _make_finding("tools", "git", _read_version_line("git", "--version"), "the project's state in each log",
+                        _advise_apt("git"))
 
 
-def storage() -> Iterator[Finding]:
+def examine_storage() -> Iterator[Finding]:
     """Places that are written to."""
     from plant.compile import cache_folder  # here: it loads numba, which takes a second
 
@@ -187,46 +193,46 @@ def storage() -> Iterator[Finding]:
     yield Finding("storage", "disk", status, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", remedy)
 
 
-def _read(path: str) -> str:
+def _read_text(path: str) -> str:
     try:
         return Path(path).read_text().strip()
     except OSError:
         return ""
 
 
-def rights() -> Iterator[Finding]:
+def examine_rights() -> Iterator[Finding]:
     """Kernel and rights that decide how well `--pace realtime` can keep its cycle."""
-    preempt_rt = _read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
+    preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
     kernel = f"{platform.release()}, {'PREEMPT_RT' if preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
     remedy = "" if preempt_rt else "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"
     yield Finding("real time", "kernel", "ok" if preempt_rt else "limited", kernel, "bounds the worst lateness", remedy)
-    fifo = bool(lateness.under_fifo(lambda: True))
-    limit = lateness.priority_limit()
+    fifo = bool(lateness.run_under_fifo(lambda: True))
+    limit = lateness.read_priority_limit()
     text = f"SCHED_FIFO up to priority {limit}" if fifo else ""
     remedy = "as root: echo \"$USER - rtprio 90\" >> /etc/security/limits.d/rt.conf, then log in again"
-    yield _finding("real time", "priority", text, "other programs do not delay the loop", remedy)
-    locked = lateness.memory_lock_limit()
+    yield _make_finding("real time", "priority", text, "other programs do not delay the loop", remedy)
+    locked = lateness.read_memory_lock_limit()
     enough = locked < 0 or locked >= 1 << 29
     text = "unlimited" if locked < 0 else f"{locked / 1e6:.0f} MB"
     remedy = "" if enough else "as root: echo \"$USER - memlock unlimited\" >> /etc/security/limits.d/rt.conf"
     yield Finding("real time", "memory lock", "ok" if enough else "limited", text, "no page faults in the loop", remedy)
-    source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
-    clock = f"{lateness.clock_resolution_ns():.0f} ns, {source}"
-    fine = lateness.clock_resolution_ns() <= 1e3
+    source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
+    clock = f"{lateness.read_clock_resolution_ns():.0f} ns, {source}"
+    fine = lateness.read_clock_resolution_ns() <= 1e3
     remedy = "" if fine else "a kernel with CONFIG_HIGH_RES_TIMERS"
     yield Finding("real time", "clock", "ok" if fine else "limited", clock, "the cycle's due times", remedy)
 
 
-def timers(seconds: float) -> Iterator[Finding]:
+def measure_timers(seconds: float) -> Iterator[Finding]:
     """Lateness of a 1 kHz timer, measured now: as an ordinary process, and under SCHED_FIFO where that is allowed."""
-    ordinary = lateness.timer_lateness(seconds)
-    yield _timer("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
-    fifo = lateness.under_fifo(lambda: lateness.timer_lateness(seconds))
+    ordinary = lateness.measure_timer_lateness(seconds)
+    yield _make_timer_finding("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
+    fifo = lateness.run_under_fifo(lambda: lateness.measure_timer_lateness(seconds))
     if fifo is not None:
-        yield _timer("timer under FIFO", fifo, "the same with real-time priority")
+        yield _make_timer_finding("timer under FIFO", fifo, "the same with real-time priority")
 
 
-def _timer(name: str, late: lateness.Lateness, purpose: str) -> Finding:
+def _make_timer_finding(name: str, late: lateness.Lateness, purpose: str) -> Finding:
     text = f"late by {late.p50:.0f} us (p50), {late.p99:.0f} (p99), {late.p99_9:.0f} (p99.9), {late.max:.0f} (max)"
     if late.missed == 0:
         return Finding("real time", name, "ok", text, purpose)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rig_command import rig
 
-from rig.network.bus import socketcan_problem
+from rig.network.bus import explain_socketcan_problem
 
 pytest_plugins = ["plugin_bus_summary"]
 
@@ -16,7 +16,7 @@ pytest_plugins = ["plugin_bus_summary"]
 def bus_kind(request: pytest.FixtureRequest) -> str:
     """The back end a bus test runs on. Without vcan0 the socketcan ones skip, or fail with EHA_RIG_REQUIRE_VCAN=1."""
     kind: str = request.param
-    problem = socketcan_problem("vcan0") if kind == "socketcan" else ""
+    problem = explain_socketcan_problem("vcan0") if kind == "socketcan" else ""
     if problem and os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1":
         pytest.fail(problem)
     if problem:

@@ -15,7 +15,7 @@ from plant.errors import InputError, RigError
 from rig.network.frame import Frame, Node, Send
 from rig.network.udp import LoopbackBus
 
-VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
+BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
 BITRATE = 1_000_000  # bit/s
 _GROUP = "239.74.163.2"  # python-can's IPv4 default
 _NETWORK = Path("/sys/class/net")
@@ -26,7 +26,7 @@ AnyNode = TypeVar("AnyNode", bound=Node)
 Receive = Callable[[Frame], None]
 
 
-class Embedded:
+class EmbeddedBus:
     """An in-process bus in one thread. Frames wait in one queue and are delivered in the order they were sent.
 
     There is no arbitration and no bit time: the order is the nodes' doing, which is what makes a lockstep run repeat.
@@ -73,23 +73,23 @@ class Embedded:
         return count
 
 
-def choose(spec: str = "auto") -> tuple[str, str]:
+def choose_bus(spec: str = "auto") -> tuple[str, str]:
     """The bus to use for what the user wrote, and a sentence saying why.
 
     `auto` is the bus that EHA_RIG_BUS names, else the embedded one: nothing sends on hardware unasked. Raises
     InputError for a spec that means nothing, RigError for a CAN interface that is not there, also when the variable
     names it: a bench that was told to use hardware must not pass on its own simulation.
     """
-    configured = os.environ.get(VARIABLE, "")
+    configured = os.environ.get(BUS_VARIABLE, "")
     if spec == "auto" and configured in ("", "auto"):
-        live = can_interfaces()
+        live = list_can_interfaces()
         unasked = f"; {', '.join(live)} up, but not taken unasked" if live else ""
-        return "embedded", f"embedded bus: no --bus and no {VARIABLE}{unasked}"
-    where, taken = (VARIABLE, configured) if spec == "auto" else ("--bus", spec)
-    kind, channel = _split(taken, where)
+        return "embedded", f"embedded bus: no --bus and no {BUS_VARIABLE}{unasked}"
+    where, taken = (BUS_VARIABLE, configured) if spec == "auto" else ("--bus", spec)
+    kind, channel = _parse_spec(taken, where)
     if kind == "socketcan":
-        _require_live(channel)
-    return taken, f"{taken}, as {VARIABLE} says" if where == VARIABLE else f"{taken}, as asked"
+        _require_interface(channel)
+    return taken, f"{taken}, as {BUS_VARIABLE} says" if where == BUS_VARIABLE else f"{taken}, as asked"
 
 
 def open_can(spec: str) -> can.BusABC:
@@ -98,11 +98,11 @@ def open_can(spec: str) -> can.BusABC:
 
     Raises InputError for a bad spec, RigError if the bus cannot be had.
     """
-    kind, channel = _split(spec, "--bus")
+    kind, channel = _parse_spec(spec, "--bus")
     if kind == "embedded":
         raise InputError("--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     if kind == "socketcan":
-        _require_live(channel)
+        _require_interface(channel)
     try:
         if kind == "virtual":
             return can.Bus(interface="virtual", channel=channel)
@@ -113,14 +113,14 @@ def open_can(spec: str) -> can.BusABC:
         raise RigError(f"{spec}: {error}".replace("\n", " ")) from error
 
 
-def can_interfaces() -> list[str]:
+def list_can_interfaces() -> list[str]:
     """The kernel's CAN interfaces that are up, real and virtual."""
     found = _NETWORK.glob("*/type") if _NETWORK.exists() else []
     names = sorted(path.parent.name for path in found if path.read_text().strip() == _ARPHRD_CAN)
-    return [name for name in names if not socketcan_problem(name)]
+    return [name for name in names if not explain_socketcan_problem(name)]
 
 
-def socketcan_problem(interface: str) -> str:
+def explain_socketcan_problem(interface: str) -> str:
     """Why a kernel CAN interface cannot be used and how to get it, in one line; empty if it can."""
     virtual = interface.startswith("vcan")
     up = f"sudo ip link set {interface} up" + ("" if virtual else f" type can bitrate {BITRATE}")
@@ -139,13 +139,13 @@ def socketcan_problem(interface: str) -> str:
     return ""
 
 
-def _require_live(interface: str) -> None:
-    problem = socketcan_problem(interface)
+def _require_interface(interface: str) -> None:
+    problem = explain_socketcan_problem(interface)
     if problem:
         raise RigError(f"socketcan:{interface}: {problem}")
 
 
-def _split(spec: str, where: str) -> tuple[str, str]:
+def _parse_spec(spec: str, where: str) -> tuple[str, str]:
     """Kind and channel of a spec, defaults filled in. Raises InputError."""
     kind, _, channel = spec.partition(":")
     if kind == "embedded" and not channel:

@@ -33,8 +33,8 @@ class LoopbackBus(can.BusABC):
         self.channel_info = f"udp_multicast {group}:{port} on the loopback interface"
         self.overflows = 0
         self._destination = group, port
-        self._rx = _socket()
-        self._tx = _socket()
+        self._rx = _make_socket()
+        self._tx = _make_socket()
         try:
             self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
@@ -46,7 +46,7 @@ class LoopbackBus(can.BusABC):
             self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
             self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             self._tx.bind(("127.0.0.1", 0))
-            self._turn = _lock(f"eha-rig-{group}-{port}.lock")
+            self._turn = _open_lock_file(f"eha-rig-{group}-{port}.lock")
         except OSError as error:
             self._rx.close()
             self._tx.close()
@@ -61,7 +61,7 @@ class LoopbackBus(can.BusABC):
                 if (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
                     (self.overflows,) = struct.unpack("=I", value)
             if sender != self._own:
-                return _message(data), False
+                return _decode_message(data), False
             timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
         return None, False
 
@@ -86,7 +86,7 @@ class LoopbackBus(can.BusABC):
         self._turn.close()
 
 
-def _lock(name: str) -> IO[bytes]:
+def _open_lock_file(name: str) -> IO[bytes]:
     """A file of this name that processes of all users may lock."""
     path = Path(tempfile.gettempdir()) / name
     if not path.exists():
@@ -95,7 +95,7 @@ def _lock(name: str) -> IO[bytes]:
     return path.open("rb")
 
 
-def _message(data: bytes) -> can.Message:
+def _decode_message(data: bytes) -> can.Message:
     """The frame in a datagram; a datagram that holds none is an error frame."""
     try:
         return unpack_message(data, check=True)
@@ -103,5 +103,5 @@ def _message(data: bytes) -> can.Message:
         return can.Message(is_error_frame=True)
 
 
-def _socket() -> socket.socket:
+def _make_socket() -> socket.socket:
     return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from rig.network.bus import Embedded
+from rig.network.bus import EmbeddedBus
 from rig.network.clock import Clock, WallClock
 from rig.network.frame import Frame, Node, Send
 from rig.network.link import Link
@@ -34,7 +34,7 @@ class Wire(Protocol):
         """Give the bus back."""
 
 
-def _nowhere(frame: Frame) -> None:
+def _ignore_frame(frame: Frame) -> None:
     """Nobody listens yet."""
 
 
@@ -43,8 +43,8 @@ class EmbeddedWire:
 
     def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
         self.clock, self._period = clock, period_ns
-        self.receive: Callable[[Frame], None] = _nowhere
-        self._bus = Embedded()
+        self.receive: Callable[[Frame], None] = _ignore_frame
+        self._bus = EmbeddedBus()
         self.send = self._bus.attach(lambda frame: self.receive(frame))
         self._nodes = [self._bus.add(make) for make in makers]
 
@@ -90,7 +90,7 @@ class LinkWire:
         self.clock: Clock = clock
         self.link, self._grace = link, grace
         self._missed = 0  # cycles in a row without all frames
-        self.receive: Callable[[Frame], None] = _nowhere
+        self.receive: Callable[[Frame], None] = _ignore_frame
         self.send: Send = link.send
 
     def wait(self, done: Done, seconds: float) -> bool:
@@ -123,7 +123,7 @@ class LinkWire:
             self.receive(frame)
 
 
-def serve(node: Node, link: Link, clock: Clock, stop: Done) -> None:
+def serve_node(node: Node, link: Link, clock: Clock, stop: Done) -> None:
     """Run one node on a link until `stop()`: the whole of `rig node`."""
     tick = clock.now() + MS
     while not stop():

@@ -36,7 +36,7 @@ class Gains(NamedTuple):
     period: float
 
 
-def gains_of(model: Model) -> Gains:
+def read_gains(model: Model) -> Gains:
     """What a model's [controller] says."""
     return Gains(*(model[f"controller.{field}"] for field in Gains._fields))
 

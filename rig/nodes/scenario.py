@@ -12,10 +12,10 @@ from plant.segments import Array
 from rig.sequences.faults import Plan
 from rig.sequences.parameters import require_sensible
 
-FORCE = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
-SENT = 1 << 20  # bytes in one SDO download, as the node's server has it
-LARGEST = 1 << 26  # bytes of JSON: six hours of random load
-LONGEST = 20_000_000  # cycles; noise is drawn for all of them beforehand
+FORCE_RESOLUTION = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
+LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it
+LARGEST_JSON = 1 << 26  # bytes of JSON: six hours of random load
+LONGEST_PLAN = 20_000_000  # cycles; noise is drawn for all of them beforehand
 WHERE = "scenario (object 0x2210)"
 
 
@@ -36,12 +36,12 @@ class Scenario(NamedTuple):
         """
         require_servovalve(model)
         require_sensible(plan, model)
-        counts = [0] * plan.start + np.rint(load / FORCE).astype(int).tolist()
-        return cls(model.having(_touched(plan)), plan, tuple(counts), seed)
+        counts = [0] * plan.start + np.rint(load / FORCE_RESOLUTION).astype(int).tolist()
+        return cls(model.having(_find_changed_groups(plan)), plan, tuple(counts), seed)
 
     def load(self) -> list[float]:
         """Load on the ram in N, one a cycle; none after the last."""
-        return [count * FORCE for count in self.force]
+        return [count * FORCE_RESOLUTION for count in self.force]
 
     def to_bytes(self) -> bytes:
         """JSON, compressed. Loads are second differences: constant and ramp are zeros.
@@ -53,8 +53,8 @@ class Scenario(NamedTuple):
         data = zlib.compress(json.dumps({
             "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.differences()},
             "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
-        if len(data) > SENT:
-            raise InputError("load", "", f"a load (and faults) of at most {SENT >> 10} KiB compressed, not "
+        if len(data) > LARGEST_DOWNLOAD:
+            raise InputError("load", "", f"a load (and faults) of at most {LARGEST_DOWNLOAD >> 10} KiB compressed, not "
                                          f"{len(data) >> 10} KiB: fewer recorded cycles, or fewer digits")
         return data
 
@@ -66,13 +66,13 @@ class Scenario(NamedTuple):
             InputError: it is none, or names what this node does not know.
         """
         try:
-            table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, LARGEST))
+            table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, LARGEST_JSON))
             named = table["model"]
             model = Model(str(named["name"])).having(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
             plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
-            if seed < 0 or not 0 <= plan.start <= plan.stop <= LONGEST:
-                raise InputError(WHERE, "plan", f"a seed from 0, and at most {LONGEST} cycles")
+            if seed < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
+                raise InputError(WHERE, "plan", f"a seed from 0, and at most {LONGEST_PLAN} cycles")
             require_sensible(plan, model)
             return cls(model, plan, tuple(force), seed)
         except InputError:
@@ -87,6 +87,6 @@ def require_servovalve(model: Model) -> None:
         raise InputError("--model", model.name, "a model of eha; the bench drives a servovalve")
 
 
-def _touched(plan: Plan) -> set[str]:
+def _find_changed_groups(plan: Plan) -> set[str]:
     """Groups of the parameters that faults change: the plant must have their effects from the start."""
     return {fault.parameter.partition(".")[0] for fault in plan.faults if hasattr(fault, "parameter")}

@@ -37,7 +37,7 @@ from mcap.records import (
 MAGIC = b"\x89MCAP0\r\n"
 
 
-def record_bytes(records: Iterable[McapRecord]) -> bytes:
+def encode_records(records: Iterable[McapRecord]) -> bytes:
     """The records as they stand in a file."""
     out = RecordBuilder()
     for record in records:
@@ -59,7 +59,7 @@ class McapFile:
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._declared = False  # schemas and channels stand at the head of the first chunk
-        self._write(MAGIC + record_bytes([Header(profile="", library=library)]))
+        self._write(MAGIC + encode_records([Header(profile="", library=library)]))
 
     def _write(self, data: bytes) -> None:
         view = memoryview(data)
@@ -73,26 +73,26 @@ class McapFile:
 
     def attachment(self, name: str, media_type: str, data: bytes, time_ns: int = 0) -> None:
         """A file to keep with the log."""
-        raw = record_bytes([Attachment(time_ns, time_ns, name, media_type, data)])
+        raw = encode_records([Attachment(time_ns, time_ns, name, media_type, data)])
         self._attachments.append(AttachmentIndex(self._offset, len(raw), time_ns, time_ns, len(data), name, media_type))
         self._write(raw)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Names and values of the run."""
-        raw = record_bytes([Metadata(name=name, metadata=dict(values))])
+        raw = encode_records([Metadata(name=name, metadata=dict(values))])
         self._metadata.append(MetadataIndex(self._offset, len(raw), name))
         self._write(raw)
 
     def chunk(self, raw: bytes, index: Mapping[int, array[int]]) -> None:
         """Messages as records, and for each channel its pairs (log time ns, offset in `raw`) in one flat array."""
         if not self._declared:
-            head = record_bytes([*self.schemas.values(), *self.channels.values()])
+            head = encode_records([*self.schemas.values(), *self.channels.values()])
             raw, shift, self._declared = head + raw, len(head), True
             index = {c: array("Q", (v + shift * (i & 1) for i, v in enumerate(pairs))) for c, pairs in index.items()}
         packed = zstandard.compress(raw)
         times = [t for pairs in index.values() for t in (min(pairs[::2]), max(pairs[::2]))]
         chunk = Chunk("zstd", packed, max(times), min(times), zlib.crc32(raw), len(raw))
-        out = [record_bytes([chunk])]
+        out = [encode_records([chunk])]
         length = len(out[0])
         where, offsets = self._offset + length, {}
         for channel, pairs in index.items():
@@ -116,7 +116,7 @@ class McapFile:
 
     def finish(self) -> None:
         """Write the summary and close."""
-        self._write(record_bytes([DataEnd(data_section_crc=0)]))
+        self._write(encode_records([DataEnd(data_section_crc=0)]))
         start, summary, offsets = self._offset, b"", []
         groups: list[tuple[int, list[McapRecord]]] = [
             (Opcode.SCHEMA, [*self.schemas.values()]), (Opcode.CHANNEL, [*self.channels.values()]),
@@ -124,13 +124,13 @@ class McapFile:
             (Opcode.ATTACHMENT_INDEX, [*self._attachments]), (Opcode.METADATA_INDEX, [*self._metadata])]
         for opcode, records in groups:
             if records:
-                group = record_bytes(records)
+                group = encode_records(records)
                 offsets.append(SummaryOffset(opcode, start + len(summary), len(group)))
                 summary += group
         at = start + len(summary)
-        summary += record_bytes(offsets)
+        summary += encode_records(offsets)
         crc = zlib.crc32(summary + struct.pack("<BQQQ", Opcode.FOOTER, 20, start, at))
-        self._write(summary + record_bytes([Footer(start, at, crc)]) + MAGIC)
+        self._write(summary + encode_records([Footer(start, at, crc)]) + MAGIC)
         self.close()
 
     def close(self) -> None:

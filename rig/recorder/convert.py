@@ -15,15 +15,15 @@ from plant.errors import InputError
 from rig.device.nmt import NmtState as State
 from rig.network import codec
 from rig.network.frame import Frame
-from rig.recorder.provenance import provenance
+from rig.recorder.provenance import collect_provenance
 from rig.recorder.schema import Event, NmtState, Record, Signals
 from rig.recorder.writer import Recorder
 
-RAW = (".log", ".blf", ".asc", ".trc")
+RAW_SUFFIXES = (".log", ".blf", ".asc", ".trc")
 NAN = math.nan
 
 
-def export(source: Path, out: Path, everything: bool = False) -> int:
+def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     """Write a trace as the suffix of `out` says: .csv, .csv.gz: the signals; .log, .blf, .asc, .trc: the raw frames.
 
     `everything`: signals of set-up and clean-up too; raw frames are always all of them. -> rows or frames written.
@@ -33,14 +33,14 @@ def export(source: Path, out: Path, everything: bool = False) -> int:
         trace = Trace.read(source, all=everything)
         trace.write_csv(writable(out, "--out", source=source))
         return len(trace)
-    if out.suffix not in RAW:
-        raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW)}")
+    if out.suffix not in RAW_SUFFIXES:
+        raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
     import can
 
     path = source / "trace.mcap" if source.is_dir() else source
     if path.suffix != ".mcap":
         raise InputError(path, "", "a log with raw frames (.mcap)")
-    raw = list(frames(path))
+    raw = list(read_raw_frames(path))
     if not raw:
         raise InputError(path, "/can", "at least one raw frame")
     try:
@@ -53,7 +53,7 @@ def export(source: Path, out: Path, everything: bool = False) -> int:
     return len(raw)
 
 
-def frames(path: Path) -> Iterator[Frame]:
+def read_raw_frames(path: Path) -> Iterator[Frame]:
     """The raw frames of a log."""
     for _, t_ns, message in open_log(path).messages("/can"):
         yield Frame(t_ns, message.cob_id, message.data)
@@ -62,7 +62,7 @@ def frames(path: Path) -> Iterator[Frame]:
 def import_csv(source: Path, out: Path) -> int:
     """Make a log with signals only from a CSV trace; -> cycles."""
     trace = Trace.read(source)
-    write_mcap(trace, out, provenance(imported=source.name, period=trace.period, pace="imported"))
+    write_mcap(trace, out, collect_provenance(imported=source.name, period=trace.period, pace="imported"))
     return len(trace)
 
 
@@ -72,13 +72,14 @@ def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = Non
     Raises InputError for a place that cannot be written; unlike a run it makes no folder.
     """
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
-    recorder = Recorder(_mcap(out), {n: ("application/octet-stream", d) for n, d in trace.attachments.items()}, given)
+    attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
+    recorder = Recorder(_require_mcap(out), attachments, given)
     columns = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
     for k, (phase, *values) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
         if not all(math.isnan(value) for value in values):
             com, xj, cor, p12, xs, load = values
             recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
-            _wait(recorder, k)
+            _wait_for_writer(recorder, k)
     recorder.close()
 
 
@@ -89,14 +90,14 @@ def import_frames(source: Path, out: Path, dbc: Path) -> int:
     Raises InputError for a file or DBC that cannot be read, and when there is no SYNC in it.
     """
     raw = list(_read_frames(source))
-    cycles = _Cycles(_decoder(dbc))
+    cycles = _CycleBuilder(_load_decoder(dbc))
     records = [(frame.t_ns, record) for frame in raw for record in cycles.feed(frame)]
     if not cycles.rows:
         raise InputError(source, "", f"at least one SYNC frame (0x{codec.SYNC:03X})")
     spans = [b[0] - a[0] for a, b in zip(cycles.rows, cycles.rows[1:], strict=False)]
     period = round(sorted(spans)[len(spans) // 2] / 1e9, 4) if spans else 1e-3
-    recorder = Recorder(_mcap(out), {dbc.name: ("text/plain", dbc.read_bytes())},
-                        provenance(imported=source.name, period=period, pace="imported"))
+    recorder = Recorder(_require_mcap(out), {dbc.name: ("text/plain", dbc.read_bytes())},
+                        collect_provenance(imported=source.name, period=period, pace="imported"))
     items: list[tuple[int, Frame | Record]] = [(f.t_ns, f) for f in raw]
     items += [*cycles.rows, *records]
     for k, (t_ns, item) in enumerate(sorted(items, key=lambda pair: pair[0])):
@@ -104,12 +105,12 @@ def import_frames(source: Path, out: Path, dbc: Path) -> int:
             recorder.frame(item)
         else:
             recorder.put(t_ns, item)
-        _wait(recorder, k)
+        _wait_for_writer(recorder, k)
     recorder.close()
     return len(cycles.rows)
 
 
-class _Cycles:
+class _CycleBuilder:
     """Frames in, one Signals a SYNC out; heartbeats and emergencies become records on the way."""
 
     def __init__(self, decode: dict[int, Any]) -> None:
@@ -132,7 +133,7 @@ class _Cycles:
             self._signals(cob_id, message.decode(frame.data, decode_choices=False))
         elif 0x700 < cob_id < 0x780 and len(frame.data) == 1 and self._nmt.get(node) != frame.data[0]:
             self._nmt[node] = frame.data[0]
-            return [NmtState(node, frame.data[0], _state_name(frame.data[0]))]
+            return [NmtState(node, frame.data[0], _name_state(frame.data[0]))]
         elif codec.SYNC < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
             return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
@@ -162,7 +163,7 @@ class _Cycles:
                     row.cor, row.status = values["current"], values["status_word"]
 
 
-def _state_name(code: int) -> str:
+def _name_state(code: int) -> str:
     try:
         return State(code).name.lower().replace("_", "-")
     except ValueError:
@@ -187,7 +188,7 @@ def _read_frames(source: Path) -> Iterator[Frame]:
         raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
 
 
-def _decoder(dbc: Path) -> dict[int, Any]:
+def _load_decoder(dbc: Path) -> dict[int, Any]:
     import cantools
 
     try:
@@ -206,13 +207,13 @@ def _decoder(dbc: Path) -> dict[int, Any]:
     return {cob_id: found[cob_id] for cob_id in wanted}
 
 
-def _mcap(out: Path) -> Path:
+def _require_mcap(out: Path) -> Path:
     if out.suffix != ".mcap":
         raise InputError(out, "--out", "a name that ends in .mcap")
     return writable(out, "--out")
 
 
-def _wait(recorder: Recorder, item: int) -> None:
+def _wait_for_writer(recorder: Recorder, item: int) -> None:
     """Let the writer keep up: here nothing paces the loop."""
     if item % 10_000 == 0:
         while recorder.waiting > 100_000:

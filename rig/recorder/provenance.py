@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap", "protobuf")
+RECORDED_PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap", "protobuf")
 
 
-def provenance(**given: object) -> dict[str, str]:
+def collect_provenance(**given: object) -> dict[str, str]:
     """Host, time, package versions and state of the checkout, with what only the caller knows (seed, bus, pace, model).
 
     >>> provenance(seed=1)["seed"]
@@ -23,7 +23,7 @@ def provenance(**given: object) -> dict[str, str]:
         "host": platform.node(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}, {os.cpu_count()} processors",
         "python": platform.python_version(),
-        **{f"version.{name}": _read_version(name) for name in PACKAGES},
+        **{f"version.{name}": _read_version(name) for name in RECORDED_PACKAGES},
         **_read_git_state(Path(__file__).parents[2]),
     }
 

@@ -43,7 +43,7 @@ class Salvage:
                 f"what the writer had not yet written, at most about 0.25 s")
 
 
-def recover(path: Path, out: Path) -> Salvage:
+def recover_log(path: Path, out: Path) -> Salvage:
     """Write what is sound in `path` to `out`, a complete indexed MCAP file with the attachments and metadata.
 
     Raises InputError when `path` cannot be read or holds nothing sound, and when `out` cannot be written.
@@ -53,18 +53,18 @@ def recover(path: Path, out: Path) -> Salvage:
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
     with source:
-        reading = _Reading(source, path.stat().st_size)
+        reading = _IntactRecords(source, path.stat().st_size)
         records = iter(reading)
         first = next(records, None)
         if first is None:
             raise InputError(path, "", f"an MCAP log with something in it ({reading.reason or 'it is empty'})")
         try:
-            return _write(chain([first], records), reading, writable(out, "--out", source=path))
+            return _write_salvage(chain([first], records), reading, writable(out, "--out", source=path))
         except OSError as error:
             raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 
 
-class _Reading:
+class _IntactRecords:
     """Iterates over the sound records of a log up to where it ends; a damaged chunk in the middle is left out."""
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
@@ -89,7 +89,7 @@ class _Reading:
             self.lost += self._size - at
 
 
-def _write(records: Iterator[McapRecord], reading: _Reading, out: Path) -> Salvage:
+def _write_salvage(records: Iterator[McapRecord], reading: _IntactRecords, out: Path) -> Salvage:
     file = McapFile(out, "eha-rig recover", [], [])
     names = []
     for record in records:
@@ -100,14 +100,14 @@ def _write(records: Iterator[McapRecord], reading: _Reading, out: Path) -> Salva
             file.metadata(record.name, record.metadata)
         elif isinstance(record, Chunk):
             for item in breakup_chunk(record) if not file.channels else ():
-                _declare(file, item)
+                _add_declaration(file, item)
             stream, size = get_chunk_data_stream(record)
             raw = stream.read(size)
-            index = _index(raw)
+            index = _index_messages(raw)
             if index:
                 file.chunk(raw, index)
         else:
-            _declare(file, record)
+            _add_declaration(file, record)
     if reading.reason:
         file.metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
     counts = file.statistics()
@@ -118,14 +118,14 @@ def _write(records: Iterator[McapRecord], reading: _Reading, out: Path) -> Salva
                    reading.reason)
 
 
-def _declare(file: McapFile, record: McapRecord) -> None:
+def _add_declaration(file: McapFile, record: McapRecord) -> None:
     if isinstance(record, Schema):
         file.schemas[record.id] = record
     elif isinstance(record, Channel):
         file.channels[record.id] = record
 
 
-def _index(raw: bytes) -> dict[int, array[int]]:
+def _index_messages(raw: bytes) -> dict[int, array[int]]:
     """Channel -> flat pairs (log time ns, offset) of the messages in a chunk."""
     index: dict[int, array[int]] = {}
     for channel, time_ns, at, _ in scan_messages(raw):

@@ -30,7 +30,7 @@ _HEAD = "<BQHIQQ"  # MCAP message record: opcode, length, channel, sequence, log
 _MESSAGE = 0x05
 
 
-def _doc(text: str, unit: str = "", **kw: Any) -> Any:
+def _describe_field(text: str, unit: str = "", **kw: Any) -> Any:
     return field(metadata={"unit": unit, "doc": text}, **kw)
 
 
@@ -38,71 +38,72 @@ def _doc(text: str, unit: str = "", **kw: Any) -> Any:
 class CanFrame:
     """A raw classical CAN frame; its time is the log time."""
 
-    cob_id: U32 = _doc("11-bit identifier")
-    data: bytes = _doc("0-8 bytes")
+    cob_id: U32 = _describe_field("11-bit identifier")
+    data: bytes = _describe_field("0-8 bytes")
 
 
 @dataclass(slots=True)
 class Signals:
     """One cycle, decoded: row k holds Com_k, XJ_k as sensed and Cor_k, the answer to sample k. NaN: no sample."""
 
-    cycle: U32 = _doc("cycles since the run began, not wrapped as on the bus")
-    phase: U32 = _doc("0 set-up, 1 main, 2 clean-up")
-    com: float = _doc("position demand", "m")
-    xj: float = _doc("ram position as sensed", "m")
-    cor: float = _doc("current demand of the controller", "A")
-    p12: float = _doc("differential pressure as sensed", "Pa")
-    xs: float = _doc("spool position as sensed", "m")
-    load: float = _doc("known external force on the ram, positive against extension", "N")
-    control: U32 = _doc("control word, CiA 408 object 0x6040")
-    status: U32 = _doc("status word, CiA 408 object 0x6041")
-    flags: U32 = _doc("flags of the plant node")
+    cycle: U32 = _describe_field("cycles since the run began, not wrapped as on the bus")
+    phase: U32 = _describe_field("0 set-up, 1 main, 2 clean-up")
+    com: float = _describe_field("position demand", "m")
+    xj: float = _describe_field("ram position as sensed", "m")
+    cor: float = _describe_field("current demand of the controller", "A")
+    p12: float = _describe_field("differential pressure as sensed", "Pa")
+    xs: float = _describe_field("spool position as sensed", "m")
+    load: float = _describe_field("known external force on the ram, positive against extension", "N")
+    control: U32 = _describe_field("control word, CiA 408 object 0x6040")
+    status: U32 = _describe_field("status word, CiA 408 object 0x6041")
+    flags: U32 = _describe_field("flags of the plant node")
 
 
 @dataclass(slots=True)
 class Timing:
     """When one cycle ran; all times are on the wall clock, also in lockstep."""
 
-    cycle: U32 = _doc("as in /signals")
-    overrun: bool = _doc("the cycle was skipped or ended after the next one was due")
-    lateness: float = _doc("SYNC sent this long after it was due", "s")
-    response: float = _doc("from SYNC to the controller's drive frame; NaN: none came", "s")
-    work: float = _doc("time the bench spent in the cycle", "s")
+    cycle: U32 = _describe_field("as in /signals")
+    overrun: bool = _describe_field("the cycle was skipped or ended after the next one was due")
+    lateness: float = _describe_field("SYNC sent this long after it was due", "s")
+    response: float = _describe_field("from SYNC to the controller's drive frame; NaN: none came", "s")
+    work: float = _describe_field("time the bench spent in the cycle", "s")
 
 
 @dataclass(slots=True)
 class Event:
     """Something that happened once: phase change, fault on or off, EMCY, safe state, operator."""
 
-    level: str = _doc("INFO, WARN or ERROR")
-    kind: str = _doc("one word: phase, segment, fault, emcy, safe_state, abort, ...")
-    text: str = _doc("for people")
+    level: str = _describe_field("INFO, WARN or ERROR")
+    kind: str = _describe_field("one word: phase, segment, fault, emcy, safe_state, abort, ...")
+    text: str = _describe_field("for people")
 
 
 @dataclass(slots=True)
 class NmtState:
     """A node's NMT state changed, as seen by the master (CiA 301 heartbeat codes)."""
 
-    node: U32 = _doc("node number")
-    code: U32 = _doc("0 boot-up, 4 stopped, 5 operational, 127 pre-operational")
-    name: str = _doc("the same in words")
+    node: U32 = _describe_field("node number")
+    code: U32 = _describe_field("0 boot-up, 4 stopped, 5 operational, 127 pre-operational")
+    name: str = _describe_field("the same in words")
 
 
 @dataclass(slots=True, kw_only=True)
 class Check:
     """One judged measurement."""
 
-    value: float = _doc("measured, in `unit`")
-    low: float = _doc("lower limit; NaN: none", default=math.nan)
-    high: float = _doc("upper limit; NaN: none", default=math.nan)
-    passed: bool = _doc("verdict")
-    t0: float = _doc("start of the window, from the start of the main phase; NaN: not a window", "s", default=math.nan)
-    t1: float = _doc("end of the window", "s", default=math.nan)
-    name: str = _doc("as in the sequence")
-    kind: str = _doc("what was measured: overshoot, settling, never_exceeds, ...", default="")
-    signal: str = _doc("what was looked at")
-    unit: str = _doc("of value, low and high")
-    detail: str = _doc("why, in words", default="")
+    value: float = _describe_field("measured, in `unit`")
+    low: float = _describe_field("lower limit; NaN: none", default=math.nan)
+    high: float = _describe_field("upper limit; NaN: none", default=math.nan)
+    passed: bool = _describe_field("verdict")
+    t0: float = _describe_field("start of the window, from the start of the main phase; NaN: not a window", "s",
+                                default=math.nan)
+    t1: float = _describe_field("end of the window", "s", default=math.nan)
+    name: str = _describe_field("as in the sequence")
+    kind: str = _describe_field("what was measured: overshoot, settling, never_exceeds, ...", default="")
+    signal: str = _describe_field("what was looked at")
+    unit: str = _describe_field("of value, low and high")
+    detail: str = _describe_field("why, in words", default="")
 
 
 Record = Signals | Timing | Event | NmtState | Check
@@ -111,7 +112,7 @@ TOPICS: dict[str, type] = {"/can": CanFrame, "/signals": Signals, "/timing": Tim
 CHANNELS: dict[type, int] = {record: number for number, record in enumerate(TOPICS.values(), 1)}
 
 
-def schema_bytes(record: type) -> bytes:
+def encode_schema(record: type) -> bytes:
     """The FileDescriptorSet of one record, package `eha`."""
     files = FileDescriptorSet()
     file = files.file.add(name=f"eha/{record.__name__}.proto", package="eha", syntax="proto3")
@@ -122,7 +123,7 @@ def schema_bytes(record: type) -> bytes:
     return files.SerializeToString(deterministic=True)
 
 
-def channel_metadata(record: type) -> dict[str, str]:
+def describe_channel(record: type) -> dict[str, str]:
     """Units and meanings of the fields, for the channel's metadata: unit.xj = m, doc.xj = ..."""
     out = {"doc": (record.__doc__ or "").split("\n")[0]}
     for item in fields(record):
@@ -132,7 +133,7 @@ def channel_metadata(record: type) -> dict[str, str]:
     return out
 
 
-def packer(record: type) -> Callable[[int, Any], bytes]:
+def make_packer(record: type) -> Callable[[int, Any], bytes]:
     """-> pack(t_ns, values or record): a whole MCAP message record, header included.
 
     `values` of a frame is the Frame itself (t_ns, cob_id, data), which saves an object per frame.
@@ -153,7 +154,7 @@ def packer(record: type) -> Callable[[int, Any], bytes]:
     size = fixed.size - 9
     names = [item.name for item in fields(record)][: (len(args) - 6) // 2]
     if record is CanFrame:
-        return _frame_packer(fixed.pack, args, size)
+        return _make_frame_packer(fixed.pack, args, size)
     get: Callable[[Any], Any] = attrgetter(*names) if len(names) > 1 else lambda r: tuple(getattr(r, n) for n in names)
 
     def pack(t_ns: int, values: Any) -> bytes:
@@ -163,7 +164,7 @@ def packer(record: type) -> Callable[[int, Any], bytes]:
             args[1] = size
             whole: bytes = fixed.pack(*args)
             return whole
-        tail = b"".join(tag + _sized(getattr(values, name)) for name, tag in blobs)
+        tail = b"".join(tag + _encode_blob(getattr(values, name)) for name, tag in blobs)
         args[1] = size + len(tail)
         head: bytes = fixed.pack(*args)
         return head + tail
@@ -171,7 +172,7 @@ def packer(record: type) -> Callable[[int, Any], bytes]:
     return pack
 
 
-def _frame_packer(pack_head: Callable[..., bytes], args: list[int], size: int) -> Callable[[int, Any], bytes]:
+def _make_frame_packer(pack_head: Callable[..., bytes], args: list[int], size: int) -> Callable[[int, Any], bytes]:
     opcode, _, channel, sequence, _, _, tag, _ = args
     tails = [bytes([2 << 3 | 2, n]) for n in range(9)]
 
@@ -185,7 +186,7 @@ def _frame_packer(pack_head: Callable[..., bytes], args: list[int], size: int) -
     return pack
 
 
-def _sized(value: str | bytes) -> bytes:
+def _encode_blob(value: str | bytes) -> bytes:
     """Length-delimited field: varint length, then the bytes."""
     raw = value.encode() if isinstance(value, str) else value
     n, out = len(raw), bytearray()

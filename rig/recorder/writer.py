@@ -26,9 +26,9 @@ from rig.recorder.schema import (
     Record,
     Signals,
     Timing,
-    channel_metadata,
-    packer,
-    schema_bytes,
+    describe_channel,
+    encode_schema,
+    make_packer,
 )
 
 CHUNK_BYTES = 64 * 1024
@@ -43,13 +43,14 @@ class RecorderError(RigError):
     """The log cannot be written any more (disk full, folder gone, disk too slow). Raised once, to the loop."""
 
 
-def channels() -> tuple[list[Schema], list[Channel]]:
+def list_channels() -> tuple[list[Schema], list[Channel]]:
     """Schemas and channels of a log of this rig."""
     schemas, out = [], []
     for topic, record in TOPICS.items():
         number = CHANNELS[record]
-        schemas.append(Schema(id=number, data=schema_bytes(record), encoding="protobuf", name=f"eha.{record.__name__}"))
-        out.append(Channel(id=number, topic=topic, message_encoding="protobuf", metadata=channel_metadata(record),
+        schemas.append(Schema(id=number, data=encode_schema(record), encoding="protobuf",
+                              name=f"eha.{record.__name__}"))
+        out.append(Channel(id=number, topic=topic, message_encoding="protobuf", metadata=describe_channel(record),
                            schema_id=number))
     return schemas, out
 
@@ -74,13 +75,13 @@ class Recorder:
         self._stop = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = McapFile(path, LIBRARY, *channels())
+            self._file = McapFile(path, LIBRARY, *list_channels())
             for name, (media_type, data) in attachments.items():
                 self._file.attachment(name, media_type, data, time.time_ns())
             self._file.metadata("run", metadata)
         except OSError as error:
-            raise _failure(path, error) from error
-        self._packers = {record: packer(record) for record in TOPICS.values()}
+            raise _describe_failure(path, error) from error
+        self._packers = {record: make_packer(record) for record in TOPICS.values()}
         self._parts: list[bytes] = []
         self._size = 0
         self._first_ns = 0
@@ -134,7 +135,7 @@ class Recorder:
             self._close_chunk()
             self._file.finish()
         except OSError as error:
-            self._fail(_failure(self.path, error))
+            self._fail(_describe_failure(self.path, error))
         except Exception as error:  # a record that cannot be packed is a bug, but it must not end in silence
             self._fail(RecorderError(f"{self.path}: the log stops here: {type(error).__name__}: {error}"))
 
@@ -184,5 +185,5 @@ class Recorder:
             self._parts, self._size, self._index = [], 0, {}
 
 
-def _failure(path: Path, error: OSError) -> RecorderError:
+def _describe_failure(path: Path, error: OSError) -> RecorderError:
     return RecorderError(f"{path}: the log cannot be written: {error.strerror or error}")

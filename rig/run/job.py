@@ -18,8 +18,8 @@ from plant.parameters import parse_toml
 from rig.nodes.scenario import Scenario
 from rig.sequences import Sequence
 
-_SAID = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
-_EFFECTS, _FILES = "effects/", "sequence/"  # folders of the attachments
+_REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
+_EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the attachments
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +55,8 @@ class Job:
     def attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""
         found = {"model.toml": ("application/toml", self.model.to_toml().encode())}
-        found |= {_FILES + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
-        found |= {_EFFECTS + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
+        found |= {_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
+        found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
         return found | {path.name: ("text/plain", path.read_bytes()) for path in (dbc.DBC, *dbc.EDS.values())}
 
     def settings(self) -> dict[str, object]:
@@ -66,7 +66,7 @@ class Job:
                 "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
 
 
-def repeat(path: Path) -> Job:
+def read_job(path: Path) -> Job:
     """The job that made a log.
 
     Raises:
@@ -74,10 +74,10 @@ def repeat(path: Path) -> Job:
     """
     trace = Trace.read(path, all=True)
     said = trace.provenance
-    bundle = _folder(trace.attachments, _FILES)
-    if "model.toml" not in trace.attachments or not bundle or not said.keys() >= _SAID:
+    bundle = _select_attachments(trace.attachments, _SEQUENCE_FOLDER)
+    if "model.toml" not in trace.attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
-    effects = _unpack(_folder(trace.attachments, _EFFECTS))
+    effects = _write_effect_files(_select_attachments(trace.attachments, _EFFECT_FOLDER))
     for effect in effects:
         load_effects(effect)
     model = parse_model(parse_toml(trace.attachments["model.toml"].decode(), "model.toml"), f"{path}:model.toml")
@@ -86,11 +86,11 @@ def repeat(path: Path) -> Job:
                max_overruns=float(said["max_overruns"]))
 
 
-def _folder(attachments: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
+def _select_attachments(attachments: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
     return {name.removeprefix(prefix): data for name, data in attachments.items() if name.startswith(prefix)}
 
 
-def _unpack(files: Mapping[str, bytes]) -> tuple[Path, ...]:
+def _write_effect_files(files: Mapping[str, bytes]) -> tuple[Path, ...]:
     """User effects as files again; they must outlive this call, because code is compiled from them later."""
     if not files:
         return ()

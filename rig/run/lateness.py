@@ -24,14 +24,14 @@ class Lateness(NamedTuple):
     missed: int  # periods whose whole time was over at the wake-up
 
 
-def percentiles(late_ns: np.ndarray, period_ns: int) -> Lateness:
+def summarise_lateness(late_ns: np.ndarray, period_ns: int) -> Lateness:
     """Sum up wake-ups that came `late_ns` (n,) after they were due."""
     p50, p99, p99_9 = (float(value) for value in np.percentile(late_ns, [50, 99, 99.9]) / 1e3)
     missed = int(np.count_nonzero(late_ns >= period_ns))
     return Lateness(p50, p99, p99_9, float(late_ns.max()) / 1e3, late_ns.size, missed)
 
 
-def timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Lateness:
+def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Lateness:
     """Sleep until t0 + k * period, as the real-time loop does, and note how late each wake-up is.
 
     Due times never move: a late wake-up does not push the next one, so lateness is not hidden by the sum of sleeps.
@@ -43,10 +43,10 @@ def timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Lateness:
         if (rest := due - time.monotonic_ns()) > 0:
             time.sleep(rest / 1e9)
         late[k] = time.monotonic_ns() - due
-    return percentiles(late, period_ns)
+    return summarise_lateness(late, period_ns)
 
 
-def under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
+def run_under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
     """`function()` in a thread of its own under SCHED_FIFO; None where the right to it is not granted."""
     result: list[R] = []
 
@@ -63,18 +63,18 @@ def under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
     return result[0] if result else None
 
 
-def clock_resolution_ns() -> float:
+def read_clock_resolution_ns() -> float:
     """Resolution of the monotonic clock, ns."""
     return time.clock_getres(time.CLOCK_MONOTONIC) * 1e9
 
 
-def memory_lock_limit() -> int:
+def read_memory_lock_limit() -> int:
     """Bytes that may be locked in memory; -1 means no limit (also for root, whom the limit does not bind)."""
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     return -1 if soft == resource.RLIM_INFINITY or os.geteuid() == 0 else soft
 
 
-def priority_limit() -> int:
+def read_priority_limit() -> int:
     """Highest real-time priority that may be asked for (RLIMIT_RTPRIO); 99 for root; 0 means none."""
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     return 99 if os.geteuid() == 0 or soft == resource.RLIM_INFINITY else soft

@@ -21,14 +21,14 @@ _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
 _ALL = _XJ | _XS | _COR
 
 
-class Log(Protocol):
+class CycleObserver(Protocol):
     """Who is told of a cycle when it is over."""
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """A cycle is over."""
 
 
-class Step(NamedTuple):
+class CycleInput(NamedTuple):
     """What one cycle is asked to do."""
 
     phase: int  # 0 set-up, 1 main, 2 clean-up
@@ -37,10 +37,10 @@ class Step(NamedTuple):
     control: int  # control word
 
 
-class Loop:
+class CycleLoop:
     """Runs cycles one by one and tells `log` of each when it is closed."""
 
-    def __init__(self, master: Master, faults: Schedule, log: Log, period_ns: int, realtime: bool) -> None:
+    def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire
         self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
         self.k = 0  # the cycle to come
@@ -58,7 +58,7 @@ class Loop:
         """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
         return self._wire.clock.now() if self._realtime else self._t_ns
 
-    def cycle(self, step: Step) -> Signals | None:
+    def cycle(self, step: CycleInput) -> Signals | None:
         """One cycle; returns the row of the cycle before, which it closes."""
         lateness = self._wait_until_due()
         closed = self._close()

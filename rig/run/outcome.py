@@ -14,10 +14,10 @@ from fdi.output import write_text
 from plant.segments import Array
 from rig.run.history import History
 from rig.run.job import Job
-from rig.run.session import Happening
+from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
 
-STATUS = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+STATUS_OF_VERDICT = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
 
 
@@ -28,7 +28,7 @@ class Outcome:
     job: Job
     folder: Path
     checks: Sequence[CheckResult]
-    events: Sequence[Happening]
+    events: Sequence[SessionEvent]
     aborted: str  # why, or ""
     safe: bool  # the safe state was entered
     interrupted: bool
@@ -65,14 +65,14 @@ class Outcome:
     @property
     def status(self) -> int:
         """Exit status of `rig run`."""
-        return INTERRUPTED if self.interrupted else STATUS[self.verdict]
+        return INTERRUPTED if self.interrupted else STATUS_OF_VERDICT[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
         """As interface and verdict.json have it; a number that is not there is null."""
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
-                "checks": [_plain(check._asdict()) for check in self.checks],
+                "checks": [_replace_nan(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
-                "events": [_plain(event._asdict()) for event in self.events],
+                "events": [_replace_nan(event._asdict()) for event in self.events],
                 "run": self.job.settings(), "fdi": self.fdi}
 
     def save(self) -> None:
@@ -80,14 +80,14 @@ class Outcome:
         write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
 
 
-def timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:
+def summarise_timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:
     """Percentiles of lateness and response in us, as `rig run --json` gives them."""
     return {"cycles": len(history), "overruns": overruns, "scheduler": scheduler,
-            "lateness_us": _percentiles(history.column("lateness")),
-            "response_us": _percentiles(history.column("response"))}
+            "lateness_us": _compute_percentiles(history.column("lateness")),
+            "response_us": _compute_percentiles(history.column("response"))}
 
 
-def _percentiles(seconds: Array) -> dict[str, float | None]:
+def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
     """Of the values that are there, in us."""
     values = seconds[~np.isnan(seconds)] * 1e6
     if not len(values):
@@ -96,5 +96,5 @@ def _percentiles(seconds: Array) -> dict[str, float | None]:
     return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
 
 
-def _plain(row: dict[str, Any]) -> dict[str, Any]:
+def _replace_nan(row: dict[str, Any]) -> dict[str, Any]:
     return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}

@@ -20,18 +20,18 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
 
-EMBEDDED = ("embedded", "virtual")
-LISTEN = 0.25  # s: a rig at work is heard within this
-GRACE = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
-BRIEF = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
-ANSWER = 0.7  # s: a node that is there boots within this
-START = 60.0  # s: a node of our own may have to compile the plant first
+EMBEDDED_NAMES = ("embedded", "virtual")
+RIVAL_TIMEOUT = 0.25  # s: a rig at work is heard within this
+FRAME_TIMEOUT = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
+LOST_FRAME_TIMEOUT = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
+BOOT_TIMEOUT = 0.7  # s: a node that is there boots within this
+START_TIMEOUT = 60.0  # s: a node of our own may have to compile the plant first
 
 Child = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
-def crew(job: Job) -> Iterator[Wire]:
+def open_wire(job: Job) -> Iterator[Wire]:
     """The bus with all nodes that are ours to run on it: inside this process, or as processes of their own.
 
     Raises:
@@ -39,42 +39,43 @@ def crew(job: Job) -> Iterator[Wire]:
             else's with an effect of ours.
         BusError: an external node does not answer.
     """
-    if job.controller == "external" and in_firmware(job.model):
+    if job.controller == "external" and find_firmware_parameters(job.model):
         raise InputError("--controller", "external", f"a model without effects in the firmware, which is not ours "
-                                                     f"then: not {', '.join(in_firmware(job.model))}")
-    if job.bus.partition(":")[0] in EMBEDDED:
+                                                     f"then: not {', '.join(find_firmware_parameters(job.model))}")
+    if job.bus.partition(":")[0] in EMBEDDED_NAMES:
         if "external" in (job.controller, job.plant):
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
         yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         return
     clock = WallClock()
-    wire = LinkWire(Link(open_can(job.bus), clock.now), clock, BRIEF if job.sequence.loses_frames else GRACE)
+    timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
+    wire = LinkWire(Link(open_can(job.bus), clock.now), clock, timeout)
     children: list[Child] = []
     try:
-        _complete(job, Master(wire, clock.now), children)
+        _start_missing_nodes(job, Master(wire, clock.now), children)
         yield wire
     finally:
-        _dismiss(children)
+        _stop_processes(children)
         wire.close()
 
 
-def _complete(job: Job, master: Master, children: list[Child]) -> None:
+def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> None:
     """Start what is ours to run, having looked who is there. Raises BusError."""
-    if master.rival(LISTEN):  # before the first word: a reset would end somebody's test
+    if master.rival(RIVAL_TIMEOUT):  # before the first word: a reset would end somebody's test
         raise BusError(f"another rig is at work on {job.bus}: a SYNC or heartbeat of node 1 was heard")
     for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
-        there = (wanted != "builtin" or node == CONTROLLER) and master.present(node, ANSWER)
+        there = (wanted != "builtin" or node == CONTROLLER) and master.present(node, BOOT_TIMEOUT)
         if wanted == "external" and not there:
             raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
         if node == CONTROLLER and wanted == "builtin" and there:
             raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
         if not there:
-            children.append(_start(job, NAMES[node]))
-            _await(master, node, children[-1])
+            children.append(_start_node(job, NAMES[node]))
+            _wait_for_node(master, node, children[-1])
 
 
-def _dismiss(children: Sequence[Child]) -> None:
+def _stop_processes(children: Sequence[Child]) -> None:
     """End the processes that we started, kindly first."""
     for child in children:
         child.terminate()
@@ -86,28 +87,29 @@ def _dismiss(children: Sequence[Child]) -> None:
             child.wait()
 
 
-def in_firmware(model: Model) -> dict[str, float]:
+def find_firmware_parameters(model: Model) -> dict[str, float]:
     """The parameters of the effects at work in a model's firmware."""
     acting = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].firmware]
     return {name: model[name] for effect in acting if effect.acts(model.values) for name in effect.parameters}
 
 
-def _start(job: Job, name: str) -> Child:
+def _start_node(job: Job, name: str) -> Child:
     """A node of our own in its own process, which ends when this one does.
 
     It has its own session, so that Ctrl-C reaches the rig alone: clean-up needs its plant.
     """
     effects = [word for path in job.effects for word in ("--effects", str(path))]
     if name == NAMES[CONTROLLER]:  # all else about the model comes by SDO
-        effects += [word for name, value in in_firmware(job.model).items() for word in ("--set", f"{name}={value!r}")]
+        for parameter, value in find_firmware_parameters(job.model).items():
+            effects += ["--set", f"{parameter}={value!r}"]
     command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", job.bus, "--quiet", "--parent",
                str(os.getpid()), *effects]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
 
 
-def _await(master: Master, node: int, child: Child) -> None:
+def _wait_for_node(master: Master, node: int, child: Child) -> None:
     """Until a node of our own answers. Raises BusError when it does not."""
-    for _ in range(round(START)):
+    for _ in range(round(START_TIMEOUT)):
         if master.present(node, 1.0):
             return
         if child.poll() is not None:

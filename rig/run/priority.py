@@ -8,20 +8,20 @@ import sys
 import threading
 from collections.abc import Iterator
 
-SWITCH = 50e-6  # s
-PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
+SWITCH_INTERVAL = 50e-6  # s
+LOOP_PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
 
 
 @contextlib.contextmanager
-def elevated() -> Iterator[None]:
+def raise_priority() -> Iterator[None]:
     """The calling thread under SCHED_FIFO where that is allowed; as before afterwards.
 
     The process's other threads (the recorder) get the lowest real-time priority: while one of them holds the
     interpreter lock, other programs must not keep it from going on, for the loop would wait with it.
     """
     others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
-    raised = [thread for thread in others if thread is not None and _fifo(thread, 1)]
-    raised += [0] if _fifo(0, PRIORITY) else []
+    raised = [thread for thread in others if thread is not None and _set_fifo(thread, 1)]
+    raised += [0] if _set_fifo(0, LOOP_PRIORITY) else []
     try:
         yield
     finally:
@@ -31,14 +31,14 @@ def elevated() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
+def suspend_garbage_collection() -> Iterator[None]:
     """No garbage collection, which takes ms; and a thread that holds the interpreter lock gives it up when asked.
 
     By default it may keep the lock for 5 ms, five cycles, while the loop waits for it.
     """
     collecting, interval = gc.isenabled(), sys.getswitchinterval()
     gc.disable()
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     try:
         yield
     finally:
@@ -47,7 +47,7 @@ def undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-def _fifo(thread: int, priority: int) -> bool:
+def _set_fifo(thread: int, priority: int) -> bool:
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError):
@@ -55,7 +55,7 @@ def _fifo(thread: int, priority: int) -> bool:
     return True
 
 
-def scheduler() -> str:
+def name_scheduler() -> str:
     """How the kernel schedules this thread."""
     names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
     return names.get(os.sched_getscheduler(0), "unknown") if hasattr(os, "sched_getscheduler") else "unknown"

@@ -14,17 +14,17 @@ from plant import Actuator, Columns, InputError
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
 from rig.recorder import Check, Recorder
-from rig.recorder.provenance import provenance
+from rig.recorder.provenance import collect_provenance
 from rig.run.history import History
 from rig.run.job import Job
-from rig.run.outcome import Outcome, timing
-from rig.run.participants import crew
-from rig.run.priority import elevated, scheduler, undisturbed
+from rig.run.outcome import Outcome, summarise_timing
+from rig.run.participants import open_wire
+from rig.run.priority import name_scheduler, raise_priority, suspend_garbage_collection
 from rig.run.session import MAIN, Session
-from rig.sequences.checks import CheckResult, evaluate
+from rig.sequences.checks import CheckResult, evaluate_checks
 
 
-def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
+def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
     """Do a job; what comes of it lies in `folder`.
 
     Raises:
@@ -32,7 +32,7 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
     """
     if job.plant != "external":  # here, where a law that cannot be compiled can be told in words
         Actuator(job.scenario.model).warm()
-    with taken(folder), crew(job) as wire, log(job, folder) as recorder:
+    with lock_folder(folder), open_wire(job) as wire, open_recorder(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
         progress("bring-up", 0.0)
         session.bring_up()
@@ -40,36 +40,37 @@ def run(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) ->
         stopwatch = WallClock()
         with contextlib.ExitStack() as rights:
             if job.realtime:
-                rights.enter_context(elevated())
-                rights.enter_context(undisturbed())
-            scheduled = scheduler()
+                rights.enter_context(raise_priority())
+                rights.enter_context(suspend_garbage_collection())
+            scheduled = name_scheduler()
             session.play()
         spent = stopwatch.now() * 1e-9
         loop = session.loop
         history = session.history
-        checks = judge(job, session)
+        checks = judge_run(job, session)
         for check in checks:
-            recorder.put(session.now(), _record(check))
+            recorder.put(session.now(), _make_check_record(check))
         outcome = Outcome(
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-            interrupted=session.interrupted, timing=timing(history, loop.overruns, scheduled),
-            counters=_counters(history), speed=len(history) * job.period_ns * 1e-9 / spent)
+            interrupted=session.interrupted, timing=summarise_timing(history, loop.overruns, scheduled),
+            counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
                                       "overruns": str(loop.overruns)})
     outcome.save()
     return outcome
 
 
-def judge(job: Job, session: Session) -> list[CheckResult]:
+def judge_run(job: Job, session: Session) -> list[CheckResult]:
     """The job's checks on the main phase."""
     main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    return evaluate(sequence.checks, Columns(t, *main), sequence.sections(), session.events, sequence.fault_starts())
+    return evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
+                           sequence.fault_starts())
 
 
 @contextlib.contextmanager
-def taken(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """The folder, made if need be, and locked against a second run.
 
     Raises:
@@ -90,18 +91,18 @@ def taken(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def log(job: Job, folder: Path) -> Iterator[Recorder]:
+def open_recorder(job: Job, folder: Path) -> Iterator[Recorder]:
     """The run's log in place of an earlier run's results, closed whatever happens."""
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
-    recorder = Recorder(folder / "trace.mcap", job.attachments(), provenance(**job.settings()))
+    recorder = Recorder(folder / "trace.mcap", job.attachments(), collect_provenance(**job.settings()))
     try:
         yield recorder
     finally:
         recorder.close()
 
 
-def _counters(history: History) -> dict[str, int]:
+def _count_lost_frames(history: History) -> dict[str, int]:
     """Cycles whose answers did not come, from what the rig itself saw and what the plant flagged."""
     flags = history.column("flags").astype(int)
     return {"no_feedback": int(np.isnan(history.column("xj")).sum()),
@@ -110,6 +111,6 @@ def _counters(history: History) -> dict[str, int]:
             "plant_drive_late": int((flags & Flags.DRIVE_LATE != 0).sum())}
 
 
-def _record(check: CheckResult) -> Check:
+def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
                  low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)

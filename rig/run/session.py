@@ -20,21 +20,21 @@ from rig.network.codec import Control
 from rig.network.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
 from rig.network.wire import Wire
 from rig.nodes import firmware
-from rig.nodes.scenario import FORCE
+from rig.nodes.scenario import FORCE_RESOLUTION
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
 from rig.run.history import History
 from rig.run.job import Job
-from rig.run.loop import Loop, Step
+from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import Schedule
-from rig.sequences.guards import Watch
+from rig.sequences.guards import GuardWatch
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
-_ENABLING = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
+_ENABLING_STEPS = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
 
 
-class Happening(NamedTuple):
+class SessionEvent(NamedTuple):
     """An event of the run; `t` in s of main."""
 
     t: float
@@ -52,9 +52,9 @@ class Session:
         self.scenario = job.scenario
         self._plan = self.scenario.plan
         self._faults = Schedule(self._plan, self.scenario.model.values)
-        self._watch = Watch(job.sequence.guards)
-        self.loop: Loop | None = None
-        self.events: list[Happening] = []
+        self._watch = GuardWatch(job.sequence.guards)
+        self.loop: CycleLoop | None = None
+        self.events: list[SessionEvent] = []
         self.history = History()
         self.aborted = ""  # why main ended early
         self.interrupted = False
@@ -81,7 +81,7 @@ class Session:
     def say(self, level: str, kind: str, text: str) -> None:
         """Something happened."""
         t_ns = self.now()
-        self.events.append(Happening(self._main_time(), level, kind, text))
+        self.events.append(SessionEvent(self._main_time(), level, kind, text))
         self.recorder.put(t_ns, Event(level, kind, text))
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
@@ -98,12 +98,12 @@ class Session:
         job = self.job
         self.say("INFO", "phase", "bring-up")
         self._master.reset()
-        gains = firmware.gains_of(job.model) if job.controller == "builtin" else None
+        gains = firmware.read_gains(job.model) if job.controller == "builtin" else None
         patient = not job.realtime and isinstance(self._clock, WallClock)
         self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
-        self.loop = Loop(self._master, self._faults, self, job.period_ns, job.realtime)
+        self.loop = CycleLoop(self._master, self._faults, self, job.period_ns, job.realtime)
 
     def play(self) -> None:
         """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""
@@ -133,7 +133,7 @@ class Session:
         if phase == CLEANUP and self.safe and i == 0:
             return int(Control.RESET)
         started = self.loop.k if self.loop else 0  # without set-up main is where it is enabled
-        return int(_ENABLING[started]) if started < len(_ENABLING) else int(Control.ACTIVE)
+        return int(_ENABLING_STEPS[started]) if started < len(_ENABLING_STEPS) else int(Control.ACTIVE)
 
     def _run(self, phase: int, profile: Profile) -> bool:
         """The cycles of one phase; False when it was ended early."""
@@ -145,8 +145,8 @@ class Session:
             for i in range(section.start, section.stop):
                 self._announce_faults()
                 self._demand = float(profile.command[i])
-                load = self.scenario.force[self.loop.k] * FORCE if phase == MAIN else 0.0
-                closed = self.loop.cycle(Step(phase, self._demand, load, self._control(phase, i)))
+                load = self.scenario.force[self.loop.k] * FORCE_RESOLUTION if phase == MAIN else 0.0
+                closed = self.loop.cycle(CycleInput(phase, self._demand, load, self._control(phase, i)))
                 if self.loop.k % 50 == 0:
                     self._progress(shown, self.loop.k / max(self._plan.stop, self.loop.k))
                 if phase != CLEANUP and self._must_end(closed):

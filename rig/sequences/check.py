@@ -9,14 +9,14 @@ from typing import Annotated, ClassVar, NamedTuple
 from plant.errors import InputError
 from plant.segments import LONGEST, RATE, Second
 from rig.sequences.measures import NotMeasurable
-from rig.sequences.scene import MAIN, Scene
-from rig.sequences.units import OF_SIGNAL, scale
+from rig.sequences.run_data import MAIN, RunData
+from rig.sequences.units import UNIT_OF_SIGNAL, find_scale
 
 InUnit = Annotated[float, "the check's unit"]
-MOST = 1e6  # s, later than any run ends
+LATEST_TIME = 1e6  # s, later than any run ends
 
 
-def require(holds: bool, key: str, expected: str) -> None:
+def require_check(holds: bool, key: str, expected: str) -> None:
     """Refuse a check; whoever read it knows the file and the line and adds them."""
     if not holds:
         raise InputError("check", key, expected)
@@ -52,14 +52,15 @@ class Check(ABC):
     unit: str = ""
 
     def __post_init__(self) -> None:
-        require(self.low is not None or self.high is not None, "", "a low, a high, or both")
+        require_check(self.low is not None or self.high is not None, "", "a low, a high, or both")
         if self.low is not None and self.high is not None:
-            require(self.low <= self.high, "high", f"a number from low = {self.low:g} up, not {self.high:g}")
+            require_check(self.low <= self.high, "high", f"a number from low = {self.low:g} up, not {self.high:g}")
         if isinstance(self.window, tuple):
             t0, t1 = self.window
-            require(0 <= t0 < t1 <= MOST, "window", f"[t0, t1] with 0 <= t0 < t1 <= {MOST:g}, not {[t0, t1]}")
-        require(0 <= self.skip <= LONGEST, "skip", f"0 s or more, at most {LONGEST:g}, not {self.skip:g}")
-        scale(self.shown_unit, self.si_unit)
+            require_check(0 <= t0 < t1 <= LATEST_TIME, "window",
+                          f"[t0, t1] with 0 <= t0 < t1 <= {LATEST_TIME:g}, not {[t0, t1]}")
+        require_check(0 <= self.skip <= LONGEST, "skip", f"0 s or more, at most {LONGEST:g}, not {self.skip:g}")
+        find_scale(self.shown_unit, self.si_unit)
 
     @property
     def about(self) -> str:
@@ -68,24 +69,24 @@ class Check(ABC):
 
     @property
     def si_unit(self) -> str:
-        return self.si or OF_SIGNAL[self.about]
+        return self.si or UNIT_OF_SIGNAL[self.about]
 
     @property
     def shown_unit(self) -> str:
         return self.unit or self.si_unit
 
     @abstractmethod
-    def measure(self, scene: Scene, span: slice) -> float:
+    def measure(self, run: RunData, span: slice) -> float:
         """The number in rows `span`, SI; raises NotMeasurable with the reason."""
 
-    def judge(self, scene: Scene) -> CheckResult:
+    def judge(self, run: RunData) -> CheckResult:
         """Measure and hold against the limits."""
         value, t0, t1, detail = nan, nan, nan, ""
         try:
-            span = scene.span(self.window, self.skip)
+            span = run.span(self.window, self.skip)
             t0, t1 = span.start / RATE, span.stop / RATE
-            missing = scene.missing(self.about, span)
-            measured = self.measure(scene, span) / scale(self.shown_unit, self.si_unit)
+            missing = run.missing(self.about, span)
+            measured = self.measure(run, span) / find_scale(self.shown_unit, self.si_unit)
             if not isfinite(measured):
                 raise NotMeasurable(f"the measure came to {measured:g}")
             value, detail = measured, f"{missing} missing samples bridged" if missing else ""

@@ -16,11 +16,11 @@ import numpy as np
 
 from plant.segments import RATE, Hertz, Second, require_frequency
 from rig.sequences import measures
-from rig.sequences.check import MOST, Check, CheckResult, InUnit, require
+from rig.sequences.check import LATEST_TIME, Check, CheckResult, InUnit, require_check
 from rig.sequences.measures import NotMeasurable
-from rig.sequences.scene import EventLike, Scene, TraceLike
+from rig.sequences.run_data import EventLike, RunData, TraceLike
 
-__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "evaluate"]
+__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "evaluate_checks"]
 
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InSI = Annotated[float, "SI units"]
@@ -47,8 +47,8 @@ class Overshoot(_OfPosition):
 
     kind, si = "overshoot", "%"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return measures.overshoot(*scene.step(span))
+    def measure(self, run: RunData, span: slice) -> float:
+        return measures.measure_overshoot(*run.step(span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,10 +60,10 @@ class SettlingTime(_OfPosition):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(0 < self.band <= 100, "band", f"above 0 and at most 100 % of the step, not {self.band:g}")
+        require_check(0 < self.band <= 100, "band", f"above 0 and at most 100 % of the step, not {self.band:g}")
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return measures.settling_time(*scene.step(span), self.band)
+    def measure(self, run: RunData, span: slice) -> float:
+        return measures.measure_settling_time(*run.step(span), self.band)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +72,8 @@ class RiseTime(_OfPosition):
 
     kind, si = "rise_time", "s"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return measures.rise_time(*scene.step(span))
+    def measure(self, run: RunData, span: slice) -> float:
+        return measures.measure_rise_time(*run.step(span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +82,8 @@ class SteadyError(_OfPosition):
 
     kind = "steady_error"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return abs(float(scene.signal("error", span).mean()))
+    def measure(self, run: RunData, span: slice) -> float:
+        return abs(float(run.signal("error", span).mean()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +92,8 @@ class RampError(_OfPosition):
 
     kind = "ramp_error"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return measures.ramp_error(scene.signal("error", span), scene.signal("com", span))
+    def measure(self, run: RunData, span: slice) -> float:
+        return measures.measure_ramp_error(run.signal("error", span), run.signal("com", span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,8 +102,8 @@ class BreakAway(_OfPosition):
 
     kind = "break_away"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return measures.break_away(scene.signal("error", span))
+    def measure(self, run: RunData, span: slice) -> float:
+        return measures.measure_break_away(run.signal("error", span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,8 +112,8 @@ class MaxError(_OfPosition):
 
     kind = "max_error"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return float(np.abs(measures.median(scene.signal("error", span))).max())
+    def measure(self, run: RunData, span: slice) -> float:
+        return float(np.abs(measures.filter_median(run.signal("error", span))).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +122,8 @@ class RmsError(_OfPosition):
 
     kind = "rms_error"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return float(np.sqrt(np.mean(scene.signal("error", span) ** 2)))
+    def measure(self, run: RunData, span: slice) -> float:
+        return float(np.sqrt(np.mean(run.signal("error", span) ** 2)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +132,8 @@ class NeverExceeds(_OfSignal):
 
     kind = "never_exceeds"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return float(np.abs(scene.signal(self.signal, span)).max())
+    def measure(self, run: RunData, span: slice) -> float:
+        return float(np.abs(run.signal(self.signal, span)).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +147,8 @@ class AmplitudeRatio(_OfPosition):
         super().__post_init__()
         require_frequency("frequency", self.frequency)
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return abs(measures.response(scene.signal("xj", span), scene.signal("com", span), self.frequency))
+    def measure(self, run: RunData, span: slice) -> float:
+        return abs(measures.measure_response(run.signal("xj", span), run.signal("com", span), self.frequency))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,8 +157,8 @@ class PhaseLag(AmplitudeRatio):
 
     kind, si = "phase_lag", "deg"
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        response = measures.response(scene.signal("xj", span), scene.signal("com", span), self.frequency)
+    def measure(self, run: RunData, span: slice) -> float:
+        response = measures.measure_response(run.signal("xj", span), run.signal("com", span), self.frequency)
         return -degrees(phase(response))
 
 
@@ -175,20 +175,22 @@ class ResponseWithin(Check):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(bool(self.event) != (self.signal is not None), "event", "either an event or a signal")
+        require_check(bool(self.event) != (self.signal is not None), "event", "either an event or a signal")
         levelled = self.above is not None or self.below is not None
-        require(levelled == (self.signal is not None), "signal", "a signal with a level above or below which it counts")
+        require_check(levelled == (self.signal is not None), "signal",
+                      "a signal with a level above or below which it counts")
         if isinstance(self.after, float):
-            require(0 <= self.after <= MOST, "after", f"0 to {MOST:g} s of main, or a fault's name, not {self.after:g}")
+            require_check(0 <= self.after <= LATEST_TIME, "after",
+                          f"0 to {LATEST_TIME:g} s of main, or a fault's name, not {self.after:g}")
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        after = self.after if isinstance(self.after, float) else scene.starts.get(self.after)
+    def measure(self, run: RunData, span: slice) -> float:
+        after = self.after if isinstance(self.after, float) else run.starts.get(self.after)
         if after is None:
             raise NotMeasurable(f"there was no fault {self.after!r}")
         if self.signal:
-            rest = scene.span((after, span.stop / RATE))
-            return measures.crossing(scene.signal(self.signal, rest), self.above, self.below)
-        events = scene.matching(self.event, after)
+            rest = run.span((after, span.stop / RATE))
+            return measures.find_crossing(run.signal(self.signal, rest), self.above, self.below)
+        events = run.matching(self.event, after)
         if not events:
             raise NotMeasurable(f"no event {self.event!r} after {after:g} s")
         return events[0].t - after
@@ -204,10 +206,10 @@ class EventOccurs(Check):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(bool(self.event.split()), "event", "at least one word")
+        require_check(bool(self.event.split()), "event", "at least one word")
 
-    def measure(self, scene: Scene, span: slice) -> float:
-        return float(len(scene.matching(self.event, span.start / RATE, span.stop / RATE)))
+    def measure(self, run: RunData, span: slice) -> float:
+        return float(len(run.matching(self.event, span.start / RATE, span.stop / RATE)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +226,7 @@ KINDS: dict[str, type[Check]] = {kind.kind: kind for kind in (
     AmplitudeRatio, PhaseLag, ResponseWithin, EventOccurs, EventNever)}
 
 
-def evaluate(checks: Iterable[Check], trace: TraceLike, sections: Mapping[str, slice],
+def evaluate_checks(checks: Iterable[Check], trace: TraceLike, sections: Mapping[str, slice],
              events: Sequence[EventLike] = (), starts: Mapping[str, float] | None = None) -> list[CheckResult]:
     """Judge a run.
 
@@ -235,5 +237,5 @@ def evaluate(checks: Iterable[Check], trace: TraceLike, sections: Mapping[str, s
         events: what happened, times in s of main.
         starts: when each fault began, s of main, by its label.
     """
-    scene = Scene(trace, sections, events, starts or {})
-    return [check.judge(scene) for check in checks]
+    run = RunData(trace, sections, events, starts or {})
+    return [check.judge(run) for check in checks]

@@ -20,15 +20,15 @@ from plant.parameters import accept
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
 from rig.sequences import tables
-from rig.sequences.injection import Added, Held, hits
+from rig.sequences.injection import AddedSignal, StuckSignal, choose_frames
 
 Sensor = Literal["xj", "p12", "xs"]
 FrameName = Literal["feedback", "valve_state", "drive", "command"]
-Heart = Literal["rig", "plant"]
+HeartbeatNode = Literal["rig", "plant"]
 InSI = Annotated[float, "SI units"]
-LATEST = 1e6  # s, later than any run ends
-LARGEST = 1e12  # SI; a sensor cannot be further off, and sums of two stay numbers
-MOST = 1_000_000_000  # cycles or frames to count to
+LATEST_START = 1e6  # s, later than any run ends
+LARGEST_VALUE = 1e12  # SI; a sensor cannot be further off, and sums of two stay numbers
+LARGEST_COUNT = 1_000_000_000  # cycles or frames to count to
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +41,10 @@ class Fault(ABC):
     name: str = ""
 
     def __post_init__(self) -> None:
-        _require(0 <= self.start <= LATEST, "start", f"0 s or later, at most {LATEST:g}, not {self.start:g}")
-        _require(self.end is None or self.start < self.end <= LATEST, "end",
-                 f"after the start at {self.start:g} s, and at most {LATEST:g} s")
+        _require(0 <= self.start <= LATEST_START, "start",
+                 f"0 s or later, at most {LATEST_START:g}, not {self.start:g}")
+        _require(self.end is None or self.start < self.end <= LATEST_START, "end",
+                 f"after the start at {self.start:g} s, and at most {LATEST_START:g} s")
 
     @property
     def label(self) -> str:
@@ -135,8 +136,8 @@ class _Frames(Fault):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(1 <= self.every <= MOST, "every", f"1 or more cycles, not {self.every}")
-        _require(self.count is None or 1 <= self.count <= MOST, "count", f"1 or more frames, not {self.count}")
+        _require(1 <= self.every <= LARGEST_COUNT, "every", f"1 or more cycles, not {self.every}")
+        _require(self.count is None or 1 <= self.count <= LARGEST_COUNT, "count", f"1 or more frames, not {self.count}")
         _require(0 < self.probability <= 1, "probability", f"above 0 and at most 1, not {self.probability:g}")
 
 
@@ -164,7 +165,7 @@ class Silent(Fault):
     """A node whose heartbeat stops."""
 
     kind = "heartbeat"
-    node: Heart
+    node: HeartbeatNode
 
 
 KINDS: dict[str, type[Fault]] = {kind.kind: kind for kind in (Parameter, Offset, Noise, Stuck, Lost, Late, Silent)}
@@ -211,7 +212,7 @@ class Plan:
     def from_json(cls, data: object) -> Plan:
         """The plan that was sent; InputError if it is none."""
         plain = {**data, "faults": list(data.get("faults", ()))} if isinstance(data, dict) else data
-        return tables.read(cls, plain, tables.Place("scenario"), {Fault: KINDS})
+        return tables.build_dataclass(cls, plain, tables.Place("scenario"), {Fault: KINDS})
 
 
 class Schedule:
@@ -238,18 +239,18 @@ class Schedule:
         match fault:
             case Parameter():
                 if fault.parameter not in self._base:
-                    raise InputError("faults", fault.parameter, tables.one_of(fault.parameter, self._base))
+                    raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
                 self._parameters.setdefault(fault.parameter, []).append(
                     (first, last, fault.target(meaning(fault.parameter, "faults")), fault))
             case Offset():  # or noise
                 shape = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
                 values = [fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
-                self._signals.setdefault(fault.signal, []).append(Added(first, values))
+                self._signals.setdefault(fault.signal, []).append(AddedSignal(first, values))
             case Stuck():
-                self._signals.setdefault(fault.signal, []).append(Held(range(first, last), fault.value))
+                self._signals.setdefault(fault.signal, []).append(StuckSignal(range(first, last), fault.value))
             case _Frames():
                 action = Delay(round(fault.delay * 1e9)) if isinstance(fault, Late) else Drop()
-                hit = hits(last - first, fault.every, fault.count, fault.probability, rng)
+                hit = choose_frames(last - first, fault.every, fault.count, fault.probability, rng)
                 self._frames.setdefault(fault.frame, []).append((first, hit, action))
                 return first + len(hit)
             case Silent():
@@ -292,7 +293,7 @@ class Schedule:
 
 
 def _require_size(value: float) -> None:
-    _require(abs(value) <= LARGEST, "value", f"at most {LARGEST:g} either way, not {value:g}")
+    _require(abs(value) <= LARGEST_VALUE, "value", f"at most {LARGEST_VALUE:g} either way, not {value:g}")
 
 
 def _require(holds: bool, key: str, expected: str) -> None:

@@ -7,7 +7,7 @@ from math import inf
 from typing import Literal
 
 from plant.errors import InputError
-from rig.sequences.units import OF_SIGNAL, scale
+from rig.sequences.units import UNIT_OF_SIGNAL, find_scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +30,12 @@ class Guard:
 
     def limits(self) -> tuple[float, float]:
         """Low and high in SI; infinite where there is none."""
-        si = OF_SIGNAL[self.signal]
-        size = scale(self.unit or si, si)
+        si = UNIT_OF_SIGNAL[self.signal]
+        size = find_scale(self.unit or si, si)
         return (-inf if self.low is None else self.low * size), (inf if self.high is None else self.high * size)
 
 
-class Watch:
+class GuardWatch:
     """Follows a run and says which guard it has passed."""
 
     def __init__(self, guards: Iterable[Guard]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 
-class Added:
+class AddedSignal:
     """A sensor that reads more than there is: from cycle `first` on by `values`, one a cycle."""
 
     def __init__(self, first: int, values: list[float]) -> None:
@@ -15,7 +15,7 @@ class Added:
         return value + self._values[k] if 0 <= k < len(self._values) else value
 
 
-class Held:
+class StuckSignal:
     """A sensor stuck within `cycles`, at `value` or without one at what it last read."""
 
     def __init__(self, cycles: range, value: float | None) -> None:
@@ -28,7 +28,7 @@ class Held:
         return value
 
 
-def hits(cycles: int, every: int, count: int | None, probability: float, rng: np.random.Generator) -> bytes:
+def choose_frames(cycles: int, every: int, count: int | None, probability: float, rng: np.random.Generator) -> bytes:
     """One byte a cycle, 1 where a frame is hit: every `every`-th with a probability; up to the last if counted."""
     hit = (np.arange(cycles) % every == 0) & (rng.random(cycles) < probability)
     if count is not None and hit.sum() >= count:

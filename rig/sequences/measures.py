@@ -11,7 +11,7 @@ import numpy as np
 
 from plant.segments import RATE, Array
 
-MEDIAN = 5  # samples
+MEDIAN_SAMPLES = 5  # samples
 SMALLEST_STEP = 20e-6  # m, ten times the noise
 SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
 
@@ -20,7 +20,7 @@ class NotMeasurable(Exception):
     """Why a signal does not have the number that was asked for."""
 
 
-def bridged(signal: Array, name: str, allowed: float) -> Array:
+def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
     """The signal with missing samples (NaN) on straight lines; NotMeasurable if more than a fraction `allowed` are."""
     missing = ~np.isfinite(signal)
     count = int(missing.sum())
@@ -34,15 +34,15 @@ def bridged(signal: Array, name: str, allowed: float) -> Array:
     return np.interp(rows, rows[~missing], signal[~missing])
 
 
-def median(signal: Array) -> Array:
+def filter_median(signal: Array) -> Array:
     """Centred moving median of MEDIAN samples, the ends repeated."""
-    half = MEDIAN // 2
+    half = MEDIAN_SAMPLES // 2
     padded = np.pad(signal, half, mode="edge")
-    filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, MEDIAN), axis=1)
+    filtered: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_SAMPLES), axis=1)
     return filtered
 
 
-def speed(position: Array) -> Array:
+def compute_speed(position: Array) -> Array:
     """Central difference over SPEED_SPAN cycles, one-sided at the ends, m/s."""
     rows = np.arange(len(position))
     ahead, behind = np.minimum(rows + SPEED_SPAN // 2, len(rows) - 1), np.maximum(rows - SPEED_SPAN // 2, 0)
@@ -52,7 +52,7 @@ def speed(position: Array) -> Array:
     return difference
 
 
-def step_size(com: Array, before: float) -> float:
+def measure_step_size(com: Array, before: float) -> float:
     """What a step section asks for; NotMeasurable if it has no step at its start or moves on later."""
     size = float(com[-1] - before)
     if abs(size) < SMALLEST_STEP or np.abs(com - com[-1]).max() > 1e-9:
@@ -60,16 +60,16 @@ def step_size(com: Array, before: float) -> float:
     return size
 
 
-def overshoot(position: Array, com: Array, before: float) -> float:
+def measure_overshoot(position: Array, com: Array, before: float) -> float:
     """How far the highest point is beyond the target, % of the step; 0 if it never gets there."""
-    size = step_size(com, before)
-    return max(0.0, 100 * float(((median(position) - com[-1]) / size).max()))
+    size = measure_step_size(com, before)
+    return max(0.0, 100 * float(((filter_median(position) - com[-1]) / size).max()))
 
 
-def settling_time(position: Array, com: Array, before: float, band: float) -> float:
+def measure_settling_time(position: Array, com: Array, before: float, band: float) -> float:
     """Time until the position stays within +-band % of the step around the target, s."""
-    size = step_size(com, before)
-    outside = np.flatnonzero(np.abs(median(position) - com[-1]) > abs(size) * band / 100)
+    size = measure_step_size(com, before)
+    outside = np.flatnonzero(np.abs(filter_median(position) - com[-1]) > abs(size) * band / 100)
     if not len(outside):
         return 0.0
     if outside[-1] == len(position) - 1:
@@ -77,10 +77,10 @@ def settling_time(position: Array, com: Array, before: float, band: float) -> fl
     return float(outside[-1] + 1) / RATE
 
 
-def rise_time(position: Array, com: Array, before: float) -> float:
+def measure_rise_time(position: Array, com: Array, before: float) -> float:
     """Time from 10 % to 90 % of the step, s, interpolated between samples."""
-    size = step_size(com, before)
-    done = (median(position) - before) / size
+    size = measure_step_size(com, before)
+    done = (filter_median(position) - before) / size
 
     def reached(level: float) -> float:
         beyond = np.flatnonzero(done >= level)
@@ -92,25 +92,25 @@ def rise_time(position: Array, com: Array, before: float) -> float:
     return float(reached(0.9) - reached(0.1)) / RATE
 
 
-def ramp_error(error: Array, com: Array) -> float:
+def measure_ramp_error(error: Array, com: Array) -> float:
     """Mean lag behind a ramp, m, positive when the ram is behind whichever way it goes (docs/physics.md)."""
     if com[-1] == com[0]:
         raise NotMeasurable("the command does not move here")
     return float(error.mean() * np.sign(com[-1] - com[0]))
 
 
-def break_away(error: Array) -> float:
+def measure_break_away(error: Array) -> float:
     """Position error that builds up before the spool lets go, m: half the band that stick-slip draws on a slow ramp.
 
     docs/physics.md: FSS KF / (GPF1 ASV GM GAP). The band is taken from the 1st to the 99th percentile of the
     filtered error, so that noise and single outliers do not widen it; a triangle loses 2 % by that. The mean (ramp
     error) drops out.
     """
-    low, high = np.percentile(median(error), (1, 99))
+    low, high = np.percentile(filter_median(error), (1, 99))
     return float(high - low) / 2
 
 
-def response(signal: Array, com: Array, frequency: float) -> complex:
+def measure_response(signal: Array, com: Array, frequency: float) -> complex:
     """Signal over command as a complex number at `frequency`, Hz: least-squares sine, cosine and mean of both."""
     if len(com) < RATE / frequency:
         raise NotMeasurable(f"the window is shorter than one period of {frequency:g} Hz")
@@ -123,7 +123,7 @@ def response(signal: Array, com: Array, frequency: float) -> complex:
     return given / asked
 
 
-def crossing(signal: Array, above: float | None, below: float | None) -> float:
+def find_crossing(signal: Array, above: float | None, below: float | None) -> float:
     """Time of the first of three samples in a row above or below a level, s from the signal's start."""
     beyond = np.zeros(len(signal), bool)
     if above is not None:

@@ -10,7 +10,7 @@ from plant.model import Model
 from plant.parameters import accept, sensible
 from plant.quantity import Quantity
 from plant.segments import RATE
-from rig.sequences.faults import LATEST, Parameter, Plan, Schedule
+from rig.sequences.faults import LATEST_START, Parameter, Plan, Schedule
 from rig.sequences.tables import Place
 
 Known = Callable[[str], object]  # raises InputError for a name that no parameter has
@@ -22,7 +22,7 @@ def check_overrides(overrides: Mapping[str, float | str], place: Place, known: K
     for name, value in overrides.items():
         here = place.at(*name.split("."))  # where `overrides.spool.travel` stands in the file
         here = here if here.keys in place.lines else place.at(name)
-        quantity = _meaning(name, here, known)
+        quantity = _find_meaning(name, here, known)
         whole &= quantity is not None
         if quantity is not None:
             try:
@@ -37,7 +37,7 @@ def check_faults(plan: Plan, place: Place, known: Known) -> bool:
     whole = True
     for i, fault in enumerate(plan.faults):
         if isinstance(fault, Parameter):
-            quantity = _meaning(fault.parameter, place.at(i, "parameter"), known)
+            quantity = _find_meaning(fault.parameter, place.at(i, "parameter"), known)
             whole &= quantity is not None
             if quantity is not None:
                 try:
@@ -75,21 +75,21 @@ def require_sensible(plan: Plan, model: Model) -> None:
         return
     schedule = Schedule(plan, model.having(fault.parameter.partition(".")[0] for _, fault in changing).values)
     for i, fault in changing:
-        for cycle in _turns(plan, fault):
+        for cycle in _list_extreme_cycles(plan, fault):
             try:
                 sensible("faults", schedule.parameters(cycle))
             except InputError as error:
                 raise Contradiction(i, fault.label, (cycle - plan.start) / RATE, error) from error
 
 
-def _turns(plan: Plan, fault: Parameter) -> tuple[int, ...]:
+def _list_extreme_cycles(plan: Plan, fault: Parameter) -> tuple[int, ...]:
     """Where a parameter on its straight line may be furthest out: it begins, is all there, last acts, is over."""
     first, last = plan.cycles(fault)
     end = max(first, last - 1)
-    return first, min(first + ceil(min(fault.ramp, LATEST) * RATE), end), end, last
+    return first, min(first + ceil(min(fault.ramp, LATEST_START) * RATE), end), end, last
 
 
-def _meaning(name: str, place: Place, known: Known) -> Quantity | None:
+def _find_meaning(name: str, place: Place, known: Known) -> Quantity | None:
     try:
         quantity: Any = known(name)
     except InputError as error:

@@ -24,7 +24,7 @@ from rig.sequences.checks import Check, ResponseWithin
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
 from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
-from rig.sequences.scene import MAIN
+from rig.sequences.run_data import MAIN
 from rig.sequences.tables import Place
 
 ReadFile = Callable[[str], bytes]
@@ -141,7 +141,7 @@ def load_sequence(name_or_path: str | Path, known: Known = meaning) -> Sequence:
         return parse_sequence(entries[name].read_text(encoding="utf-8"), name, _read_beside(Path()), known)
     path = Path(name_or_path)
     if path.suffix != ".toml":
-        raise InputError(name_or_path, "", f"a .toml file, or {tables.one_of(str(name_or_path), shipped)}")
+        raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     read_file = _read_beside(path.parent)
     try:
         text = read_file(path.name).decode("utf-8")
@@ -162,8 +162,8 @@ def _read_beside(folder: Path) -> ReadFile:
 
 def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = meaning) -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV files that it names."""
-    table, place = tables.parse(text, name)
-    sequence = tables.read(Sequence, table, place, _KINDS)
+    table, place = tables.parse_table(text, name)
+    sequence = tables.build_dataclass(Sequence, table, place, _KINDS)
     sequence = replace(sequence, name=Path(name).name, source=text)
     for phase in ("setup", "main", "cleanup", "load"):
         sequence = _with_csv(sequence, phase, place.at(phase), read_file)
@@ -263,8 +263,8 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
             raise place.at(i, "name").refuse(f"a name used once, not {used[check.name]} times {check.name!r}")
         window = check.window
         if isinstance(window, str) and window != MAIN and window not in sections:
-            raise place.at(i, "window").refuse(f"a section: {tables.one_of(window, [MAIN, *sections])}")
+            raise place.at(i, "window").refuse(f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / RATE:
             raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
         if isinstance(check, ResponseWithin) and isinstance(check.after, str) and labels[check.after] != 1:
-            raise place.at(i, "after").refuse(f"a time or one fault: {tables.one_of(check.after, labels)}")
+            raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(check.after, labels)}")

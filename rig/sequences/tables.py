@@ -17,7 +17,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plant.errors import InputError
-from rig.sequences.toml_lines import Path, lines
+from rig.sequences.toml_lines import Path, find_lines
 
 T = TypeVar("T")
 Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: subclass}
@@ -43,17 +43,17 @@ class Place:
         return InputError(self.file if line is None else f"{self.file}:{line}", text, expected)
 
 
-def parse(text: str, file: str) -> tuple[dict[str, Any], Place]:
+def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
     """The tables of a TOML text and the place of its root; InputError with the line if it is not TOML."""
     try:
-        return tomllib.loads(text), Place(file, lines(text))
+        return tomllib.loads(text), Place(file, find_lines(text))
     except tomllib.TOMLDecodeError as error:
         found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
         message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
         raise InputError(f"{file}:{line}", "", f"TOML; {message[:1].lower()}{message[1:]}") from error
 
 
-def read(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:
+def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:
     """A `cls` from the table at `place`; raises InputError for a key or value it cannot be made from."""
     kinds = kinds or {}
     if not isinstance(table, dict):
@@ -62,13 +62,13 @@ def read(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) 
     if cls in kinds:
         kind = pairs.pop("kind", None)
         if not isinstance(kind, str) or kind not in kinds[cls]:
-            raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {one_of(kind, kinds[cls])}")
+            raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {list_choices(kind, kinds[cls])}")
         cls = kinds[cls][kind]
     hints = get_type_hints(cls, include_extras=True)
     known = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
     for key in pairs:
         if key not in known:
-            raise place.at(key).refuse(f"a key: {one_of(key, known)}")
+            raise place.at(key).refuse(f"a key: {list_choices(key, known)}")
     for key, f in known.items():
         if key not in pairs and f.default is MISSING and f.default_factory is MISSING:
             raise place.refuse(f"also the key {key!r}, {_describe(hints[key])}")
@@ -79,7 +79,7 @@ def read(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) 
         raise (place.at(error.field) if error.field else place).refuse(error.expected) from error
 
 
-def one_of(word: object, known: Iterable[str]) -> str:
+def list_choices(word: object, known: Iterable[str]) -> str:
     """The words that would have done in place of `word`, and the one that was probably meant.
 
     >>> one_of("hodl", ["hold", "step"])
@@ -98,12 +98,12 @@ def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
     bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     origin, args = get_origin(bare), get_args(bare)
     if bare in _SCALARS:
-        if not _fits(value, bare):
+        if not _is_scalar(value, bare):
             raise place.refuse(f"{_describe(hint)}, not {value!r}")
         return bare(value)
     if origin is Literal:
         if value not in args:
-            raise place.refuse(one_of(value, args))
+            raise place.refuse(list_choices(value, args))
         return value
     if origin in (Union, UnionType):
         for member in (m for m in args if m is not NoneType):
@@ -119,15 +119,16 @@ def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
     if origin is Mapping:
         if not isinstance(value, dict):
             raise place.refuse(f"{_describe(hint)}, not {value!r}")
-        return dict(_named(value, args[1], place, kinds))
-    return read(bare, value, place, kinds)
+        return dict(_flatten_names(value, args[1], place, kinds))
+    return build_dataclass(bare, value, place, kinds)
 
 
-def _named(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten_names(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds,
+                   prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted names and values: `spool.travel = 1` and `"spool.travel" = 1` are the same to a user."""
     for key, item in table.items():
         if isinstance(item, dict):
-            yield from _named(item, hint, place.at(key), kinds, f"{prefix}{key}.")
+            yield from _flatten_names(item, hint, place.at(key), kinds, f"{prefix}{key}.")
         else:
             yield prefix + key, _convert(item, hint, place.at(key), kinds)
 
@@ -135,7 +136,7 @@ def _named(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds, prefix:
 _SCALARS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 
 
-def _fits(value: object, kind: Any) -> bool:
+def _is_scalar(value: object, kind: Any) -> bool:
     if kind is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
     return type(value) is kind
@@ -147,7 +148,7 @@ def _describe(hint: Any) -> str:
     if origin is Annotated:
         return f"{_describe(args[0])} in {args[1]}"
     if origin is Literal:
-        return one_of(None, args)
+        return list_choices(None, args)
     if origin in (Union, UnionType):
         return " or ".join(_describe(member) for member in args if member is not NoneType)
     if origin is tuple:

@@ -27,7 +27,7 @@ class _Token(NamedTuple):
     line: int
 
 
-def lines(text: str) -> dict[Path, int]:
+def find_lines(text: str) -> dict[Path, int]:
     """Line number, from 1, of every key, array element and table header."""
     scanner = _Scanner(text)
     scanner.document()

@@ -14,7 +14,7 @@ from fdi.report.run_verdict import verdict
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Trace
 from plant.errors import RigError
-from rig.sequences.units import IN_SI
+from rig.sequences.units import SI_OF_UNIT
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -56,7 +56,7 @@ PLOTS = (
 )
 SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x8E5BBFFF}
 LANES, TEXTS = "Verdict, phase, NMT states, checks", "Events and checks"  # titles of the views that are no plots
-LANE_HEIGHT, SCREEN = 0.039, (0.5, 0.78)  # a lane's and all lanes' least and most part of the window's height
+LANE_HEIGHT, LANES_SHARE = 0.039, (0.5, 0.78)  # a lane's and all lanes' least and most part of the window's height
 SHOWN_IN = {"xj": ("position", 1e3), "com": ("position", 1e3), "error": ("error", 1e6), "cor": ("current", 1e3),
             "p12": ("pressure", 1e-6), "xs": ("spool", 1e6)}  # signal -> plot, scale from SI
 LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
@@ -68,7 +68,7 @@ class ViewerError(RigError):
     status = 1
 
 
-def rerun() -> Any:
+def import_rerun() -> Any:
     """The rerun package. Raises ViewerError with the way to get it."""
     try:
         import rerun as rr
@@ -82,19 +82,19 @@ def write_rrd(trace: Trace, path: Path) -> None:
 
     Raises ViewerError without rerun; InputError for a place that cannot be written.
     """
-    rr = rerun()
+    rr = import_rerun()
     writable(path, "the recording")
     with rr.RecordingStream("eha-rig", recording_id=str(path.stem)) as stream:
-        stream.save(path, default_blueprint=_blueprint(rr, trace))
+        stream.save(path, default_blueprint=_build_blueprint(rr, trace))
         stream.send_recording_name(trace.provenance.get("sequence", trace.provenance.get("source", "trace")))
-        _series(rr, stream, trace)
-        _limits(rr, stream, trace.checks)
-        _states(rr, stream, trace)
-        _texts(rr, stream, trace)
+        _send_series(rr, stream, trace)
+        _send_limits(rr, stream, trace.checks)
+        _send_states(rr, stream, trace)
+        _send_texts(rr, stream, trace)
         stream.flush()
 
 
-def lines(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
+def list_lines(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
     """Path of each line -> times, s, and values in the plot's unit."""
     timing = trace.timing
     out = {"position/command": trace.com * 1e3, "position/ram": trace.xj * 1e3,
@@ -109,73 +109,73 @@ def lines(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
     return known
 
 
-def _series(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
+def _send_series(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
     for plot in PLOTS:
         for line in plot.lines:
             path = f"{plot.origin}/{line.path}"
-            if path in lines(trace):
-                t, values = lines(trace)[path]
-                _send(rr, stream, path, line.name, line.colour, line.width, t, values)
+            if path in list_lines(trace):
+                t, values = list_lines(trace)[path]
+                _send_line(rr, stream, path, line.name, line.colour, line.width, t, values)
 
 
-def _send(rr: Any, stream: rr.RecordingStream, path: str, name: str, colour: int, width: float, t: Floats,
+def _send_line(rr: Any, stream: rr.RecordingStream, path: str, name: str, colour: int, width: float, t: Floats,
           values: Floats) -> None:
     line = rr.SeriesLines(colors=[colour], widths=[width], names=[name], aggregation_policy="MinMax")  # keeps the peaks
     stream.log(path, line, static=True)
     rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=t)], rr.Scalars.columns(scalars=values), recording=stream)
 
 
-def _limits(rr: Any, stream: rr.RecordingStream, checks: tuple[Check, ...]) -> None:
+def _send_limits(rr: Any, stream: rr.RecordingStream, checks: tuple[Check, ...]) -> None:
     """Limits of a plotted signal as red lines over the check's window."""
     for number, check in enumerate(checks):
         if check.kind not in LIMITS_OF or math.isnan(check.t0):
             continue
         origin, shown = SHOWN_IN.get("error" if check.kind == "max_error" else check.signal, ("", 0.0))
-        level = check.high * IN_SI.get(check.unit, ("", 1.0))[1] * shown
+        level = check.high * SI_OF_UNIT.get(check.unit, ("", 1.0))[1] * shown
         if origin and not math.isnan(level):  # both kinds judge the size of the signal
             for name, sign in (("high", 1.0), ("low", -1.0)):
-                _send(rr, stream, f"{origin}/limit_{number}_{name}", f"limit: {check.name}", LIMIT, 1.5,
+                _send_line(rr, stream, f"{origin}/limit_{number}_{name}", f"limit: {check.name}", LIMIT, 1.5,
                       np.array([check.t0, check.t1]), sign * np.array([level, level]))
 
 
-def _states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
+def _send_states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
     """Lanes: verdict, phase, sections of the command, each node's NMT state, each check over its window."""
     result, first = verdict(trace), float(trace.t[0])
     if result.word in VERDICTS:
-        _lane(rr, stream, "0 verdict", [(first, str(result))], {str(result): VERDICTS[result.word]})
+        _send_lane(rr, stream, "0 verdict", [(first, str(result))], {str(result): VERDICTS[result.word]})
     names = np.array(["set-up", "main", "clean-up"])
     turns = np.flatnonzero(np.diff(trace.phase, prepend=-1))
-    _lane(rr, stream, "1 phase", [(float(trace.t[k]), str(names[trace.phase[k]])) for k in turns],
+    _send_lane(rr, stream, "1 phase", [(float(trace.t[k]), str(names[trace.phase[k]])) for k in turns],
           {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL})
-    sections = [(float(trace.t[s.start]), s.kind, _asked(s)) for s in trace.sections()]
-    _lane(rr, stream, "2 command", [(t, text) for t, _, text in sections],
+    sections = [(float(trace.t[s.start]), s.kind, _describe_section(s)) for s in trace.sections()]
+    _send_lane(rr, stream, "2 command", [(t, text) for t, _, text in sections],
           {text: SECTIONS[kind] for _, kind, text in sections})
     for node in sorted({state.node for state in trace.nmt}):
-        _lane(rr, stream, f"3 node {node} NMT", [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
+        _send_lane(rr, stream, f"3 node {node} NMT", [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
     for number, check in enumerate(trace.checks, 1):
-        _check_lane(rr, stream, number, check, trace)
+        _send_check_lane(rr, stream, number, check, trace)
 
 
-def _check_lane(rr: Any, stream: rr.RecordingStream, number: int, check: Check, trace: Trace) -> None:
+def _send_check_lane(rr: Any, stream: rr.RecordingStream, number: int, check: Check, trace: Trace) -> None:
     """In the sequence's order, the failed ones first; grey is a window that the run did not reach."""
     unreached = math.isnan(check.t0) and math.isnan(check.value)
     main = trace.t[trace.phase == MAIN]
     whole = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (float(trace.t[0]), float(trace.t[-1]))
     start, stop = whole if math.isnan(check.t0) else (check.t0, check.t1)
-    word = f"{'PASS' if check.passed else 'FAIL'} {_value(check)}"
+    word = f"{'PASS' if check.passed else 'FAIL'} {_format_value(check)}"
     if math.isnan(check.value) and check.detail:
         word += f": {check.detail}"
-    _lane(rr, stream, f"{5 if check.passed else 4}.{number:02} {check.name}", [(start, word), (stop, "")],
+    _send_lane(rr, stream, f"{5 if check.passed else 4}.{number:02} {check.name}", [(start, word), (stop, "")],
           {word: PASS if check.passed else NEUTRAL if unreached else FAIL})
 
 
-def _asked(section: Section) -> str:
+def _describe_section(section: Section) -> str:
     if section.kind == "ramp":
         return f"ramp {section.rate * 1e3:.3g} mm/s"
     return section.kind if section.kind == "dynamic" else f"{section.kind} {section.last * 1e3:.3g} mm"
 
 
-def _lane(rr: Any, stream: rr.RecordingStream, name: str, states: list[tuple[float, str]],
+def _send_lane(rr: Any, stream: rr.RecordingStream, name: str, states: list[tuple[float, str]],
           colours: dict[str, int]) -> None:
     path = f"states/{re.sub('[^A-Za-z0-9.]+', '_', name)}"
     if colours:
@@ -186,19 +186,19 @@ def _lane(rr: Any, stream: rr.RecordingStream, name: str, states: list[tuple[flo
         stream.log(path, rr.StateChange(state=state))
 
 
-def _measured(check: Check) -> str:
+def _describe_measurement(check: Check) -> str:
     limits = " and ".join(f"{sign} {limit:.4g}" for sign, limit in (("≥", check.low), ("≤", check.high))
                           if not math.isnan(limit))
-    return _value(check) + (f" (limit {limits})" if limits else "")
+    return _format_value(check) + (f" (limit {limits})" if limits else "")
 
 
-def _value(check: Check) -> str:
+def _format_value(check: Check) -> str:
     if math.isnan(check.value):
         return "not measured"
     return f"{check.value:.4g}" + ("" if check.unit in ("", "1") else f" {check.unit}")
 
 
-def _texts(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
+def _send_texts(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
     for event in trace.events:
         stream.set_time(TIMELINE, duration=event.t)
         text = f"{event.t:8.3f} s  {event.kind}: {event.text}"
@@ -206,28 +206,29 @@ def _texts(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
     for check in trace.checks:
         t = check.t0 if not math.isnan(check.t0) else float(trace.t[-1])
         stream.set_time(TIMELINE, duration=t)
-        text = f"{t:8.3f} s  {'PASS' if check.passed else 'FAIL'} {check.name}: {_measured(check)} {check.detail}"
+        verdict_word = "PASS" if check.passed else "FAIL"
+        text = f"{t:8.3f} s  {verdict_word} {check.name}: {_describe_measurement(check)} {check.detail}"
         stream.log("log/checks", rr.TextLog(text.rstrip(), level="INFO" if check.passed else "ERROR"))
     facts = [f"{key}: {value}" for key, value in trace.provenance.items()]
     stream.log("log/provenance", rr.TextDocument("\n".join(f"- {fact}" for fact in facts), media_type="text/markdown"),
                static=True)
 
 
-def _axis(rrb: Any, trace: Trace, plot: Plot) -> Any:
+def _choose_axis(rrb: Any, trace: Trace, plot: Plot) -> Any:
     """The timing view ends where nearly all cycles do: one long pause of the machine must not flatten the rest."""
     if plot.origin != "timing":
         return None
-    drawn = [values for path, (_, values) in lines(trace).items() if path.startswith("timing/")]
+    drawn = [values for path, (_, values) in list_lines(trace).items() if path.startswith("timing/")]
     return rrb.ScalarAxis(range=(0.0, 1.5 * max(float(np.nanpercentile(values, 99.5)) for values in drawn)))
 
 
-def _blueprint(rr: Any, trace: Trace) -> Any:
+def _build_blueprint(rr: Any, trace: Trace) -> Any:
     import rerun.blueprint as rrb
     from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
     linked = rrb.TimeAxis(link="LinkToGlobal")
-    there = {path.split("/")[0] for path in lines(trace)}
-    plots = [rrb.TimeSeriesView(origin=f"/{p.origin}", name=p.title, axis_x=linked, axis_y=_axis(rrb, trace, p),
+    there = {path.split("/")[0] for path in list_lines(trace)}
+    plots = [rrb.TimeSeriesView(origin=f"/{p.origin}", name=p.title, axis_x=linked, axis_y=_choose_axis(rrb, trace, p),
                                 plot_legend=rrb.PlotLegend("RightTop")) for p in PLOTS if p.origin in there]
     half = (len(plots) + 1) // 2
     columns = rrb.TextLogColumns(timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
@@ -237,7 +238,7 @@ def _blueprint(rr: Any, trace: Trace) -> Any:
                      rrb.TextDocumentView(origin="/log/provenance", name="Provenance"))
     states = rrb.StateTimelineView(origin="/states", name=LANES, time_view=linked)
     lanes = 5 + len({state.node for state in trace.nmt}) + len(trace.checks)  # 5: three more, a time axis and a title
-    share = min(max(LANE_HEIGHT * lanes, SCREEN[0]), SCREEN[1])
+    share = min(max(LANE_HEIGHT * lanes, LANES_SHARE[0]), LANES_SHARE[1])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*plots[:half]), rrb.Vertical(*plots[half:]),
                        rrb.Vertical(states, texts, row_shares=[share, 1 - share])),

@@ -16,13 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.trace import Trace
-from rig.view.rerun_log import LANES, LIMIT, PASS, PLOTS, SECTIONS, STATES, TEXTS, VERDICTS, ViewerError, lines, rerun
+from rig.view.rerun_log import (
+    LANES,
+    LIMIT,
+    PASS,
+    PLOTS,
+    SECTIONS,
+    STATES,
+    TEXTS,
+    VERDICTS,
+    ViewerError,
+    import_rerun,
+    list_lines,
+)
 
-SEEN = 500  # pixels; the marks in a legend have some 60 each
-WORD = 40  # pixels; one level in the list of events has some 60
-FADING = 7.0  # s; the viewer's own greeting covers a corner for that long
-DIMMED = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
-LEVELS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
+FEWEST_PIXELS = 500  # pixels; the marks in a legend have some 60 each
+FEWEST_TEXT_PIXELS = 40  # pixels; one level in the list of events has some 60
+GREETING_TIME = 7.0  # s; the viewer's own greeting covers a corner for that long
+LANE_WEIGHT = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
+LEVEL_COLOURS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
 LIMITS = "limits"
 
 
@@ -31,67 +43,68 @@ def open_viewer(rrd: Path) -> None:
 
     Raises ViewerError without rerun and without a display.
     """
-    rerun()
+    import_rerun()
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or ask for --screenshot")
-    subprocess.Popen(_command(rrd, "auto"), start_new_session=True)
+    subprocess.Popen(_build_command(rrd, "auto"), start_new_session=True)
 
 
-def screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
+def take_screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
     """Draw `rrd`, made of `trace`, without a display and save the picture; -> pixels of what each view is to show.
 
     Needs a Vulkan driver, lavapipe will do (Debian: mesa-vulkan-drivers libvulkan1). Raises ViewerError when the viewer
     does not come up within `patience` s, when a view reports a warning or an error, and when one shows no line, no
     lane or no text. The lines of limits are counted, but one may well lie behind its signal.
     """
-    rerun()
-    views = _draw(rrd, image, patience)
+    import_rerun()
+    views = _draw_views(rrd, image, patience)
     wrong = [f"{view.name}: {report.summary}" for view in views for report in view.reports]
     if wrong:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
-    pixels = _pixels(trace, image)
-    empty = [title for title, count in pixels.items() if count < {TEXTS: WORD, LIMITS: 0}.get(title, SEEN)]
+    pixels = _count_view_pixels(trace, image)
+    fewest = {TEXTS: FEWEST_TEXT_PIXELS, LIMITS: 0}
+    empty = [title for title, count in pixels.items() if count < fewest.get(title, FEWEST_PIXELS)]
     if empty:
         raise ViewerError(f"{image}: views in which nothing is to be seen: {', '.join(empty)}")
     return pixels
 
 
-def _pixels(trace: Trace, image: Path) -> dict[str, int]:
+def _count_view_pixels(trace: Trace, image: Path) -> dict[str, int]:
     """View -> how many pixels have the colour of one of its lines, lanes or words."""
     from matplotlib.image import imread
 
     shades = (imread(str(image))[..., :3] * 255).astype(int)
-    there = lines(trace)
+    there = list_lines(trace)
     out: dict[str, int] = {}
     for plot in PLOTS:
         colours = [line.colour for line in plot.lines if f"{plot.origin}/{line.path}" in there]
         if colours:
-            out[plot.title] = sum(_count(shades, colour) for colour in colours)
-    out[LANES] = sum(_count(shades, colour, DIMMED, 6) for colour in
+            out[plot.title] = sum(_count_pixels(shades, colour) for colour in colours)
+    out[LANES] = sum(_count_pixels(shades, colour, LANE_WEIGHT, 6) for colour in
                      {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()})
     if trace.events or trace.checks:
-        out[TEXTS] = sum(_count(shades, colour) for colour in LEVELS)
-    out[LIMITS] = _count(shades, LIMIT)
+        out[TEXTS] = sum(_count_pixels(shades, colour) for colour in LEVEL_COLOURS)
+    out[LIMITS] = _count_pixels(shades, LIMIT)
     return out
 
 
-def _count(shades: NDArray[np.int64], colour: int, weight: float = 1.0, off: int = 24) -> int:
+def _count_pixels(shades: NDArray[np.int64], colour: int, weight: float = 1.0, off: int = 24) -> int:
     """Pixels whose channels are all within `off` of a colour."""
     wanted = weight * np.array([colour >> shift & 0xFF for shift in (24, 16, 8)])
     return int((np.abs(shades - wanted).max(axis=2) < off).sum())
 
 
-def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
+def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
     """Save the picture; -> the views' states."""
     from rerun.experimental import ViewerClient
 
-    port = _free_port()
+    port = _find_free_port()
     image.unlink(missing_ok=True)
     with tempfile.TemporaryFile("w+") as output:
-        viewer = subprocess.Popen([*_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],
+        viewer = subprocess.Popen([*_build_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],
                                   stdout=output, stderr=output, start_new_session=True)
         try:
-            views = _when_loaded(viewer, f"rerun+http://127.0.0.1:{port}/proxy", patience)
+            views = _wait_until_loaded(viewer, f"rerun+http://127.0.0.1:{port}/proxy", patience)
             ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image.resolve()))
         except (ConnectionError, TimeoutError, RuntimeError) as error:
             output.seek(0)
@@ -104,7 +117,7 @@ def _draw(rrd: Path, image: Path, patience: float) -> list[Any]:
     return views
 
 
-def _when_loaded(viewer: subprocess.Popen[bytes], url: str, patience: float) -> list[Any]:
+def _wait_until_loaded(viewer: subprocess.Popen[bytes], url: str, patience: float) -> list[Any]:
     """The views once everything has arrived, been drawn, and the greeting has faded."""
     from rerun.experimental import ViewerClient
 
@@ -118,16 +131,16 @@ def _when_loaded(viewer: subprocess.Popen[bytes], url: str, patience: float) -> 
         except ConnectionError:
             continue
         if state.recordings and state.views and not state.loading:
-            time.sleep(FADING)
+            time.sleep(GREETING_TIME)
             return list(ViewerClient(url).get_state().views)
     raise TimeoutError(f"not ready after {patience:g} s")
 
 
-def _command(rrd: Path, port: str) -> list[str]:
+def _build_command(rrd: Path, port: str) -> list[str]:
     return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", port, "--hide-welcome-screen", str(rrd)]
 
 
-def _free_port() -> int:
+def _find_free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from itertools import count
 from typing import Protocol
 
-from rig.network.bus import Embedded, open_can
+from rig.network.bus import EmbeddedBus, open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
 
@@ -26,7 +26,7 @@ class Station(Protocol):
 class Port:
     """A port of the embedded bus; polling delivers, as there is nobody else to do it."""
 
-    def __init__(self, bus: Embedded, clock: Callable[[], int]) -> None:
+    def __init__(self, bus: EmbeddedBus, clock: Callable[[], int]) -> None:
         self._bus, self._clock = bus, clock
         self._frames: list[Frame] = []
         self.send = bus.attach(lambda frame: self._frames.append(frame))
@@ -53,7 +53,7 @@ def stations(kind: str, number: int = 3) -> Iterator[list[Station]]:
         return time.monotonic_ns() - begin
 
     if kind == "embedded":
-        bus = Embedded()
+        bus = EmbeddedBus()
         yield [Port(bus, clock) for _ in range(number)]
         return
     where = spec(kind)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from dbc import EDS
 from rig.device import Device, NmtCommand
-from rig.network.bus import Embedded
+from rig.network.bus import EmbeddedBus
 from rig.network.frame import Frame
 
 MS = 1_000_000  # ns
@@ -17,7 +17,7 @@ class Rack:
     def __init__(self, node: int = 3, boot: bool = True, eds: Path | None = None) -> None:
         self.node, self.t_ns = node, 0
         self.heard: list[tuple[int, bytes]] = []
-        self.bus = Embedded()
+        self.bus = EmbeddedBus()
         self._send = self.bus.attach(self._hear)
         self.device = self.bus.add(lambda send: Device(node, eds or EDS[node], send))
         if boot:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from plant import Model
 from rig.network import codec
-from rig.network.bus import Embedded
+from rig.network.bus import EmbeddedBus
 from rig.network.codec import Drive, Feedback, ValveState
 from rig.network.frame import Send
 from rig.nodes.emulator import SCENARIO, Emulator
@@ -22,7 +22,7 @@ class Desk:
     def __init__(self, make: Callable[[Send], AnyNode]) -> None:
         self.t_ns = 0
         self.heard: list[tuple[int, int, bytes]] = []
-        self._bus = Embedded()
+        self._bus = EmbeddedBus()
         self._send = self._bus.attach(lambda frame: self.heard.append((frame.t_ns, frame.cob_id, frame.data)))
         self.node = self._bus.add(make)
         self.wait(0)

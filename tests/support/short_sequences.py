@@ -8,7 +8,7 @@ from fdi.progress import ignore_progress
 from plant import load_model
 from rig.run.job import Job
 from rig.run.outcome import Outcome
-from rig.run.runner import run
+from rig.run.runner import run_job
 from rig.sequences.sequence import parse_sequence
 
 SHORT = """
@@ -41,7 +41,7 @@ def job(text: str = SHORT, seed: int = 0, set_: dict[str, float] | None = None, 
 
 def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
     """Run a job; its results lie in `folder`."""
-    return run(one, folder, ignore_progress, stop)
+    return run_job(one, folder, ignore_progress, stop)
 
 
 def stop_after(cycles: int) -> Callable[[], bool]:

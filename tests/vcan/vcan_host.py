@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import pytest
 
-from rig.network.bus import socketcan_problem
+from rig.network.bus import explain_socketcan_problem
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent.parent
@@ -30,7 +30,7 @@ def skip_or_fail(reason: str) -> NoReturn:
 @functools.cache
 def kernel_has_vcan0() -> bool:
     """True if vcan0 is there and up in this very kernel. Nothing is sent: somebody may be using it."""
-    return not socketcan_problem("vcan0")
+    return not explain_socketcan_problem("vcan0")
 
 
 @functools.cache

@@ -27,7 +27,7 @@ def run_command(args: argparse.Namespace) -> int:
     from rig import doctor
     from rig.cli.answer import show_answer
 
-    report = build_doctor_report(doctor.survey(args.seconds))
+    report = build_doctor_report(doctor.examine_machine(args.seconds))
     if args.out is not None:
         write_text(args.out, json.dumps(report.data, indent=1) + "\n")
     show_answer(report, args)

@@ -16,11 +16,11 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.report.report import Report
     from plant.errors import InputError
     from rig.cli.answer import show_answer
-    from rig.recorder.convert import export
+    from rig.recorder.convert import export_trace
 
     if args.out is None:
         raise InputError("--out", "", "the file to write")
-    count = export(Path(args.trace), Path(args.out), args.all)
+    count = export_trace(Path(args.trace), Path(args.out), args.all)
     sentence = f"{args.out}: {count} {'rows' if '.csv' in Path(args.out).suffixes else 'frames'}"
     show_answer(Report("export", args.trace, sentence=sentence, data={"path": str(args.out), "count": count}), args)
     return 0

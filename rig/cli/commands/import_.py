@@ -17,13 +17,13 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.report.report import Report
     from plant.errors import InputError
     from rig.cli.answer import show_answer
-    from rig.recorder.convert import RAW, import_csv, import_frames
+    from rig.recorder.convert import RAW_SUFFIXES, import_csv, import_frames
 
     source = Path(args.file)
     csv = source.name.endswith((".csv", ".csv.gz"))
     out = Path(args.out) if args.out is not None else source.with_name(source.name.split(".")[0] + ".mcap")
-    if not csv and source.suffix not in RAW:
-        raise InputError(source, "", f"a file that ends in .csv, .csv.gz, {', '.join(RAW)}")
+    if not csv and source.suffix not in RAW_SUFFIXES:
+        raise InputError(source, "", f"a file that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
     cycles = import_csv(source, out) if csv else import_frames(source, out, Path(args.dbc) if args.dbc else dbc.DBC)
     data = {"trace": str(out), "cycles": cycles}
     show_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles", data=data), args)

@@ -30,15 +30,15 @@ def run_command(args: argparse.Namespace) -> int:
     import signal
 
     from plant import InputError
-    from rig.network.bus import choose, open_can
+    from rig.network.bus import choose_bus, open_can
     from rig.network.clock import WallClock
     from rig.network.link import Link
-    from rig.network.wire import serve
-    from rig.run.participants import EMBEDDED
-    from rig.run.priority import elevated
+    from rig.network.wire import serve_node
+    from rig.run.participants import EMBEDDED_NAMES
+    from rig.run.priority import raise_priority
 
-    bus, _ = choose(args.bus)
-    if bus.partition(":")[0] in EMBEDDED:
+    bus, _ = choose_bus(args.bus)
+    if bus.partition(":")[0] in EMBEDDED_NAMES:
         raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     make = choose_node(args)
     clock = WallClock()
@@ -50,8 +50,8 @@ def run_command(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
     try:
-        with elevated():
-            serve(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
+        with raise_priority():
+            serve_node(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
     finally:
         link.close()
     if not args.quiet:
@@ -63,7 +63,7 @@ def run_command(args: argparse.Namespace) -> int:
 def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
     """A function that builds the node which the options describe."""
     from rig.nodes.emulator import Emulator
-    from rig.nodes.firmware import Firmware, gains_of
+    from rig.nodes.firmware import Firmware, read_gains
     from rig.nodes.scenario import Scenario, require_servovalve
     from rig.sequences.faults import Plan
 
@@ -71,4 +71,4 @@ def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
     require_servovalve(model)
     if args.node == "plant":
         return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
-    return lambda send: Firmware(send, gains_of(model), model)
+    return lambda send: Firmware(send, read_gains(model), model)

@@ -15,10 +15,10 @@ def run_command(args: argparse.Namespace) -> int:
     """Write --out (default: FILE with .recovered before its suffix) and report what was lost."""
     from fdi.report.report import Report
     from rig.cli.answer import show_answer
-    from rig.recorder.recover import recover
+    from rig.recorder.recover import recover_log
 
     source = Path(args.file)
     out = Path(args.out) if args.out is not None else source.with_name(f"{source.stem}.recovered{source.suffix}")
-    salvage = recover(source, out)
+    salvage = recover_log(source, out)
     show_answer(Report("recover", str(source), sentence=str(salvage), data=asdict(salvage)), args)
     return 0

@@ -44,17 +44,17 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.trace.trace import Trace
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
-    from rig.network.bus import choose
+    from rig.network.bus import choose_bus
     from rig.run.page_writer import PageWriter
-    from rig.run.runner import run as do
+    from rig.run.runner import run_job
 
     job = read_job(args.source, args) if args.source else build_job(args)
-    bus, why = choose(job.bus if args.source and args.bus == "auto" else args.bus)
+    bus, why = choose_bus(job.bus if args.source and args.bus == "auto" else args.bus)
     job = replace_settings(job, bus=bus)
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
     with (PageWriter(in_background=not job.realtime) as pages, catch_signals() as is_to_stop,
           announce_run(job, why, is_silent=args.json or args.quiet) as progress):
-        outcome = do(job, folder, progress, is_to_stop)
+        outcome = run_job(job, folder, progress, is_to_stop)
         progress("report", 0.0)
         pages.write_page(folder / "trace.mcap", folder / "report.html")
         report = build_run_report(Trace.read(folder / "trace.mcap", all=True))
@@ -157,14 +157,14 @@ def read_job(source: Path, args: argparse.Namespace) -> Job:
         InputError: no log of a run, or options that would change the job.
     """
     from plant import InputError
-    from rig.run.job import repeat
+    from rig.run.job import read_job
 
     if args.sequence or args.set or args.model or args.effects or args.seed is not None:
         raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed or --effects: the log has them")
     log = source / "trace.mcap" if source.is_dir() else source
     if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
         raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
-    return replace_settings(repeat(source), pace=args.pace, controller=args.controller, plant=args.plant,
+    return replace_settings(read_job(source), pace=args.pace, controller=args.controller, plant=args.plant,
                             max_overruns=args.max_overruns)
 
 

@@ -41,7 +41,7 @@ def run_command(args: argparse.Namespace) -> int:
     answer: dict[str, object] = {"rrd": str(rrd)}
     if args.screenshot:
         answer["screenshot"] = args.screenshot
-        answer["pixels"] = viewer.screenshot(trace, rrd, Path(args.screenshot))
+        answer["pixels"] = viewer.take_screenshot(trace, rrd, Path(args.screenshot))
     elif save is None:
         viewer.open_viewer(rrd)
     written = "\n".join(str(path) for path in (rrd, args.screenshot) if path)

@@ -36,12 +36,12 @@ def measure_simulation_speed(command: Array, rounds: int = 9) -> float:
 def measure_bus_run_speed(runs: int = 3) -> float:
     """The speed of a preflight run on the embedded bus, with its log, as a multiple of real time; best of `runs`."""
     from rig.run.job import Job
-    from rig.run.runner import run
+    from rig.run.runner import run_job
     from rig.sequences import load_sequence
 
     job = Job(sequence=load_sequence("preflight"), model=Model())
     speeds = []
     for _ in range(runs):
         with tempfile.TemporaryDirectory() as folder:
-            speeds.append(run(job, Path(folder), ignore_progress, lambda: False).speed)
+            speeds.append(run_job(job, Path(folder), ignore_progress, lambda: False).speed)
     return max(speeds)

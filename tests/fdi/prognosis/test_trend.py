@@ -21,7 +21,7 @@ from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import ignore_progress
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
-from rig.recorder.provenance import provenance
+from rig.recorder.provenance import collect_provenance
 from rig.studies.prognosis import degrading_units
 from rig.studies.prognosis.score import Prediction, find_false_trends, score_unit
 
@@ -301,4 +301,4 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_log_of_the_rig_tells_its_date() -> None:
-    assert parse_date(provenance()["started"]) > parse_date("2026-01-01")
+    assert parse_date(collect_provenance()["started"]) > parse_date("2026-01-01")

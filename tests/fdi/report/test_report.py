@@ -23,7 +23,7 @@ from fdi.report.run_verdict import verdict
 from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
 from rig.recorder import Check, Recorder, Signals, Timing
-from rig.recorder.recover import recover
+from rig.recorder.recover import recover_log
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +155,7 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
 def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
     record(tmp_path / "aborted.mcap", stop=100)
     (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-50_000])
-    recover(tmp_path / "cut.mcap", tmp_path / "salvaged.mcap")
+    recover_log(tmp_path / "cut.mcap", tmp_path / "salvaged.mcap")
     (tmp_path / "short.csv").write_text("t,com,xj,cor\n0,0,,0\n0.001,0,1e-6,0\n0.004,0,1e-6,0\n")
     for name in ("aborted.mcap", "salvaged.mcap", "short.csv"):
         write_run_page(tmp_path / name, tmp_path / "report.html")

@@ -206,7 +206,7 @@ def test_timing_that_is_invalid(short: Path, tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_bug_is_neither_a_verdict_nor_bad_input(short: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("rig.run.runner.judge", lambda *_: 1 / 0)
+    monkeypatch.setattr("rig.run.runner.judge_run", lambda *_: 1 / 0)
     said = rig("run", short, "--out", tmp_path / "out", "--json")
     assert said.status == 70 and "ZeroDivisionError" in said.err and said.out == ""
     assert Trace.read(tmp_path / "out").xj.size == 350  # the log is closed

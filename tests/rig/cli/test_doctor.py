@@ -18,7 +18,7 @@ from rig.run import lateness
 
 @pytest.fixture(scope="module")
 def findings() -> list[doctor.Finding]:
-    return doctor.survey(seconds=0.05)
+    return doctor.examine_machine(seconds=0.05)
 
 
 def arguments(*words: str) -> argparse.Namespace:
@@ -53,13 +53,13 @@ def test_can_finding_is_true(findings: list[doctor.Finding]) -> None:
 def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None:
     text = next(finding.found for finding in findings if finding.name == "packages")
     assert f"numpy {np.__version__}" in text
-    assert set(doctor.requirements()) == {"", "view", "dev", "fleet", "learn", "bench"}
-    assert doctor.versions(["no-such-distribution"]) == {"no-such-distribution": ""}
+    assert set(doctor.read_requirements()) == {"", "view", "dev", "fleet", "learn", "bench"}
+    assert doctor.read_versions(["no-such-distribution"]) == {"no-such-distribution": ""}
 
 
 def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(doctor, "requirements", lambda: {"": ["numpy", "no-such-distribution"]})
+    monkeypatch.setattr(doctor, "read_requirements", lambda: {"": ["numpy", "no-such-distribution"]})
     assert command.run_command(arguments("--seconds", "0")) == 1
     out = capsys.readouterr().out
     assert "missing: no-such-distribution" in out
@@ -68,7 +68,7 @@ def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_PATH", "/nowhere")
-    found = {finding.name: finding for finding in [*doctor.tools(), *doctor.can()]}
+    found = {finding.name: finding for finding in [*doctor.examine_tools(), *doctor.examine_buses()]}
     assert found["C compiler"].status == "missing" and "gcc" in found["C compiler"].remedy
     assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
 
@@ -98,17 +98,17 @@ def test_bad_seconds_are_refused(seconds: str) -> None:
 
 def test_percentiles_of_known_wake_ups() -> None:
     late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
-    assert lateness.percentiles(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
+    assert lateness.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
 
 
 def test_timer_lateness_counts_its_periods() -> None:
-    late = lateness.timer_lateness(0.05)
+    late = lateness.measure_timer_lateness(0.05)
     assert late.periods == 50
     assert 0 <= late.p50 <= late.p99 <= late.p99_9 <= late.max
 
 
 def test_fifo_ends_with_its_thread() -> None:
-    assert lateness.under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
+    assert lateness.run_under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
@@ -117,4 +117,4 @@ def test_fifo_without_the_right_is_none(monkeypatch: pytest.MonkeyPatch) -> None
         raise PermissionError
 
     monkeypatch.setattr("os.sched_setscheduler", refuse)
-    assert lateness.under_fifo(lambda: True) is None
+    assert lateness.run_under_fifo(lambda: True) is None

@@ -8,7 +8,7 @@ import pytest
 from rig_command import rig
 from synthetic_run import record
 
-from rig.recorder.convert import RAW
+from rig.recorder.convert import RAW_SUFFIXES
 
 HEAD = "t,com,xj,cor\n"
 COMMANDS = {  # name -> words, of what suffix the result is
@@ -18,7 +18,7 @@ COMMANDS = {  # name -> words, of what suffix the result is
     "report": (["report", "{log}", "--out", "{out}"], ".html"),
     "export csv": (["export", "{log}", "--out", "{out}"], ".csv"),
     "export csv.gz": (["export", "{log}", "--out", "{out}"], ".csv.gz"),
-    **{f"export {suffix}": (["export", "{log}", "--out", "{out}"], suffix) for suffix in RAW},
+    **{f"export {suffix}": (["export", "{log}", "--out", "{out}"], suffix) for suffix in RAW_SUFFIXES},
     "import csv": (["import", "{csv}", "--out", "{out}"], ".mcap"),
     "import frames": (["import", "{can}", "--out", "{out}"], ".mcap"),
     "recover": (["recover", "{log}", "--out", "{out}"], ".mcap"),

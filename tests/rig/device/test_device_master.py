@@ -8,7 +8,7 @@ import pytest
 
 from dbc import EDS
 from rig.device import Device, NmtState
-from rig.network.bus import Embedded
+from rig.network.bus import EmbeddedBus
 from rig.network.frame import Frame
 
 MS = 1_000_000  # ns
@@ -17,7 +17,7 @@ MS = 1_000_000  # ns
 class Master(canopen.Network):  # type: ignore[misc]  # canopen is not typed
     """canopen's network on an embedded bus: a frame sent is delivered, and answered, before the call returns."""
 
-    def __init__(self, bus: Embedded) -> None:
+    def __init__(self, bus: EmbeddedBus) -> None:
         super().__init__()
         self.t_ns = 0
         self._embedded = bus
@@ -36,7 +36,7 @@ class Bench:
     """Nodes 2 and 3, booted, and their remote images in the master."""
 
     def __init__(self) -> None:
-        bus = Embedded()
+        bus = EmbeddedBus()
         self.master = Master(bus)
         self.remotes = {n: self.master.add_node(n, str(EDS[n])) for n in (2, 3)}
         self.devices = {n: bus.add(lambda send, n=n: Device(n, EDS[n], send)) for n in (2, 3)}  # type: ignore[misc]

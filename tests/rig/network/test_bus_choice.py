@@ -9,44 +9,44 @@ import pytest
 
 from plant.errors import InputError, RigError
 from rig.network import bus as bus_module
-from rig.network.bus import choose, open_can, socketcan_problem
+from rig.network.bus import choose_bus, explain_socketcan_problem, open_can
 
 
 @pytest.fixture(autouse=True)
 def _no_variable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(bus_module.VARIABLE, raising=False)
+    monkeypatch.delenv(bus_module.BUS_VARIABLE, raising=False)
 
 
 def test_auto_is_embedded_and_says_so() -> None:
-    chosen, reason = choose("auto")
+    chosen, reason = choose_bus("auto")
     assert chosen == "embedded"
     assert "EHA_RIG_BUS" in reason
 
 
 def test_live_interface_is_named_but_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_module, "can_interfaces", lambda: ["vcan0"])
-    chosen, reason = choose()
+    monkeypatch.setattr(bus_module, "list_can_interfaces", lambda: ["vcan0"])
+    chosen, reason = choose_bus()
     assert chosen == "embedded"
     assert "vcan0 up, but not taken unasked" in reason
 
 
 def test_asked_or_configured(monkeypatch: pytest.MonkeyPatch) -> None:
     for taken in ("embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"):
-        assert choose(taken) == (taken, f"{taken}, as asked")
-        monkeypatch.setenv(bus_module.VARIABLE, taken)
-        assert choose("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
-        assert choose("virtual:y")[0] == "virtual:y"  # asking beats the variable
+        assert choose_bus(taken) == (taken, f"{taken}, as asked")
+        monkeypatch.setenv(bus_module.BUS_VARIABLE, taken)
+        assert choose_bus("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
+        assert choose_bus("virtual:y")[0] == "virtual:y"  # asking beats the variable
 
 
 def test_bad_spec(monkeypatch: pytest.MonkeyPatch) -> None:
     for bad in ("vcan0", "socketcan", "embedded:x", "udp_multicast:10.0.0.1", "udp_multicast:x", "nosuch:0"):
         with pytest.raises(InputError, match=f"--bus: {bad}: expected "):
-            choose(bad)
-        monkeypatch.setenv(bus_module.VARIABLE, bad)
+            choose_bus(bad)
+        monkeypatch.setenv(bus_module.BUS_VARIABLE, bad)
         with pytest.raises(InputError, match=f"EHA_RIG_BUS: {bad}: expected "):
-            choose("auto")
+            choose_bus("auto")
     with pytest.raises(InputError, match="--bus: expected auto, embedded, "):
-        choose("")
+        choose_bus("")
 
 
 def test_embedded_is_no_bus_between_programs() -> None:
@@ -56,8 +56,9 @@ def test_embedded_is_no_bus_between_programs() -> None:
 
 def test_missing_interface_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Asked for or configured: an error, never a silent fall back to the simulation."""
-    monkeypatch.setenv(bus_module.VARIABLE, "socketcan:vcan77")
-    for use in (lambda: choose("auto"), lambda: choose("socketcan:vcan77"), lambda: open_can("socketcan:vcan77")):
+    monkeypatch.setenv(bus_module.BUS_VARIABLE, "socketcan:vcan77")
+    for use in (lambda: choose_bus("auto"), lambda: choose_bus("socketcan:vcan77"),
+                lambda: open_can("socketcan:vcan77")):
         with pytest.raises(RigError) as caught:
             use()
         assert str(caught.value).startswith("socketcan:vcan77: ")
@@ -80,12 +81,12 @@ def test_what_is_wrong_with_an_interface(monkeypatch: pytest.MonkeyPatch, tmp_pa
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(kind + "\n")
         (tmp_path / name / "flags").write_text(flags + "\n")
-    assert "ip link add vcan1 type vcan && sudo ip link set vcan1 up" in socketcan_problem("vcan1")
-    assert "ip link set can1 up type can bitrate 1000000" in socketcan_problem("can1")
-    assert socketcan_problem("eth0") == "eth0 is not a CAN interface"
-    assert socketcan_problem("vcan0") == "vcan0 is down; sudo ip link set vcan0 up"
-    assert socketcan_problem("can0") == ""
-    assert bus_module.can_interfaces() == ["can0"]
+    assert "ip link add vcan1 type vcan && sudo ip link set vcan1 up" in explain_socketcan_problem("vcan1")
+    assert "ip link set can1 up type can bitrate 1000000" in explain_socketcan_problem("can1")
+    assert explain_socketcan_problem("eth0") == "eth0 is not a CAN interface"
+    assert explain_socketcan_problem("vcan0") == "vcan0 is down; sudo ip link set vcan0 up"
+    assert explain_socketcan_problem("can0") == ""
+    assert bus_module.list_can_interfaces() == ["can0"]
 
 
 def test_kernel_without_can(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,4 +94,4 @@ def test_kernel_without_can(monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError(97, os.strerror(97))
 
     monkeypatch.setattr(socket, "socket", refuse)
-    assert "no SocketCAN" in socketcan_problem("vcan0")
+    assert "no SocketCAN" in explain_socketcan_problem("vcan0")

@@ -14,9 +14,9 @@ from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.master import CONTROLLER, PLANT, BusError, Master
-from rig.network.wire import EmbeddedWire, LinkWire, Wire, serve
+from rig.network.wire import EmbeddedWire, LinkWire, Wire, serve_node
 from rig.nodes.emulator import Emulator
-from rig.nodes.firmware import Firmware, gains_of
+from rig.nodes.firmware import Firmware, read_gains
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Plan
 
@@ -31,7 +31,7 @@ def served(where: str, *makers: type[Emulator] | type[Firmware]) -> Iterator[Non
     for make in makers:
         clock = WallClock()
         links.append(Link(open_can(where), clock.now))
-        threads.append(threading.Thread(target=serve, args=(make(links[-1].send), links[-1], clock, over.is_set)))
+        threads.append(threading.Thread(target=serve_node, args=(make(links[-1].send), links[-1], clock, over.is_set)))
     for thread in threads:
         thread.start()
     try:
@@ -67,7 +67,7 @@ def test_bring_up(wire: Wire) -> None:
     seen: list[tuple[int, int]] = []
     master.on_state = lambda node, state: seen.append((node, state))
     master.reset()
-    master.configure(SCENARIO, gains_of(Model()), 1_000_000)
+    master.configure(SCENARIO, read_gains(Model()), 1_000_000)
     master.start()
     wire.wait(lambda: set(master.states.values()) == {5}, 1.0)
     master.stop()
@@ -89,7 +89,7 @@ def test_refusals_name_node_and_object(wire: Wire) -> None:
     with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210: .*0x06090030"):
         master.configure(b"nonsense", None, 0)
     with pytest.raises(BusError, match=r"node 2 \(controller\), object 0x2110 sub 1: .*0x06090030"):
-        master.configure(SCENARIO, gains_of(Model())._replace(proportional_gain=float("nan")), 0)
+        master.configure(SCENARIO, read_gains(Model())._replace(proportional_gain=float("nan")), 0)
 
 
 def test_nobody_there() -> None:
@@ -146,7 +146,7 @@ def test_heartbeats_are_watched_from_the_first_on() -> None:
     lost: list[int] = []
     master.on_lost = lost.append
     master.reset()
-    master.configure(SCENARIO, gains_of(Model()), 0)
+    master.configure(SCENARIO, read_gains(Model()), 0)
     for _ in range(10):
         master.wire.wait(lambda: False, 0.1)
         master.tick()

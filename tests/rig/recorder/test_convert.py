@@ -17,7 +17,7 @@ from plant.errors import InputError
 from rig.cli.commands import export as export_command
 from rig.cli.commands import import_ as import_command
 from rig.cli.commands import recover as recover_command
-from rig.recorder.convert import RAW, export, frames, import_csv, import_frames
+from rig.recorder.convert import RAW_SUFFIXES, export_trace, import_csv, import_frames, read_raw_frames
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +25,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1300)
 
 
-@pytest.mark.parametrize("suffix", RAW)
+@pytest.mark.parametrize("suffix", RAW_SUFFIXES)
 def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"x{suffix}"
-    assert export(log, out) == 6500
+    assert export_trace(log, out) == 6500
     assert import_frames(out, tmp_path / "back.mcap", dbc.DBC) == 1300
-    before, after = list(frames(log)), list(frames(tmp_path / "back.mcap"))
+    before, after = list(read_raw_frames(log)), list(read_raw_frames(tmp_path / "back.mcap"))
     assert [f[1:] for f in before] == [f[1:] for f in after]
     worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
     assert worst <= 100_000  # .trc counts 0.1 ms
@@ -44,7 +44,7 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
 def test_wireshark_decodes_the_export(log: Path, tmp_path: Path) -> None:
     if not shutil.which("tshark"):
         pytest.skip("no tshark on this machine (Debian: apt-get install tshark)")
-    export(log, tmp_path / "x.blf")
+    export_trace(log, tmp_path / "x.blf")
     words = ["tshark", "-r", str(tmp_path / "x.blf"), "-d", "can.subdissector,canopen", "-T", "fields", "-e", "can.id",
              "-e", "_ws.malformed"]
     lines = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
@@ -77,7 +77,7 @@ def test_lost_and_late_frames_of_a_candump(tmp_path: Path) -> None:
 
 
 def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
-    export(log, tmp_path / "x.csv.gz")
+    export_trace(log, tmp_path / "x.csv.gz")
     assert import_csv(tmp_path / "x.csv.gz", tmp_path / "y.mcap") == 1000
     before, after = Trace.read(log), Trace.read(tmp_path / "y.mcap")
     np.testing.assert_array_equal(before.xj, after.xj)
@@ -86,13 +86,13 @@ def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
 
 def test_refusals(log: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"ends in \.csv"):
-        export(log, tmp_path / "x.xlsx")
+        export_trace(log, tmp_path / "x.xlsx")
     (tmp_path / "x.csv").write_text("t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n")
     with pytest.raises(InputError, match="raw frames"):
-        export(tmp_path / "x.csv", tmp_path / "x.blf")
+        export_trace(tmp_path / "x.csv", tmp_path / "x.blf")
     import_csv(tmp_path / "x.csv", tmp_path / "x.mcap")
     with pytest.raises(InputError, match="at least one raw frame"):
-        export(tmp_path / "x.mcap", tmp_path / "x.blf")
+        export_trace(tmp_path / "x.mcap", tmp_path / "x.blf")
     assert not (tmp_path / "x.blf").exists()
     (tmp_path / "bad.log").write_text("hello\n")
     with pytest.raises(InputError, match=r"CAN frames as \.log"):

@@ -18,7 +18,7 @@ from synthetic_run import ATTACHMENTS, METADATA, cycles, record
 
 from rig.network.frame import Frame
 from rig.recorder import U32, CanFrame, Check, Event, NmtState, Recorder, RecorderError, Signals, Timing
-from rig.recorder.schema import TOPICS, packer, schema_bytes
+from rig.recorder.schema import TOPICS, encode_schema, make_packer
 
 VALUES: dict[Any, st.SearchStrategy[Any]] = {
     float: st.floats(), U32: st.integers(0, 2**32 - 1), bool: st.booleans(), str: st.text(max_size=300),
@@ -39,10 +39,11 @@ def test_packed_record_is_what_protobuf_reads(kind: type, data: st.DataObject) -
     values = {f.name: data.draw(VALUES[hints[f.name]]) for f in fields(kind)}
     t_ns = data.draw(st.integers(0, 2**63))
     item = Frame(t_ns, values["cob_id"], values["data"]) if kind is CanFrame else kind(**values)
-    raw = packer(kind)(t_ns, item)
+    raw = make_packer(kind)(t_ns, item)
     opcode, length, _, _, log_time, publish_time = struct.unpack_from("<BQHIQQ", raw)
     assert (opcode, length, log_time, publish_time) == (5, len(raw) - 9, t_ns, t_ns)
-    decode = DecoderFactory().decoder_for("protobuf", Schema(1, schema_bytes(kind), "protobuf", f"eha.{kind.__name__}"))
+    schema = Schema(1, encode_schema(kind), "protobuf", f"eha.{kind.__name__}")
+    decode = DecoderFactory().decoder_for("protobuf", schema)
     assert decode is not None
     message = decode(raw[31:])
     for name, value in values.items():

@@ -16,7 +16,7 @@ from synthetic_run import ATTACHMENTS, METADATA, record
 
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.recorder.recover import recover
+from rig.recorder.recover import recover_log
 
 WRITER = """
 import sys, time
@@ -48,7 +48,7 @@ def test_kill_9_in_mid_run_loses_at_most_half_a_second(tmp_path: Path, capsys: p
     reached = int((tmp_path / "times").read_text().rsplit("\n", 2)[-2])
     with pytest.raises(InputError, match="rig recover"):
         Trace.read(broken)
-    salvage = recover(broken, out)
+    salvage = recover_log(broken, out)
     trace = Trace.read(out, all=True)
     lost = reached * 1e-9 - (trace.t[-1] - trace.t[0])
     with capsys.disabled():
@@ -72,7 +72,7 @@ def test_every_cut_gives_a_readable_log_or_a_clear_refusal(whole: Path, tmp_path
         path, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
         path.write_bytes(data[:cut])
         try:
-            kept.append(recover(path, out).messages)
+            kept.append(recover_log(path, out).messages)
         except InputError as error:
             assert cut < 200 and "MCAP log" in str(error)
             continue
@@ -89,7 +89,7 @@ def test_damage_in_the_middle_costs_one_chunk(whole: Path, tmp_path: Path) -> No
     data = bytearray(whole.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length - 100] ^= 0xFF
     (tmp_path / "bad.mcap").write_bytes(data)
-    salvage = recover(tmp_path / "bad.mcap", tmp_path / "out.mcap")
+    salvage = recover_log(tmp_path / "bad.mcap", tmp_path / "out.mcap")
     assert not salvage.complete and "damaged chunk" in salvage.reason
     assert salvage.lost_bytes >= chunk.chunk_length
     trace = Trace.read(tmp_path / "out.mcap", all=True)
@@ -99,7 +99,7 @@ def test_damage_in_the_middle_costs_one_chunk(whole: Path, tmp_path: Path) -> No
 
 
 def test_a_whole_log_stays_the_same(whole: Path, tmp_path: Path) -> None:
-    salvage = recover(whole, tmp_path / "out.mcap")
+    salvage = recover_log(whole, tmp_path / "out.mcap")
     assert salvage.complete and salvage.lost_bytes == 0
     before, after = Trace.read(whole, all=True), Trace.read(tmp_path / "out.mcap", all=True)
     assert (before.xj == after.xj).all() and before.events == after.events and before.attachments == after.attachments
@@ -108,11 +108,11 @@ def test_a_whole_log_stays_the_same(whole: Path, tmp_path: Path) -> None:
 def test_refusals(whole: Path, tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("t,com,xj,cor\n")
     with pytest.raises(InputError, match="MCAP log"):
-        recover(tmp_path / "text.mcap", tmp_path / "out.mcap")
+        recover_log(tmp_path / "text.mcap", tmp_path / "out.mcap")
     with pytest.raises(InputError, match="readable file"):
-        recover(tmp_path / "none.mcap", tmp_path / "out.mcap")
+        recover_log(tmp_path / "none.mcap", tmp_path / "out.mcap")
     with pytest.raises(InputError, match="another file"):
-        recover(whole, whole)
+        recover_log(whole, whole)
 
 
 def test_a_message_record_is_taken_apart_in_one_place() -> None:

@@ -12,7 +12,7 @@ from short_sequences import SHORT, job, play
 from fdi.trace.trace import Trace
 from plant import InputError
 from plant.effects import CATALOGUE
-from rig.run.job import repeat
+from rig.run.job import read_job
 
 EFFECT = '''
 from typing import Annotated, NamedTuple
@@ -58,11 +58,11 @@ def same(a: Path, b: Path) -> bool:
 def test_all_that_decides_is_in_the_log(tmp_path: Path) -> None:
     first = job(seed=7, set_={"filter.clogging": 0.2, "sensor_lag.time": 1e-3}, max_overruns=0.5, plant="builtin")
     play(first, tmp_path / "a")
-    again = repeat(tmp_path / "a" / "trace.mcap")
+    again = read_job(tmp_path / "a" / "trace.mcap")
     assert (again.model, again.sequence, again.settings()) == (first.model, first.sequence, first.settings())
     play(again, tmp_path / "b")
     assert same(tmp_path / "a", tmp_path / "b")
-    assert repeat(tmp_path / "b" / "trace.mcap") == again
+    assert read_job(tmp_path / "b" / "trace.mcap") == again
 
 
 def test_another_seed_is_another_run(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_a_log_without_what_decides_is_refused(tmp_path: Path, missing: str) -> 
     recorder.cycle(0, Signals(0, 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0), Timing(0, False, 0.0, 0.0, 0.0))
     recorder.close()
     with pytest.raises(InputError, match="only logs of `rig run`"):
-        repeat(tmp_path / "trace.mcap")
+        read_job(tmp_path / "trace.mcap")
 
 
 def test_bus_and_pace_may_be_asked_for_anew(tmp_path: Path) -> None:

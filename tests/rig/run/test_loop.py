@@ -13,7 +13,7 @@ from rig.network.link import Link
 from rig.network.master import Master
 from rig.network.wire import EmbeddedWire, LinkWire
 from rig.recorder import Signals, Timing
-from rig.run.loop import Loop, Step
+from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
 
 MS = 1_000_000  # ns
@@ -79,15 +79,15 @@ class Book:
         self.timings.append(timing)
 
 
-def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[Loop, Book]:
+def loop(bench: Bench, *faults: Fault, realtime: bool = True) -> tuple[CycleLoop, Book]:
     book = Book()
     schedule = Schedule(Plan(faults=faults, stop=1000))
-    return Loop(Master(bench, bench.clock.now), schedule, book, MS, realtime), book
+    return CycleLoop(Master(bench, bench.clock.now), schedule, book, MS, realtime), book
 
 
-def run(one: Loop, cycles: int) -> None:
+def run(one: CycleLoop, cycles: int) -> None:
     for k in range(cycles):
-        one.cycle(Step(1, 1e-4 * k, 0.0, 7))
+        one.cycle(CycleInput(1, 1e-4 * k, 0.0, 7))
     one.finish()
 
 
@@ -158,7 +158,7 @@ def test_an_answer_after_the_next_sync_is_not_that_cycles() -> None:
 def test_of_two_drives_the_last_counts_as_in_the_plant() -> None:
     bench = Bench()
     one, book = loop(bench)
-    one.cycle(Step(1, 0.0, 0.0, 7))
+    one.cycle(CycleInput(1, 0.0, 0.0, 7))
     bench.answers.append(Frame(bench.clock.now(), codec.DRIVE, codec.pack_drive(4e-3, 15, 0)))
     one.finish()
     assert book.rows[0].cor == 4e-3
@@ -169,7 +169,7 @@ def test_frames_of_another_length_are_nothing(cob_id: int) -> None:
     bench = Bench()
     one, book = loop(bench)
     bench.mute = True
-    one.cycle(Step(1, 0.0, 0.0, 7))
+    one.cycle(CycleInput(1, 0.0, 0.0, 7))
     for length in (0, 1, 4, 7):
         bench.receive(Frame(0, cob_id, bytes(length)))
     one.finish()

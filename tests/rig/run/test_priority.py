@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from rig.run.priority import PRIORITY, SWITCH, elevated, scheduler, undisturbed
+from rig.run.priority import LOOP_PRIORITY, SWITCH_INTERVAL, name_scheduler, raise_priority, suspend_garbage_collection
 
 
 def allowed() -> bool:
@@ -27,10 +27,10 @@ def test_all_threads_are_raised_and_lowered() -> None:
     helper.start()
     other = helper.native_id or 0
     try:
-        with elevated():
-            assert scheduler() == "SCHED_FIFO" and os.sched_getparam(0).sched_priority == PRIORITY
+        with raise_priority():
+            assert name_scheduler() == "SCHED_FIFO" and os.sched_getparam(0).sched_priority == LOOP_PRIORITY
             assert os.sched_getscheduler(other) == os.SCHED_FIFO and os.sched_getparam(other).sched_priority == 1
-        assert scheduler() == "SCHED_OTHER" and os.sched_getscheduler(other) == os.SCHED_OTHER
+        assert name_scheduler() == "SCHED_OTHER" and os.sched_getscheduler(other) == os.SCHED_OTHER
     finally:
         done.set()
         helper.join()
@@ -41,8 +41,8 @@ def test_without_the_right_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> N
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    with elevated():
-        assert scheduler() == "SCHED_OTHER"
+    with raise_priority():
+        assert name_scheduler() == "SCHED_OTHER"
 
 
 @pytest.mark.parametrize("collecting", [True, False])
@@ -51,8 +51,8 @@ def test_collection_comes_back_as_it_was(collecting: bool) -> None:
         gc.disable()
     try:
         before = sys.getswitchinterval()
-        with undisturbed():
-            assert not gc.isenabled() and sys.getswitchinterval() == pytest.approx(SWITCH)
+        with suspend_garbage_collection():
+            assert not gc.isenabled() and sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
         assert gc.isenabled() == collecting and sys.getswitchinterval() == before
     finally:
         gc.enable()

@@ -160,7 +160,7 @@ def play_with(intruder: Intruder, tmp_path: Path) -> Session:
         return intruder
 
     wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, join])  # type: ignore[list-item]
-    with runner.log(job(), tmp_path) as recorder:
+    with runner.open_recorder(job(), tmp_path) as recorder:
         session = Session(job(), wire, recorder, ignore_progress, lambda: False)
         session.bring_up()
         session.play()

@@ -12,7 +12,7 @@ from plant.errors import InputError
 from plant.profile import build
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
-from rig.sequences.checks import CheckResult, evaluate
+from rig.sequences.checks import CheckResult, evaluate_checks
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower
@@ -69,7 +69,7 @@ def check(kind: str, **keys: Any) -> checks.Check:
 
 
 def judged(run: Run, sections: dict[str, slice], kind: str, events: tuple[Event, ...] = (), **keys: Any) -> CheckResult:
-    (result,) = evaluate([check(kind, **keys)], run, sections, events, {"fault": 0.5})
+    (result,) = evaluate_checks([check(kind, **keys)], run, sections, events, {"fault": 0.5})
     return result
 
 
@@ -152,8 +152,8 @@ def test_speed_of_a_ramp() -> None:
 
 
 def test_noise_through_the_median_is_what_its_docstring_says() -> None:
-    assert np.std(measures.median(noise(100_000))) == pytest.approx(1.1e-6, abs=0.05e-6)
-    assert np.std(measures.speed(noise(100_000))) == pytest.approx(0.14e-3, abs=0.01e-3)
+    assert np.std(measures.filter_median(noise(100_000))) == pytest.approx(1.1e-6, abs=0.05e-6)
+    assert np.std(measures.compute_speed(noise(100_000))) == pytest.approx(0.14e-3, abs=0.01e-3)
 
 
 def test_response_to_a_fault_by_event_and_by_signal() -> None:
@@ -171,9 +171,9 @@ def test_events_are_counted_in_their_window() -> None:
     run, sections = follower(Hold(time=1.0))
     events = (Event(0.2, "EMCY", "0x8250"), Event(0.7, "EMCY", "0x8250"))
     assert judged(run, sections, "event_occurs", events, event="0x8250").value == 2
-    assert not evaluate([checks.EventOccurs(name="n", event="0x9999")], run, {})[0].passed
-    assert evaluate([checks.EventNever(name="n", event="emcy", window=(0.3, 0.6))], run, {}, events)[0].passed
-    assert not evaluate([checks.EventNever(name="n", event="emcy")], run, {}, events)[0].passed
+    assert not evaluate_checks([checks.EventOccurs(name="n", event="0x9999")], run, {})[0].passed
+    assert evaluate_checks([checks.EventNever(name="n", event="emcy", window=(0.3, 0.6))], run, {}, events)[0].passed
+    assert not evaluate_checks([checks.EventNever(name="n", event="emcy")], run, {}, events)[0].passed
 
 
 def test_limits_decide() -> None:
@@ -278,14 +278,15 @@ def test_a_measure_that_raises_has_failed(raised: Exception, said: str, monkeypa
         raise raised
 
     run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
-    monkeypatch.setattr(measures, "overshoot", broken)
-    spoilt, sound = evaluate([check("overshoot", window="step"), check("rise_time", window="step")], run, sections)
+    monkeypatch.setattr(measures, "measure_overshoot", broken)
+    checks = [check("overshoot", window="step"), check("rise_time", window="step")]
+    spoilt, sound = evaluate_checks(checks, run, sections)
     assert (spoilt.passed, isnan(spoilt.value), spoilt.detail) == (False, True, said)
     assert sound.passed
 
 
 def test_a_measure_without_end_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     run, sections = follower(Hold(time=0.1), Step(to=1e-3, time=0.9, name="step"))
-    monkeypatch.setattr(measures, "overshoot", lambda *_: float("inf"))
+    monkeypatch.setattr(measures, "measure_overshoot", lambda *_: float("inf"))
     result = judged(run, sections, "overshoot", window="step", low=0.0, high=None)
     assert not result.passed and isnan(result.value) and result.detail == "the measure came to inf"

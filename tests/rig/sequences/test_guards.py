@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 
 from plant.errors import InputError
-from rig.sequences.guards import Guard, Watch
+from rig.sequences.guards import Guard, GuardWatch
 
 
 def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:
     guard = Guard(name="far", signal="xj", high=10.0, unit="mm", cycles=3)
-    watch = Watch([Guard(name="other", signal="p12", low=-1.0, high=1.0), guard])
+    watch = GuardWatch([Guard(name="other", signal="p12", low=-1.0, high=1.0), guard])
     values = [0.011, 0.011, 0.0, 0.011, float("nan"), 0.011, 0.011]
     assert [watch.see({"xj": x}) for x in values] == [None] * 6 + [guard]
-    assert Watch([]).see({"xj": 1e9}) is None
+    assert GuardWatch([]).see({"xj": 1e9}) is None
 
 
 @pytest.mark.parametrize("keys", [

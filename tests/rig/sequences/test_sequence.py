@@ -11,7 +11,7 @@ import pytest
 from plant import load_model, simulate
 from plant.errors import InputError
 from rig.sequences import toml_lines
-from rig.sequences.checks import CheckResult, evaluate
+from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
 SHIPPED = sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
@@ -228,7 +228,7 @@ def test_a_bad_sequence_is_refused_in_one_line(text: str, message: str) -> None:
 def test_lines_of_keys() -> None:
     text = ('a = "x [ {"\nb = [\n  { c = 1 }, # ]\n  { c = [1,\n 2] },\n]\n["d e".f]\ng.h = """\n\n"""\n'
             "[[i]]\n[[i]]\nj = 2024-01-01 10:00:00\nk = 1\n")
-    found = toml_lines.lines(text)
+    found = toml_lines.find_lines(text)
     assert found[("b", 1, "c", 1)] == 5 and found[("b", 0, "c")] == 3
     assert found[("d e", "f", "g", "h")] == 8 and found[("i", 1)] == 12 and found[("i", 1, "k")] == 14
 
@@ -255,7 +255,7 @@ def judge_preflight(changes: dict[str, float], seed: int) -> list[CheckResult]:
     setup, main = s.setup_profile().command, s.main_profile().command
     run = simulate(load_model("eha").replace(changes), np.concatenate((setup, main)), seed=seed)
     rows = {name: column[len(setup):] for name, column in run._asdict().items()}
-    return evaluate(s.checks, SimpleNamespace(**{**rows, "t": run.t[:len(main)]}), s.sections())
+    return evaluate_checks(s.checks, SimpleNamespace(**{**rows, "t": run.t[:len(main)]}), s.sections())
 
 
 @pytest.mark.parametrize("seed", range(4))

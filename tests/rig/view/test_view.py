@@ -127,7 +127,7 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
         pytest.skip(missing)
     assert not missing
     rerun_log.write_rrd(trace, tmp_path / "view.rrd")
-    pixels = viewer.screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
+    pixels = viewer.take_screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
     assert {*pixels} == {*(plot.title for plot in rerun_log.PLOTS), rerun_log.LANES, rerun_log.TEXTS, viewer.LIMITS}
     assert (tmp_path / "view.png").stat().st_size > 50_000
     assert pixels[rerun_log.LANES] > 20_000 and pixels[rerun_log.TEXTS] > 200 and pixels[viewer.LIMITS] > 1000
@@ -144,7 +144,7 @@ def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monke
     monkeypatch.setattr(rerun_log, part, lambda *_: None)
     rerun_log.write_rrd(trace, tmp_path / "view.rrd")
     with pytest.raises(rerun_log.ViewerError, match=f"nothing is to be seen: {title}$"):
-        viewer.screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
+        viewer.take_screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "x.rrd").write_bytes(b"")
     trace = Trace.read(folder)
     with pytest.raises(rerun_log.ViewerError, match="does not draw"):
-        viewer.screenshot(trace, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+        viewer.take_screenshot(trace, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
 def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,7 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_it_listens_on_this_machine_only() -> None:
-    words = viewer._command(Path("x.rrd"), "9999")
+    words = viewer._build_command(Path("x.rrd"), "9999")
     assert words[words.index("--bind") + 1] == "127.0.0.1"
 
 

@@ -12,7 +12,7 @@ from rig.sequences import measures
 from rig.sequences.measures import NotMeasurable
 
 MAIN = "main"  # the window that is all of the main phase
-MISSING_ALLOWED = 0.01  # of a window; fewer missing samples are bridged by straight lines, and the detail says so
+LARGEST_MISSING_SHARE = 0.01  # of a window; fewer missing samples are bridged by straight lines, and the detail says so
 
 
 class TraceLike(Protocol):
@@ -38,7 +38,7 @@ class EventLike(Protocol):
 
 
 @dataclass(frozen=True)
-class Scene:
+class RunData:
     """All that a check may look at: trace, sections, events, and when each fault started (s of main, by label)."""
 
     trace: TraceLike
@@ -69,11 +69,11 @@ class Scene:
         if name == "error":
             return self.signal("com", span) - self.signal("xj", span)
         if name == "speed":
-            return measures.speed(self.signal("xj", span))
+            return measures.compute_speed(self.signal("xj", span))
         column = getattr(self.trace, name, None)
         if column is None:
             raise NotMeasurable(f"{name} was not measured")
-        return measures.bridged(np.asarray(column, float)[span], name, MISSING_ALLOWED)
+        return measures.bridge_gaps(np.asarray(column, float)[span], name, LARGEST_MISSING_SHARE)
 
     def missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
