@@ -67,7 +67,7 @@ def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_PATH", "/nowhere")
+    monkeypatch.setattr(doctor, "_SEARCH_PATH", "/nowhere")
     found = {finding.name: finding for finding in [*doctor.examine_tools(), *doctor.examine_buses()]}
     assert found["C compiler"].status == "missing" and "gcc" in found["C compiler"].remedy
     assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
