@@ -73,7 +73,7 @@ def find_gcc() -> str:
 
 def explain_missing_gcc() -> str:
     """Why the rivals in C cannot be measured; "" if gcc is installed."""
-    return "" if find_gcc() else f"there is no gcc; to get it: {GET_GCC}"
+    return "" if find_gcc() else f"gcc is not installed; to get it: {GET_GCC}"
 
 
 def explain_missing(module: str) -> str:

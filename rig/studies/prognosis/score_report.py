@@ -19,7 +19,7 @@ def build_score_report(scores: Scores) -> Report:
         command="trend", title="score",
         sections=[Section("Scores", [
             Table(columns, [_list_cells(line) for line in scores.lines], caption),
-            Line("healthy", f"a trend was reported for {scores.told} of {scores.healthy} healthy units")])],
+            Line("healthy", f"a trend was reported for {scores.false_trends} of {scores.healthy} healthy units")])],
         data=to_json(scores))
 
 

@@ -35,7 +35,7 @@ class Scores(NamedTuple):
 
     lines: tuple[LawScores, ...]
     healthy: int  # healthy units
-    told: int  # of these with a trend
+    false_trends: int  # of these with a trend
 
 
 def score_laws(units: int, seed: int, progress: Progress, healthy_ratio: int = 5) -> Scores:
@@ -93,5 +93,5 @@ def to_json(scores: Scores) -> dict[str, Any]:
     """The scores as JSON values; null for NaN and infinity."""
     content: dict[str, Any] = to_plain({
         "lambda": LAMBDAS, "lines": [line._asdict() for line in scores.lines],
-        "healthy": {"units": scores.healthy, "told": scores.told}})
+        "healthy": {"units": scores.healthy, "told": scores.false_trends}})
     return content
