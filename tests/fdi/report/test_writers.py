@@ -115,7 +115,8 @@ def test_page_shows_every_kind_of_item(whole: Report) -> None:
         assert words in page.text
     assert {"figure", "figcaption", "svg", "details", "pre", "h2"} <= page.seen
     assert ("n is-bad strong", "265") in page.cells
-    assert ("n is-good ", "1.02") in page.cells
+    assert ("n is-good", "1.02") in page.cells
+    assert ("", "XJ") in page.cells
     for words in ("only for a terminal", "short form", "*  *"):
         assert words not in page.text
     assert 'class="verdict bad"' in text
