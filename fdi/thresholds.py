@@ -327,3 +327,69 @@ ones; docs/trend.md scores other units."""
 
 PACE_FREEDOM = 3.0
 """Degrees of freedom of that Student's t: one unit in a hundred changes its pace by more than a factor of two."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Comparison: when a residual is an error of the model
+# ---------------------------------------------------------------------------------------------------------------------
+
+SIGNAL_ERROR_RATIO = 1.1
+"""RMS residual over noise, to which three standard deviations of the estimate are added, up to which a signal is noise.
+
+The floor is known to 3 % from one repeat; without repeats the model's sensor noise may be a few per cent too small."""
+
+SECTION_ERROR_SD = 5.0
+"""Standard deviations by which a single section may be above the floor; a trace has dozens of sections."""
+
+BLOCK_ERROR_RATIO = 1.3
+"""RMS residual over floor up to which a block of the actuator agrees: the floor of a balance is known less well than a
+signal's."""
+
+LOWER_BOUND_ERROR_RATIO = 3.0
+"""RMS residual over noise from which on an error is one even if the floor is only a lower bound."""
+
+SOLVER_HIDES_RATIO = 0.5
+"""Solver error over floor above which a comparison cannot tell: half the floor adds 12 % to the residual."""
+
+UNDECIDED_SHARE = 0.4
+"""Share of rows that may hang on a thousandth of a friction level and be left out of the judgement."""
+
+LAG_MISFIT_RATIO = 0.5
+"""Misfit that moving the current by some cycles must leave, of that before, for the columns to be out of step."""
+
+REPEAT_DIFFERENCE_RATIO = 1.5
+"""Difference between repeats over the floor above which a note says that the error itself does not repeat."""
+
+SHAPE_TIE_GAIN = 10.0
+"""Twice the log likelihood below which an error of the flow and one of the sensor describe a residual equally well."""
+
+NOISY_SENSOR_RATIO = 1.3
+"""Noise of the sensed position from sample to sample, over its level, above which the sensor is at fault in a tie."""
+
+SPOOL_FITS_RATIO = 1.1
+"""RMS residual of XS over noise below which the spool is as the model says."""
+
+BLOCK_EXCESS_LEAST = 0.1
+"""Squared residual over squared floor, less 1, below which flow and sensor are not told apart."""
+
+CONTROLLER_LAG_RATIO = 0.1
+"""Misfit of the controller's block with a lag, over that without, below which the lag is believed."""
+
+CONTROLLER_ERROR_RATIO = 3.0
+"""Error of the controller's block over the resolution of the file or bus: rounding alone does not reach 3."""
+
+CONDITION_SHARE = 0.6
+"""Share of the excess error that a condition must hold to be named."""
+
+CONDITION_DENSITY = 1.8
+"""Density of the excess error under a condition over the average density, at least."""
+
+CONDITION_EXCESS_LEAST = 0.05
+"""Mean squared residual over squared floor, less 1, below which no condition is looked for.
+
+The floor itself may be off by that."""
+
+RESIDUAL_TEST_CONFIDENCE = 0.99
+"""Probability with which white noise stays within the band of a residual's test."""
+
+DEPENDENCE_SHARE = 0.05
+"""Share of the residual's variance that a dependence on a quantity must hold to be reported."""

@@ -25,6 +25,14 @@ from numpy.typing import NDArray
 from fdi.estimation.noise import find_floors, floor_from_data
 from fdi.estimation.preparation import BRIDGED_ROWS, align_columns
 from fdi.estimation.replay import Columns, differentiate
+from fdi.thresholds import (
+    BLOCK_EXCESS_LEAST,
+    CONTROLLER_ERROR_RATIO,
+    CONTROLLER_LAG_RATIO,
+    NOISY_SENSOR_RATIO,
+    SHAPE_TIE_GAIN,
+    SPOOL_FITS_RATIO,
+)
 from fdi.trace.columns import bridge_gaps, hold_last, rms, shift_rows
 from fdi.trace.trace import Trace
 from plant.effects import at
@@ -41,17 +49,11 @@ JERK = 4.0  # standard deviations, that accelerations over two and four samples 
 LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
 SATURATED = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
 PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
-TIE = 10.0  # twice the log likelihood, below which two descriptions are equally good
-NOISY = 1.3  # times the noise of the position from sample to sample
 FEWEST = 400  # rows in which the forces are known; fewer are the ends of steps, where speed is hardest to tell
 OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
 SPARSE = 0.2  # of the rows; where more are missing, accelerations are guesses
-FITS = 1.1  # floors, of a spool that is as the model says
-MATTERS = 0.1  # of the floor, squared: less in excess is not worth a question
 FLOAT32 = 1e-7  # of the current limit: a firmware may calculate in single precision
 LAGS = range(-8, 21)  # cycles that Com or XJ may be late in the file
-BETTER = 0.1  # of the misfit at no lag, that a lag has to leave for being believed
-CONTROLLER_DISAGREES = 3.0  # times the resolution; rounding alone does not reach that
 
 
 class Balance(NamedTuple):
@@ -163,7 +165,7 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
         """Twice the log likelihood by which `one` describes worse than `other`."""
         return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
 
-    tie = worse(gain, both) < TIE + len(columns) or abs(worse(rate, place)) < TIE
+    tie = worse(gain, both) < SHAPE_TIE_GAIN + len(columns) or abs(worse(rate, place)) < SHAPE_TIE_GAIN
     winner = "either" if tie else "flow" if rate < place else "sensor"
     return Split(error, rate, place, both, "sensor" if tie and noisy else winner)
 
@@ -205,7 +207,7 @@ def apply_play(x: Floats, width: float) -> Floats:
 def share_error(found: Split, floor: float) -> tuple[float, float]:
     """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains."""
     whole = found.error / floor
-    if whole**2 - 1.0 < MATTERS:
+    if whole**2 - 1.0 < BLOCK_EXCESS_LEAST:
         return whole, whole
     alone_flow = math.sqrt(1.0 + max(0.0, found.sensor**2 - found.both**2) / floor**2)
     alone_sensor = math.sqrt(1.0 + max(0.0, found.flow**2 - found.both**2) / floor**2)
@@ -246,7 +248,7 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
     if (~np.isnan(b.way)).sum() < FEWEST or not floor.get("way", 0.0) > 0.0:
         return None
-    noisy = floor_from_data(trace.measured("xj")).value > NOISY * level["xj"] if "xj" in level else False
+    noisy = floor_from_data(trace.measured("xj")).value > NOISY_SENSOR_RATIO * level["xj"] if "xj" in level else False
     flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
     told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and trace.filled.mean() < SPARSE
@@ -271,7 +273,7 @@ def block_ratios(signal: Mapping[str, float], flow: float | None, force: float |
     if not spool:
         return {"controller": controller, "servovalve": flow, "jack": force, "sensor": None}
     parts = [x for x in (flow, force) if x is not None]
-    if parts and "p12" in signal and signal.get("xs", math.inf) < FITS:
+    if parts and "p12" in signal and signal.get("xs", math.inf) < SPOOL_FITS_RATIO:
         parts.append(signal["p12"])
     return {"controller": controller, "servovalve": signal.get("xs"), "jack": max(parts) if parts else None,
             "sensor": sensor}
@@ -299,14 +301,14 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     if not model.kind.controller:
         return ControllerBlock(np.full(len(trace), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
     found = _compared(trace, model, 0, 0)
-    if found.ratio <= CONTROLLER_DISAGREES:
+    if found.ratio <= CONTROLLER_ERROR_RATIO:
         return found
     com, xj, gain = find_lags(trace, model["controller.current_limit"])
     found = found._replace(gain=gain)
     if (com, xj) == (0, 0):
         return found
     late = _compared(trace, model, com, xj)
-    return late._replace(gain=gain) if late.error < BETTER * found.error else found
+    return late._replace(gain=gain) if late.error < CONTROLLER_LAG_RATIO * found.error else found
 
 
 def _compared(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:

@@ -26,6 +26,17 @@ from fdi.estimation.replay import (
 )
 from fdi.estimation.scatter import Scatter, fit_scatter
 from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import (
+    BLOCK_ERROR_RATIO,
+    CONTROLLER_ERROR_RATIO,
+    LAG_MISFIT_RATIO,
+    LOWER_BOUND_ERROR_RATIO,
+    REPEAT_DIFFERENCE_RATIO,
+    SECTION_ERROR_SD,
+    SIGNAL_ERROR_RATIO,
+    SOLVER_HIDES_RATIO,
+    UNDECIDED_SHARE,
+)
 from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
@@ -33,14 +44,6 @@ from plant.model import Model
 
 Floats = NDArray[np.float64]
 
-LIMIT = 1.1  # floors, and three standard deviations of what is estimated from so many samples
-SECTION = 5.0  # standard deviations, that a single section may be above the floor: there are dozens
-BLOCK = 1.3  # floors, of a single block
-BOUNDED = 3.0  # floors, from which on an error is one even if the floor is a lower bound
-TOO_COARSE = 0.5  # of the floor: a solver's error as large as that leaves nothing to judge
-UNDECIDED = 0.4  # of all rows, that may hang on a knife's edge and be left out
-LAGGED = 0.5  # of the misfit, that moving the current by some cycles must leave for the columns to be out of step
-UNLIKE = 1.5  # floors, by which residuals of repeats may differ before that is told
 BALANCED = "eha"  # the plant whose metering edges and ram the balances of `plant.forced` are
 STAGES = 7
 
@@ -138,12 +141,12 @@ def _blinder(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
 
 def _left_out(replay: Replay) -> NDArray[np.bool_]:
     """Rows that hang on a knife's edge, unless that is half the trace."""
-    out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED)
+    out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     return out
 
 
 def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> SignalError:
-    limit = LIMIT + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
+    limit = SIGNAL_ERROR_RATIO + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
     return SignalError(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
 
 
@@ -158,7 +161,7 @@ def _in_step(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace,
     notes = []
     if xj:
         moved = trace.with_delays(cor=-xj)
-        if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAGGED):
+        if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAG_MISFIT_RATIO):
             trace, com = moved, com - xj
             notes.append(f"Cor stands {_cycles(xj)} than the other columns: moved into step")
         else:
@@ -191,7 +194,7 @@ def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Re
 
 def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
     def limit(name: str) -> float:
-        return blocks.CONTROLLER_DISAGREES if name == "controller" else BLOCK
+        return CONTROLLER_ERROR_RATIO if name == "controller" else BLOCK_ERROR_RATIO
 
     over = [(ratio, name) for name, ratio in ratios.items() if ratio is not None and ratio > limit(name)]
     return tuple(name for _, name in sorted(over, reverse=True))
@@ -200,21 +203,28 @@ def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
 def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
              replay: Replay, period: float) -> tuple[str, str]:
     """The verdict, and why it cannot tell."""
-    coarse = [s.name for s in table.values() if s.solver_error > TOO_COARSE * s.floor.value]
+    coarse = [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]
     if coarse:
         return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
     above = [s for s in table.values() if s.ratio > s.limit]
     least = min((s.floor.freedom for s in table.values()), default=1.0)
-    local = [p for p in sections
-             if p.ratio > LIMIT + SECTION / math.sqrt(max(1.0, 2 * least * (p.t1 - p.t0) / period))]
+
+    def is_above(p: Place) -> bool:
+        samples = max(1.0, 2 * least * (p.t1 - p.t0) / period)
+        return p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(samples)
+
+    local = [p for p in sections if is_above(p)]
     if not (above or local or _named(ratios)):
         return "WITHIN_FLOOR", ""
     edgy = float(replay.undecided.mean())
-    doubt = "without a repeat the floor is only a lower bound, and the error is not far above it" \
-        if any(s.floor.lower_bound for s in table.values()) else \
-        f"{100 * edgy:.0f} % of the trace {_hangs(replay)}" if edgy > UNDECIDED else ""
-    sure = any(s.ratio > (BOUNDED if edgy > UNDECIDED or s.floor.lower_bound else 0.0) for s in above)
-    if doubt and not sure and (ratios["controller"] or 0.0) <= blocks.CONTROLLER_DISAGREES:
+    doubt = ""
+    if any(s.floor.lower_bound for s in table.values()):
+        doubt = "without a repeat the floor is only a lower bound, and the error is not far above it"
+    elif edgy > UNDECIDED_SHARE:
+        doubt = f"{100 * edgy:.0f} % of the trace {_hangs(replay)}"
+    sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or not (edgy > UNDECIDED_SHARE or s.floor.lower_bound)
+               for s in above)
+    if doubt and not sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO:
         return "CANNOT_TELL", doubt
     return "MODEL_INCOMPLETE", ""
 
@@ -223,10 +233,10 @@ def _notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str
     """What a reader must know about the floor and about rows left out."""
     said = []
     apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
-             if f.source == "repeats" and f.difference > UNLIKE * f.value]
+             if f.source == "repeats" and f.difference > REPEAT_DIFFERENCE_RATIO * f.value]
     if apart:
         said.append(f"the error itself differs between the repeats, as stick-slip does, in floors: {', '.join(apart)}")
-    if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED:
+    if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
         said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_hangs(replay)}")
     return said

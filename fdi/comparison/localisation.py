@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.replay import Columns, differentiate
+from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE
 from fdi.trace.columns import hold_last
 from fdi.trace.sections import describe_section, find_sections
 from fdi.trace.trace import Trace
@@ -24,9 +25,6 @@ PLACES = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3)  # m
 PRESSURES = (5e5, 1e6, 2e6, 5e6, 1e7)  # Pa
 OPENINGS = (5e-6, 20e-6, 50e-6, 2e-4)  # m
 DELAYS = (0.005, 0.02, 0.05, 0.1)  # s after a reversal
-MOST = 0.6  # of the excess that a condition must hold to be named
-TIMES = 1.8  # as dense as elsewhere on average, at least
-LEAST = 0.05  # of the floor, squared: less in excess may be a floor that is not quite right
 SETTLES = 0.05  # s; a section's share of samples below which it is not judged by itself
 
 
@@ -105,7 +103,7 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
     there = ~np.isnan(z2)
     excess = np.where(there, z2 - 1.0, 0.0)
     total, rows = float(excess.sum()), int(there.sum())
-    if rows == 0 or total < LEAST * rows:
+    if rows == 0 or total < CONDITION_EXCESS_LEAST * rows:
         return ""
     best, said = 0.0, ""
     for words, flags in _conditions(m, limit):
@@ -113,7 +111,7 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
         part = float(excess[flags].sum()) / total
         # the gain over spreading it evenly; a condition that holds nearly always or hardly ever gains little
         score = part - time
-        if part >= MOST and time > 0.0 and part / time >= TIMES and score > best + 0.01:
+        if part >= CONDITION_SHARE and time > 0.0 and part / time >= CONDITION_DENSITY and score > best + 0.01:
             best, said = score, f"{100 * min(part, 1.0):.0f} % of it in {100 * time:.2g} % of the time: {words}"
     return said
 

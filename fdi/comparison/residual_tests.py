@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from scipy.special import kolmogi, ndtri
 
 from fdi.comparison.localisation import Motion
+from fdi.estimation.noise import solve_yule_walker
 from fdi.estimation.replay import Columns
+from fdi.thresholds import RESIDUAL_TEST_CONFIDENCE
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 
 REACH = 100  # lags, of the autocorrelation
 AFTER, BEFORE = 60, 20  # lags, of the residual after and before the input
-CONFIDENCE = 0.99
 BINS = 15
 OWN = {("xj", "Cor"), ("p12", "P12")}  # a signal's own noise or error is in these; that they go together says nothing
 ORDER = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
 WILD = 5.0  # standard deviations; what is larger is an event and has no say in a colour
 WHITE = np.ones(1)  # the filter of what is white already
-LEAST_SHARE = 0.05  # of the residual's variance, that a dependence must hold to be worth a word
 SHAPES = ("proportional to", "steps with the sign of", "even in")
 
 
@@ -88,7 +88,7 @@ def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Flo
 def fit_whitener(x: Floats) -> Floats:
     """The filter, (p + 1,), that makes x (n,) white: its autoregressive model by Yule and Walker. WHITE if it rests.
 
-    Short of what scipy.signal and a choice of order would make of it, but without their second of import.
+    The order is fixed, as an input is to be whitened and not described.
     """
     x = np.nan_to_num(x)
     level = float(np.median(np.abs(x))) / 0.6745
@@ -97,8 +97,7 @@ def fit_whitener(x: Floats) -> Floats:
     x = np.clip(x, -WILD * level, WILD * level)
     covariance = correlate(x, x, 0, ORDER) / len(x)
     covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
-    k = np.arange(ORDER)
-    weights = np.linalg.solve(covariance[np.abs(k[:, None] - k)], covariance[1:])
+    weights = solve_yule_walker(covariance, by_elimination=True)
     out: Floats = np.concatenate([WHITE, -weights])
     return out
 
@@ -114,7 +113,7 @@ def _one(trace: Trace, residual: Floats, difference: Floats | None, inputs: Mapp
     r = np.nan_to_num(residual)
     e = apply_whitener(r, fit_whitener(difference) if difference is not None else WHITE)
     own = autocorrelate(e)
-    band = float(ndtri(0.5 + CONFIDENCE / 2)) / math.sqrt(len(e))
+    band = float(ndtri(0.5 + RESIDUAL_TEST_CONFIDENCE / 2)) / math.sqrt(len(e))
     frequencies, power, departs, allowed = cumulate_periodogram(e, trace.period)
     _, plain, _, _ = cumulate_periodogram(r, trace.period)
     half = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
@@ -175,7 +174,7 @@ def correlate_with_input(name: str, u: Floats, by: Floats, residual: Floats, per
     peak = BEFORE + 1 + int(np.abs(curve[BEFORE + 1:]).argmax())  # what comes before its cause is feedback
     # Bartlett: what is left of both colours widens the band. Of all lags the largest is taken: they share the 1 %
     wider = 1.0 + 2.0 * float(np.sum(autocorrelate(left)[1:] * autocorrelate(steps)[1:]))
-    bound = float(ndtri(1 - (1 - CONFIDENCE) / 2 / AFTER)) * math.sqrt(max(wider, 1.0) / len(steps))
+    bound = float(ndtri(1 - (1 - RESIDUAL_TEST_CONFIDENCE) / 2 / AFTER)) * math.sqrt(max(wider, 1.0) / len(steps))
     return Follows(name, float(curve[peak]), float(lags[peak]), bound, lags, curve)
 
 

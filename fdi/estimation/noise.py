@@ -281,6 +281,18 @@ def measure_level(difference: Floats, block: int = WINDOW) -> float:
     return float(np.sqrt(np.nanmedian(variance) * CONSISTENT))
 
 
+def solve_yule_walker(covariance: Floats, by_elimination: bool = False) -> Floats:
+    """Coefficients (p,) of the autoregressive model that has an autocovariance (p + 1,) at lags 0..p.
+
+    Levinson's recursion is fast, but loses digits where the equations are nearly singular: the autocovariance of a
+    sine, as a command may be, is solved `by_elimination`.
+    """
+    if by_elimination:
+        lags = np.arange(len(covariance) - 1)
+        return np.asarray(np.linalg.solve(covariance[np.abs(lags[:, None] - lags)], covariance[1:]), np.float64)
+    return np.asarray(solve_toeplitz(covariance[:-1], covariance[1:]), np.float64)
+
+
 def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
     """The autoregressive model of noise, (n,), that its length supports (Yule-Walker; Akaike's choice of order)."""
     x = residual[~np.isnan(residual)]
@@ -296,7 +308,7 @@ def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
     covariance *= sigma**2 / covariance[0]
     best, cost = white_noise(float(np.sqrt(covariance[0]))), 0.0
     for p in range(1, order + 1):
-        a = solve_toeplitz(covariance[:p], covariance[1:p + 1])
+        a = solve_yule_walker(covariance[:p + 1])
         variance = covariance[0] - a @ covariance[1:p + 1]
         gain = n * np.log(covariance[0] / variance) - NOISE_COEFFICIENT_GAIN * p
         if gain > cost:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from fdi.comparison.blocks import CONTROLLER_DISAGREES
-from fdi.comparison.compare import BALANCED, BLOCK, Comparison, SignalError
-from fdi.comparison.residual_tests import LEAST_SHARE, ResidualTests
+from fdi.comparison.compare import BALANCED, Comparison, SignalError
+from fdi.comparison.residual_tests import ResidualTests
 from fdi.report import compare_figures
 from fdi.report.numbers import (
     SIGNAL_NAMES,
@@ -21,6 +20,7 @@ from fdi.report.numbers import (
     join_words,
 )
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, Table
+from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 INPUTS_OF_BLOCKS = {
@@ -117,7 +117,7 @@ def _tabulate_blocks(c: Comparison) -> list[Item]:
                                     for name in c.blocks]
     return [Table([Column("block"), Column("ratio", align="right"), Column("from")], rows,
                   "Ratio: error of the block alone over its noise floor. A block above "
-                  f"{format_digits(BLOCK, 2)} disagrees with the measurement.")]
+                  f"{format_digits(BLOCK_ERROR_RATIO, 2)} disagrees with the measurement.")]
 
 
 def _block_ratio(c: Comparison, name: str) -> Cell:
@@ -162,7 +162,7 @@ def _describe_controller(c: Comparison) -> str:
             if lag > 0]
     if lags:
         path += f" (from {' and '.join(lags)})"
-    if a.ratio <= CONTROLLER_DISAGREES:
+    if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
     found = f"{path}: error {1e6 * a.error:.3g} uA RMS, floor {1e6 * a.floor:.3g} uA"
     gain = c.model["controller.proportional_gain"]
@@ -219,7 +219,7 @@ def _describe_flow_and_drift(c: Comparison, notable_share: float = 0.005, notabl
     """A ram that is faster or slower than the flow into it by 0.5 %; a free replay that drifts by 1 um/s."""
     lines = []
     flow, gain = c.parts["flow"], c.parts["gain"]
-    if flow is not None and gain is not None and flow > BLOCK and abs(gain) > notable_share:
+    if flow is not None and gain is not None and flow > BLOCK_ERROR_RATIO and abs(gain) > notable_share:
         direction = "further" if gain > 0 else "less"
         lines.append(Line("flow", f"the ram moves {format_percent(abs(gain))} {direction} than the flow through the "
                                   "metering edges predicts"))
@@ -254,7 +254,7 @@ def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_m
     if followed:
         f = max(followed, key=lambda f: abs(f.correlation))
         found.append(f"follows {f.input} by {1e3 * f.lag:.3g} ms (correlation {f.correlation:.2f})")
-    if d.depends and d.depends[0].share > LEAST_SHARE:
+    if d.depends and d.depends[0].share > DEPENDENCE_SHARE:
         first = d.depends[0]
         found.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
                      f"up to {format_signal(abs(first.size), name)}")

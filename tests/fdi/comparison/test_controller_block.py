@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.comparison.blocks import CONTROLLER_DISAGREES, compare_controller, find_lags, measure_resolution
+from fdi.comparison.blocks import compare_controller, find_lags, measure_resolution
 from fdi.estimation.preparation import read_cycles
+from fdi.thresholds import CONTROLLER_ERROR_RATIO
 from fdi.trace.columns import shift_rows
 from fdi.trace.trace import Trace
 from plant import Model, simulate
@@ -32,7 +33,7 @@ def test_rounding_in_a_file_is_no_disagreement(c: Trace, digits: int) -> None:
         return np.array([float(f"{v:.{digits - 1}e}") for v in x.tolist()])
 
     found = compare_controller(replace(c, cor=rounded(c.cor), xj=rounded(c.xj)), MODEL)
-    assert found.ratio < CONTROLLER_DISAGREES
+    assert found.ratio < CONTROLLER_ERROR_RATIO
 
 
 def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
