@@ -4,6 +4,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import plant  # noqa: F401  selects the kernels of linear algebra before anything imports NumPy
+
 if TYPE_CHECKING:
     from fdi.analysis import add_effect, compare, diagnose, explain, read_trace
     from fdi.trace.trace import Trace

@@ -4,7 +4,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from plant.blas import fix_blas_kernels
 from plant.errors import InputError, RigError
+
+fix_blas_kernels()  # before anything imports NumPy
 
 if TYPE_CHECKING:
     from plant.model import Model, load_model

@@ -10,6 +10,8 @@ import other_cpus
 import pytest
 from places import ROOT
 
+from plant import blas
+
 COMPILE = """
 from plant.compile import compiled
 def double(x):
@@ -28,7 +30,7 @@ def hashes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]
 
 def test_every_case_has_the_same_bits_on_every_cpu(hashes: dict[str, dict[str, str]]) -> None:
     """One hash a case, whatever vector code, fused multiply-add and library functions there are."""
-    here = hashes["this CPU"]
+    here = hashes[other_cpus.THIS]
     assert len(here) >= 8 and len(set(here.values())) == len(here)
     for cpu, cases in hashes.items():
         assert cases == here, cpu
@@ -48,7 +50,7 @@ def test_the_settings_reach_the_libraries(tmp_path: Path) -> None:
     program = tmp_path / "seen.py"
     program.write_text(SEEN)
     answers = other_cpus.on_each_cpu(str(program), folder=tmp_path)
-    here, oldest = answers["this CPU"], answers["no vector code beyond SSE2, no FMA"]
+    here, oldest = answers[other_cpus.THIS], answers[other_cpus.OLDEST]
     assert oldest["cpu"] == "generic" and oldest["features"] == "" and oldest["numpy"] == []
     if here["numpy"]:
         assert here["cpu"] != "generic" and "fma" in here["features"]
@@ -78,3 +80,49 @@ def test_machine_code_of_another_cpu_is_not_taken_from_the_cache(tmp_path: Path)
     (tmp_path / "program.py").write_text(COMPILE)
     generic = {"NUMBA_CPU_NAME": "generic"}
     assert [compiled_functions(changes) for changes in ({}, generic, {}, generic)] == [1, 2, 2, 2]
+
+
+BLAS = """
+import ctypes, json, sys
+__import__(sys.argv[1])
+import numpy, scipy.linalg
+names, threads = set(), set()
+for path in {line.split()[-1] for line in open("/proc/self/maps") if "openblas" in line}:
+    library = ctypes.CDLL(path)
+    for suffix in ("", "64_"):
+        name = getattr(library, "scipy_openblas_get_corename" + suffix, None)
+        if name is not None:
+            name.restype = ctypes.c_char_p
+            names.add(name().decode())
+            threads.add(getattr(library, "scipy_openblas_get_num_threads" + suffix)())
+print(json.dumps([sorted(names), sorted(threads)]))
+"""
+
+
+@pytest.mark.parametrize("package", ["plant", "fdi", "rig"])
+def test_linear_algebra_has_one_thread_and_the_kernels_of_2013(tmp_path: Path, package: str) -> None:
+    """On every CPU that has AVX2 and FMA, whichever package is imported first."""
+    if not {"avx2", "fma"} <= blas.read_cpu_flags():
+        pytest.skip("a CPU without AVX2 and FMA")
+    program = tmp_path / "kernels.py"
+    program.write_text(BLAS)
+    answer = other_cpus.on_each_cpu(str(program), package, folder=tmp_path, cpus=[other_cpus.THIS])[other_cpus.THIS]
+    if answer == [[], []]:
+        pytest.skip("NumPy and SciPy with another BLAS")
+    assert answer == [["Haswell"], [1]]
+
+
+def test_flags_of_a_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An old CPU keeps the kernels of its own, and what the user has set stays."""
+    info = tmp_path / "cpuinfo"
+    info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx\n\nprocessor\t: 1\nflags\t\t: fpu avx2 fma\n")
+    assert {"fpu", "avx"} <= blas.read_cpu_flags(info) and "avx2" not in blas.read_cpu_flags(info)
+    assert blas.read_cpu_flags(tmp_path / "missing") == set()
+    for flags, mine, expected in ((set(), None, None), ({"avx2", "fma"}, None, "Haswell"),
+                                  ({"avx2", "fma"}, "Zen", "Zen")):
+        monkeypatch.setattr(blas, "read_cpu_flags", lambda flags=flags: flags)
+        monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
+        if mine:
+            monkeypatch.setenv("OPENBLAS_CORETYPE", mine)
+        blas.fix_blas_kernels()
+        assert os.environ.get("OPENBLAS_CORETYPE") == expected

@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +27,30 @@ def numpy_without(*kept: str) -> str:
     return " ".join(name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] and name not in kept)
 
 
+THIS, AVX2, OLDEST = "this CPU", "AVX2 and FMA (2013)", "no vector code beyond SSE2, no FMA"
+
+
 def settings() -> dict[str, Mapping[str, str]]:
     """Name of a CPU and the environment that stands for it; only CPUs whose instructions this one has too."""
-    generic = {"NUMBA_CPU_NAME": "generic", "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": WITHOUT_FMA,
-               "NPY_DISABLE_CPU_FEATURES": numpy_without()}
-    found = {"this CPU": {}, "no vector code beyond SSE2, no FMA": generic}
+    found: dict[str, Mapping[str, str]] = {THIS: {}}
     if all(get_host_cpu_features().get(feature) for feature in HASWELL):
-        found["AVX2 and FMA (2013)"] = {
+        found[AVX2] = {
             "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ",".join(f"+{feature}" for feature in HASWELL),
-            "OPENBLAS_CORETYPE": "Haswell",
             "NPY_DISABLE_CPU_FEATURES": numpy_without("AVX", "F16C", "FMA3", "AVX2", "X86_V3")}
+    found[OLDEST] = {"NUMBA_CPU_NAME": "generic", "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": WITHOUT_FMA,
+                     "NPY_DISABLE_CPU_FEATURES": numpy_without()}
     return found
 
 
-def on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600) -> dict[str, Any]:
+def on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600,
+                cpus: Sequence[str] = (THIS, AVX2, OLDEST)) -> dict[str, Any]:
     """What the program of this folder prints as JSON, by CPU; all processes at the same time, outputs in `folder`."""
     began = {}
     for name, changes in settings().items():
-        environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_CPU")}
-        environment |= {**changes, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": f"{ROOT}{os.pathsep}{SUPPORT}"}
+        if name not in cpus:
+            continue
+        environment = {key: value for key, value in os.environ.items() if not key.startswith(("NUMBA_CPU", "OPENBLAS"))}
+        environment |= {**changes, "PYTHONPATH": f"{ROOT}{os.pathsep}{SUPPORT}"}
         command = [sys.executable, str(SUPPORT / program), *map(str, words)]
         place = folder / str(len(began))
         place.mkdir()

@@ -54,11 +54,14 @@ def test_json_of_a_healthy_unit(folder: Path) -> None:
 
 def test_words_and_json_of_a_clogged_filter(clogged: Said, folder: Path) -> None:
     assert clogged.status == 1 and clogged.err == ""
-    assert clogged.out.startswith("MAINTENANCE  Filter clogging requires maintenance: Kintas ")
+    told = json.loads((folder / "clogged.json").read_text())
+    printed = re.match(r"MAINTENANCE  Filter clogging requires maintenance: Kintas ([\d.]+)\b", clogged.out)
+    kintas = told["refined"]["kintas"]
+    assert printed and float(printed[1]) == pytest.approx(kintas["value"], abs=6e-4), "the value of the JSON, rounded"
+    assert kintas["low"] < CLOGGED["filter.clogging"] < kintas["high"]
     for words in ("spool friction is acceptable", "0.25 and 0.35", "first overshoot", "first entry", "simulations",
                   "* marks the ruling fault"):
         assert words in " ".join(clogged.out.split()), words
-    told = json.loads((folder / "clogged.json").read_text())
     assert told["ruling"] == "filter_clogging" and told["events"]
     assert all(set(event) >= {"band", "signal", "t_in", "t_out"} and event["t_in"] < event["t_out"]
                for event in told["events"])
@@ -82,8 +85,10 @@ def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: 
     said = rig("fdi", tmp_path / "biased.csv", "--out", tmp_path / "biased.html")
     page = (tmp_path / "biased.html").read_text()
     assert said.status == 0 and said.out.startswith("ACCEPTABLE")
-    for words in ("call filter clogging non-nominal", "finds it acceptable, with null bias "):
-        assert words in " ".join(said.out.split()) and words in page
+    for text in (" ".join(said.out.split()), page):
+        assert "call filter clogging non-nominal" in text
+        bias = re.search(r"finds it acceptable, with null bias ([\d.]+) mA", text)
+        assert bias and float(bias[1]) == pytest.approx(0.24, rel=0.05)
     assert "step to 0 mm" in page and len(re.findall(r"<td[^>]*>step to 0 mm</td>", page)) > 1  # two steps, two lines
     assert "eha-rig" in page
 
