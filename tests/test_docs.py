@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import inspect
 import json
@@ -167,8 +168,12 @@ def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
 
 @pytest.mark.parametrize("script", sorted((ROOT / "docs").glob("*.py")), ids=lambda path: path.name)
 def test_the_scripts_of_the_pages_can_be_imported(script: Path) -> None:
-    """They take minutes to run; a name that has moved shows when they are imported."""
-    runpy.run_path(str(script), run_name="imported")
+    """They take minutes to run; a name that has moved shows in their imports and in what they use of a module."""
+    names = runpy.run_path(str(script), run_name="imported")
+    for node in ast.walk(ast.parse(script.read_text())):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            owner = names.get(node.value.id)
+            assert not inspect.ismodule(owner) or hasattr(owner, node.attr), f"{node.value.id}.{node.attr}"
 
 
 PHYSICS = (ROOT / "docs" / "physics.md").read_text()
