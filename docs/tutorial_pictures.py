@@ -57,14 +57,14 @@ def main(folder: str) -> None:
     os.chdir(folder)
     runs = read_runs(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
-    shape = explain_figures.shape(find_pattern(found.search, found.ledger[-1]), runs.est.t)
+    shape = explain_figures.draw_pattern(find_pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for example, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
-                                     ("second", "cog.csv", "cog2.csv", "cogged.toml")):
+                                       ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load_model_file(Path(file))
         (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
-        drawn = explain_figures.ledger(known.ledger, known.floor or {})
+        drawn = explain_figures.draw_ledger(known.ledger, known.floor or {})
         (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
 
 
