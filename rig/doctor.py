@@ -1,4 +1,4 @@
-"""What this machine can do: each finding says what was found, what it is for, and how to get it."""
+"""What this machine can do: each finding says what was found, what it is used for, and how to get it."""
 from __future__ import annotations
 
 import ctypes.util
@@ -35,7 +35,7 @@ class Finding(NamedTuple):
 
 
 def examine_machine(seconds: float = 1.0) -> list[Finding]:
-    """Look at everything; `seconds` is how long each timer measurement takes, 0 leaves them out."""
+    """Examine everything; each timer measurement takes `seconds`, 0 skips them."""
     areas: list[Callable[[], Iterator[Finding]]] = [
         examine_python, examine_buses, examine_viewer, examine_tools, examine_storage]
     found = [finding for area in areas for finding in area()]
@@ -43,7 +43,7 @@ def examine_machine(seconds: float = 1.0) -> list[Finding]:
 
 
 def _make_finding(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
-    """A thing that is there (`value` says so) or missing (`value` is empty)."""
+    """A finding that is ok with its `value`, or missing if `value` is empty."""
     if value:
         return Finding(area, name, "ok", value, purpose, needed=needed)
     return Finding(area, name, "missing", "not found", purpose, remedy, needed)
@@ -178,7 +178,7 @@ def examine_tools() -> Iterator[Finding]:
 
 
 def examine_storage() -> Iterator[Finding]:
-    """Places that are written to."""
+    """Folders the software writes to."""
     from plant.compile import cache_folder  # here: it loads numba, which takes a second
 
     folder = cache_folder()

@@ -18,20 +18,20 @@ _COMMUNICATING = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)  # states in w
 
 
 def _nothing(*_: object) -> None:
-    """A hook nobody uses."""
+    """Default of a hook: do nothing."""
 
 
 class Device:
-    """A slave. It boots (boot-up frame, PRE-OPERATIONAL) at its first tick.
+    """A CANopen slave. It boots (boot-up frame, PRE-OPERATIONAL) at its first tick.
 
     What a frame may do depends on the NMT state (CiA 301, table 39), so the state's table of COB-ID -> service is the
-    gate: a frame that is foreign or not permitted costs one look-up. Hooks are attributes, set those you need:
+    gate: a foreign or forbidden frame costs one look-up. Hooks are attributes; set those you need:
 
     on_sync()                    OPERATIONAL, after synchronous RPDOs are in `od`, before synchronous TPDOs are packed
     on_rpdo(n)                   an asynchronous RPDO arrived and is in `od`
     on_write(index, sub, data)   SDO download about to be stored; may raise SdoAbort
     on_nmt(old, new)             the state has changed
-    on_heartbeat_lost(node)      a watched node fell silent (EMCY and 0x1029 are already done)
+    on_heartbeat_lost(node)      the heartbeat of a monitored node stopped (EMCY and 0x1029 are already handled)
 
     Raises InputError for an EDS that cannot be read or maps what it does not hold.
     """
@@ -88,7 +88,7 @@ class Device:
         self._configure(index)
 
     def transmit(self, n: int) -> None:
-        """The application has news for TPDO `n`; nothing is sent unless OPERATIONAL."""
+        """Send TPDO `n`, because the application has new values; nothing is sent unless OPERATIONAL."""
         if self.nmt.state is NmtState.OPERATIONAL:
             self.pdo.tpdos[n].transmit()
 
@@ -96,7 +96,7 @@ class Device:
         for index in (0x1006, 0x1016):
             self._configure(index)
         self.pdo.configure()
-        self.heartbeat.boot_up()
+        self.heartbeat.send_boot_up()
         self._enter(NmtState.PRE_OPERATIONAL)
         self.heartbeat.configure(self.od.number(0x1017, 0), self.t_ns)
 
@@ -164,7 +164,7 @@ class Device:
         self._configure(index)
 
     def _configure(self, index: int) -> None:
-        """A communication object changed: the service it belongs to takes it over."""
+        """Pass a changed communication object to the service that uses it."""
         if index == 0x1006:
             self.sync.configure(self.od.number(0x1006, 0))
         elif index == 0x1016:
@@ -177,7 +177,7 @@ class Device:
             self._gate()
 
     def _heartbeat_lost(self, node: int) -> None:
-        self.emcy.raise_(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))
+        self.emcy.raise_error(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))
         self.nmt.communication_error(self.od.number(0x1029, 1))
         self.on_heartbeat_lost(node)
 

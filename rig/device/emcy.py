@@ -58,7 +58,7 @@ class Emcy:
         """Forget all without a word, as at power-on."""
         self._active.clear()
 
-    def raise_(self, code: int, register: int = ErrorRegister.GENERIC, info: bytes = b"") -> None:
+    def raise_error(self, code: int, register: int = ErrorRegister.GENERIC, info: bytes = b"") -> None:
         """An error came: `code` as in CiA 301 table 26, its `register` bits, up to 5 bytes of `info`."""
         key = code, info[:1]
         if key in self._active:

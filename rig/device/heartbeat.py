@@ -21,7 +21,7 @@ class HeartbeatProducer:
         self._period = period_ms * _MS
         self._due = t_ns + self._period
 
-    def boot_up(self) -> None:
+    def send_boot_up(self) -> None:
         self._send(self._cob_id, b"\0")
 
     def tick(self, t_ns: int, state: int) -> None:

@@ -88,7 +88,7 @@ class Rpdo:
         codes = {EmcyCode.PDO_TOO_SHORT: length < self._size, EmcyCode.PDO_TOO_LONG: length > self._size}
         for code, wrong in codes.items():
             if wrong:
-                self._emcy.raise_(code, ErrorRegister.COMMUNICATION, info)
+                self._emcy.raise_error(code, ErrorRegister.COMMUNICATION, info)
             else:
                 self._emcy.clear(code, info)
         self._faulty = length != self._size

@@ -1,7 +1,7 @@
 """SDO server (CiA 301, 7.2.4.3): expedited and segmented upload and download, with the abort codes.
 
-Block transfer is optional for a server and refused with "command specifier not valid".
-canopen's SdoServer was looked at and not taken: it notices a read-only or absent object only after the last segment of
+Block transfer is optional for a server; it is refused with "command specifier not valid".
+Rejected alternative: canopen's SdoServer, which notices a read-only or absent object only after the last segment of
 a download, accepts any number of bytes against the size announced, and answers a stray first request with an exception.
 """
 from __future__ import annotations
@@ -77,7 +77,7 @@ class SdoServer:
         self._toggle = 0
 
     def receive(self, frame: Frame) -> None:
-        """A request. What is not 8 bytes long is no SDO and is ignored."""
+        """Handle a request. A frame that is not 8 bytes long is not an SDO and is ignored."""
         if len(frame.data) != 8:
             return
         self._last_ns = frame.t_ns
@@ -90,7 +90,7 @@ class SdoServer:
                 self._send(self._tx, reply.ljust(8, b"\0"))
 
     def tick(self, t_ns: int) -> None:
-        """Give up a transfer whose client fell silent."""
+        """Abort a transfer whose client stopped sending."""
         if self._open is not None and t_ns - self._last_ns > _TIMEOUT:
             self._abort(Abort.TIMEOUT)
 

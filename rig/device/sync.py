@@ -6,8 +6,8 @@ from collections.abc import Callable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.network.frame import Frame
 
-# 0x1006 says when a SYNC is due but not when it is lost. A late one is the bench's own business, it measures lateness;
-# a hundred missing in a row mean that the producer is gone.
+# 0x1006 gives the period of SYNC but not when SYNC counts as lost. The bench measures the lateness of a single SYNC
+# itself; a hundred missing in a row mean that the producer is gone.
 _LOST_AFTER = 100  # periods
 
 
@@ -32,7 +32,7 @@ class SyncConsumer:
     def receive(self, frame: Frame) -> None:
         if frame.data:  # a SYNC counter, which the device does not ask for (no 0x1019)
             self._malformed = True
-            self._emcy.raise_(EmcyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION)
+            self._emcy.raise_error(EmcyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION)
             return
         if self._limit_ns:
             self._deadline = frame.t_ns + self._limit_ns
@@ -46,4 +46,4 @@ class SyncConsumer:
         if self._deadline and t_ns > self._deadline:
             self._deadline = 0
             self._lost = True
-            self._emcy.raise_(EmcyCode.COMMUNICATION, ErrorRegister.COMMUNICATION)
+            self._emcy.raise_error(EmcyCode.COMMUNICATION, ErrorRegister.COMMUNICATION)

@@ -29,7 +29,7 @@ Receive = Callable[[Frame], None]
 class EmbeddedBus:
     """An in-process bus in one thread. Frames wait in one queue and are delivered in the order they were sent.
 
-    There is no arbitration and no bit time: the order is the nodes' doing, which is what makes a lockstep run repeat.
+    There is no arbitration and no bit time. The nodes alone decide the order, so a lockstep run repeats exactly.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class EmbeddedBus:
         self._queue: deque[tuple[list[Receive], int, bytes]] = deque()
 
     def attach(self, receive: Receive) -> Send:
-        """A node joins: `receive` gets every frame of the others; what is returned sends."""
+        """Connect a node: `receive` gets every frame of the other nodes; the returned function sends."""
         others = list(self._receivers)
         for each in self._others:
             each.append(receive)
@@ -52,14 +52,14 @@ class EmbeddedBus:
         return send
 
     def add(self, make: Callable[[Send], AnyNode]) -> AnyNode:
-        """Build a node that needs its `send` at birth, and attach it: `add(lambda send: Device(2, EDS[2], send))`."""
+        """Create a node with its `send` and attach it: `add(lambda send: Device(2, EDS[2], send))`."""
         nodes: list[AnyNode] = []
         send = self.attach(lambda frame: nodes[0].receive(frame))
         nodes.append(make(send))
         return nodes[0]
 
     def deliver(self, t_ns: int) -> int:
-        """Hand the queued frames to all nodes but their senders, as of `t_ns`, until no node has more to say.
+        """Deliver the queued frames, with time `t_ns`, to all nodes but their senders until no node sends any more.
 
         Returns the number of frames.
         """
@@ -74,11 +74,11 @@ class EmbeddedBus:
 
 
 def choose_bus(spec: str = "auto") -> tuple[str, str]:
-    """The bus to use for what the user wrote, and a sentence saying why.
+    """Choose the bus for --bus and EHA_RIG_BUS; return it and the reason in one sentence.
 
     `auto` is the bus that EHA_RIG_BUS names, else the embedded one: nothing sends on hardware unasked. Raises
-    InputError for a spec that means nothing, RigError for a CAN interface that is not there, also when the variable
-    names it: a bench that was told to use hardware must not pass on its own simulation.
+    InputError for an unknown spec, RigError for a CAN interface that does not exist, also when the variable
+    names it: a run on hardware must not fall back to the simulation and pass.
     """
     configured = os.environ.get(BUS_VARIABLE, "")
     if spec == "auto" and configured in ("", "auto"):
@@ -96,7 +96,7 @@ def open_can(spec: str) -> can.BusABC:
     """Open a python-can bus: `virtual[:NAME]`, `udp_multicast[:GROUP]` (this machine only), `socketcan:INTERFACE`, or
     any other interface python-can knows, at 1 Mbit/s.
 
-    Raises InputError for a bad spec, RigError if the bus cannot be had.
+    Raises InputError for a bad spec, RigError if the bus cannot be opened.
     """
     kind, channel = _parse_spec(spec, "--bus")
     if kind == "embedded":

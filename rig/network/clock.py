@@ -9,14 +9,14 @@ class Clock(Protocol):
     """Time since the run began, ns."""
 
     def now(self) -> int:
-        """What time it is, ns."""
+        """The time now, ns."""
 
     def sleep_until(self, t_ns: int) -> None:
-        """Return at `t_ns`, at once if it has passed."""
+        """Return at `t_ns`; at once if that has passed."""
 
 
 class VirtualClock:
-    """Stands still until somebody waits, and then jumps: a run costs what it computes, and repeats bit for bit."""
+    """Simulated time: `sleep_until` jumps to its end at once, so a run repeats bit for bit and never waits."""
 
     def __init__(self) -> None:
         self._t_ns = 0
@@ -31,17 +31,17 @@ class VirtualClock:
 
 
 class WallClock:
-    """The machine's monotonic clock, from zero at its making."""
+    """The machine's monotonic clock; 0 when it is created."""
 
     def __init__(self) -> None:
         self._start = time.monotonic_ns()
 
     def now(self) -> int:
-        """Time since the clock was made, ns."""
+        """Time since the clock was created, ns."""
         return time.monotonic_ns() - self._start
 
     def sleep_until(self, t_ns: int) -> None:
-        """Sleep. CPython sleeps on an absolute deadline, so a long run does not drift."""
+        """Sleep until `t_ns`. CPython sleeps to an absolute deadline, so a long run does not drift."""
         left = t_ns - self.now()
         if left > 0:
             time.sleep(left * 1e-9)

@@ -1,8 +1,9 @@
 """Bytes <-> physical values for the four PDOs of the bench: pure functions, no socket, no clock.
 
 One table, `SIGNALS`, says where each value lies; it is what `dbc/eha.dbc` and the object dictionaries say too. Values
-out of range saturate, as a transducer's output does (INT32 at 1e-7 m spans +-214 m: only a diverged plant gets there);
-NaN has no raw value and raises ValueError, for a bench that sends a made-up number is worse than one that stops.
+out of range saturate, like the output of a transducer (INT32 at 1e-7 m covers +-214 m; only a diverged plant reaches
+that);
+NaN has no raw value and raises ValueError: no invented number is sent.
 """
 from __future__ import annotations
 
@@ -68,7 +69,7 @@ class Status(IntFlag):
 
 
 class Flags(IntFlag):
-    """Object 0x2203, what the plant emulator says about its own input in this cycle."""
+    """Object 0x2203: state of the plant emulator's input in this cycle."""
 
     DRIVE_MISSING = 0x1  # no drive frame came for this cycle
     DRIVE_LATE = 0x2  # the frame that came answers an earlier cycle
@@ -76,7 +77,7 @@ class Flags(IntFlag):
 
 
 class Command(NamedTuple):
-    """What the rig asks for, frame 0x202."""
+    """Position demand and control word from the rig, frame 0x202."""
 
     position: float  # m
     control: int
@@ -84,14 +85,14 @@ class Command(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What the plant's transducers say, frame 0x183."""
+    """Readings of the plant's position and pressure transducers, frame 0x183."""
 
     position: float  # XJ, m
     pressure: float  # P12, Pa
 
 
 class ValveState(NamedTuple):
-    """The spool and what the plant thinks of its input, frame 0x283."""
+    """Spool position and input flags of the plant, frame 0x283."""
 
     spool: float  # XS, m
     flags: int
@@ -99,7 +100,7 @@ class ValveState(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """What the controller answers, frame 0x182."""
+    """Current demand and status word of the controller, frame 0x182."""
 
     current: float  # Cor, A
     status: int

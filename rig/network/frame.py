@@ -17,10 +17,10 @@ Send = Callable[[int, bytes], None]  # (COB-ID, data)
 
 
 class Node(Protocol):
-    """Anything on the bus. Time reaches a node only through the two calls below."""
+    """A node on the bus. It learns the time only through the two calls below."""
 
     def receive(self, frame: Frame) -> None:
         """A frame of another node arrived."""
 
     def tick(self, t_ns: int) -> None:
-        """It is now `t_ns`: run what is due (heartbeats, time-outs, held frames)."""
+        """Run what is due at `t_ns`: heartbeats, timeouts, delayed frames."""

@@ -112,7 +112,7 @@ class Link:
                 self._count(identifier, payload)
 
     def _count(self, identifier: int, payload: bytes) -> None:
-        """An error frame, or one the bench has no use for."""
+        """Count an error frame or a frame of a kind that the bench does not use."""
         if identifier & _ERROR:
             self.error_frames += 1
             self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)

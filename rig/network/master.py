@@ -34,11 +34,11 @@ NAMES = {NODE: "rig", CONTROLLER: "controller", PLANT: "plant"}
 
 
 class BusError(RigError):
-    """A node does not answer, or answers with a refusal."""
+    """A node does not answer, or refuses a request."""
 
 
 class _Sdo(SdoClient):
-    """The library's client, but waiting means letting frames come in."""
+    """The library's SDO client; while it waits, the wire delivers frames."""
 
     def read_response(self) -> Any:
         network: Any = self.network
@@ -70,9 +70,9 @@ class _Network(canopen.Network):
 
 
 class Master:
-    """The rig on the bus. `on_frame` sees every frame, sent or received; the other hooks what the master notices.
+    """Node 1 on the bus. `on_frame` gets every frame, sent or received; the other hooks report what the master detects.
 
-    `stamped`: frames come with the time of their reception, which is kept; else `now()` is what the log shall say.
+    `stamped`: frames carry their time of reception, and it is kept; otherwise they get the time of `now()`.
     """
 
     def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
@@ -87,7 +87,7 @@ class Master:
         self.silent = False  # a fault: no heartbeat of ours
         self.states = {CONTROLLER: -1, PLANT: -1}
         self._booted: set[int] = set()
-        self._rivals: set[int] = set()  # COB-IDs of ours that somebody else sends
+        self._rivals: set[int] = set()  # our own COB-IDs that another node sends
         self.network = _Network(wire, self.send)
         self._nodes = {node: self._join(node) for node in (CONTROLLER, PLANT)}
         self._beat = HeartbeatProducer(NODE, lambda cob_id, data: None if self.silent else self.send(cob_id, data))
@@ -136,7 +136,7 @@ class Master:
         self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 
     def tick(self) -> None:
-        """Send the heartbeat when it is due, and notice who has fallen silent."""
+        """Send the heartbeat when it is due, and detect nodes whose heartbeat stopped."""
         now = self.wire.clock.now()
         self._beat.tick(now, self._state)
         self._watch.tick(now)
@@ -154,21 +154,21 @@ class Master:
         if silent:
             raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
 
-    def present(self, node: int, seconds: float) -> bool:
+    def is_present(self, node: int, seconds: float) -> bool:
         """Whether a node answers an NMT reset of its communication."""
         self._booted.discard(node)
         self._nodes[node].nmt.send_command(130)
         return self.wire.wait(lambda: node in self._booted, seconds)
 
-    def rival(self, seconds: float) -> bool:
-        """Whether another rig is at work on the bus; listens only, up to `seconds`."""
+    def hears_rival(self, seconds: float) -> bool:
+        """Whether another rig is active on the bus; only listens, at most `seconds`."""
         return self.wire.wait(lambda: bool(self._rivals), seconds)
 
     def configure(self, scenario: bytes, gains: Gains | None, period_ns: int, limit_ms: int = HEARTBEAT_LIMIT) -> None:
         """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
 
-        `period_ns` 0: nodes must not miss a SYNC, for in lockstep they come when they come. `limit_ms`: silence after
-        which a node counts as gone. A foreign controller (no `gains`) may refuse what it does not have.
+        `period_ns` 0 switches the supervision of SYNC off: in lockstep SYNC has no fixed period. `limit_ms` is the
+        heartbeat timeout. A foreign controller (no `gains`) may refuse objects that it does not have.
 
         Raises:
             BusError: a node refused or did not answer.
@@ -189,20 +189,20 @@ class Master:
         self._beat.configure(HEARTBEAT, self.wire.clock.now())
 
     def start(self) -> None:
-        """All nodes OPERATIONAL; ours too."""
+        """Set all nodes, this one included, to OPERATIONAL."""
         self.command(1, NmtState.OPERATIONAL)
 
     def stop(self) -> None:
-        """All nodes PRE-OPERATIONAL."""
+        """Set all nodes to PRE-OPERATIONAL."""
         self.command(128, NmtState.PRE_OPERATIONAL)
 
     def command(self, specifier: int, state: NmtState) -> None:
-        """An NMT command to all nodes."""
+        """Send an NMT command to all nodes."""
         self._state = state
         self.network.nmt.send_command(specifier)
 
     def errors(self) -> list[int]:
-        """Nodes with an error, by the register in their last EMCY: code 0 takes back one error, others may stand."""
+        """Nodes whose last EMCY has an error register."""
         return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
 
     def _write(self, node: int, index: int, sub: int, value: Any) -> None:

@@ -96,10 +96,10 @@ def _open_lock_file(name: str) -> IO[bytes]:
 
 
 def _decode_message(data: bytes) -> can.Message:
-    """The frame in a datagram; a datagram that holds none is an error frame."""
+    """The frame in a datagram; a datagram without a valid frame becomes an error frame."""
     try:
         return unpack_message(data, check=True)
-    except Exception:  # msgpack and can.Message raise what they like on a stranger's bytes
+    except Exception:  # msgpack and can.Message raise various exceptions on foreign bytes
         return can.Message(is_error_frame=True)
 
 

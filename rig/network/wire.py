@@ -24,7 +24,7 @@ class Wire(Protocol):
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
 
-    def settle(self, t_ns: int, done: Done) -> None:
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
         """Lockstep: let the frames of the cycle at `t_ns` come in, until `done()` or nothing more can come."""
 
     def run_until(self, t_ns: int) -> None:
@@ -52,30 +52,30 @@ class EmbeddedWire:
         """See `Wire`; the time waited is the clock's."""
         end = self.clock.now() + round(seconds * 1e9)
         while True:
-            self._let(self.clock.now())
+            self._deliver(self.clock.now())
             if done():
                 return True
             if self.clock.now() >= end:
                 return False
             self.clock.sleep_until(self.clock.now() + MS)
 
-    def settle(self, t_ns: int, done: Done) -> None:
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
         """See `Wire`; what is late by less than a cycle comes in too."""
         self.clock.sleep_until(t_ns)
-        self._let(t_ns)
-        self._let(t_ns + self._period - 1)
+        self._deliver(t_ns)
+        self._deliver(t_ns + self._period - 1)
 
     def run_until(self, t_ns: int) -> None:
         """See `Wire`."""
-        self._let(self.clock.now())
+        self._deliver(self.clock.now())
         while self.clock.now() < t_ns:
             self.clock.sleep_until(min(t_ns, self.clock.now() + MS))
-            self._let(self.clock.now())
+            self._deliver(self.clock.now())
 
     def close(self) -> None:
         """See `Wire`; nothing to give back."""
 
-    def _let(self, t_ns: int) -> None:
+    def _deliver(self, t_ns: int) -> None:
         """Deliver what is there, run the nodes' timers, deliver what came of them."""
         self._bus.deliver(t_ns)
         for node in self._nodes:
@@ -103,7 +103,7 @@ class LinkWire:
             self._poll(min(left * 1e-9, 0.05))
         return True
 
-    def settle(self, t_ns: int, done: Done) -> None:
+    def wait_for_answers(self, t_ns: int, done: Done) -> None:
         """See `Wire`; a frame that does not come within the grace time is missing, and then less is waited for it."""
         patient = self._missed < _PATIENCE
         self._missed = 0 if self.wait(done, self._grace if patient else 0.1 * self._grace) else self._missed + 1

@@ -1,8 +1,8 @@
 """Node 3, the plant emulator: the actuator behind a CANopen interface.
 
 At each SYNC it reads its transducers and sends them, then moves the plant one cycle with the current that was latched:
-the answer to cycle k acts from cycle k+1. All that is to go wrong was loaded before the start (object 0x2210), so a
-fault costs no bus time and begins in exactly the cycle the sequence says.
+the answer to cycle k acts from cycle k+1. All faults are loaded before the start (object 0x2210), so a fault takes no
+bus time and begins exactly in the cycle that the sequence gives.
 """
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HEARTBEAT = 0x700 + NODE
 
 
 class Emulator:
-    """A plant node. `receive` and `tick` are its whole outside; `scenario` holds until the rig loads another."""
+    """The plant node. Its interface is `receive` and `tick`; `scenario` is used until the rig loads another."""
 
     def __init__(self, send: Send, scenario: Scenario | None = None) -> None:
         self._send = send
@@ -42,10 +42,10 @@ class Emulator:
         self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
 
     def load_scenario(self, scenario: Scenario) -> None:
-        """Take a plant with its faults and loads; it is compiled now, not in the first cycle.
+        """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
 
         Raises:
-            InputError: one that cannot be run; the one before stays.
+            InputError: a scenario that cannot be run; the previous one stays.
         """
         plant, faults = Actuator(scenario.model, scenario.seed), Schedule(scenario.plan, scenario.model.values)
         plant.warm()
@@ -72,7 +72,7 @@ class Emulator:
             self._od[COUNTERS, sub] = 0
 
     def receive(self, frame: Frame) -> None:
-        """A frame of another node arrived: a fault may keep it away, for a while or for good."""
+        """A frame of another node arrived: a fault may delay or drop it."""
         if frame.cob_id == codec.DRIVE:
             action = self._faults.frame("drive", self._cycle - 1)
             if isinstance(action, Delay):
@@ -86,7 +86,7 @@ class Emulator:
             self._move()
 
     def tick(self, t_ns: int) -> None:
-        """It is now `t_ns`: late frames that are due go on their way."""
+        """Deliver the delayed frames that are due at `t_ns`."""
         while self._late and self._late[0][0] <= t_ns:
             self.device.receive(heapq.heappop(self._late)[2])
         while self._held and self._held[0][0] <= t_ns:
@@ -95,7 +95,7 @@ class Emulator:
         self.device.tick(t_ns)
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
-        """Send a frame unless a fault has it lost or late."""
+        """Send a frame unless a fault drops or delays it."""
         name = _NAMES.get(cob_id)
         if name is not None:
             action = self._faults.frame(name, self._cycle)
@@ -103,12 +103,12 @@ class Emulator:
                 heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
             if action is not None:
                 return
-        elif cob_id == _HEARTBEAT and not self._faults.heartbeat_alive("plant", self._cycle):
+        elif cob_id == _HEARTBEAT and not self._faults.is_heartbeat_alive("plant", self._cycle):
             return
         self._send(cob_id, data)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
-        """The first start begins a run; after a pause the plant goes on from where it stood."""
+        """The first start begins a run; after a pause the plant continues from its last state."""
         if new is NmtState.OPERATIONAL:
             self._begun = self._first = True
         elif new is NmtState.INITIALISING:
@@ -163,12 +163,12 @@ class Emulator:
         if self._missed >= MISSED_LIMIT:
             self._current = 0.0
             flags |= Flags.CURRENT_ZEROED
-            self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
+            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
         return flags
 
     def _diverged(self) -> None:
-        """The plant has no value any more (a parameter far out, a law that divides by zero): no number is made up."""
-        self.device.emcy.raise_(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+        """The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value."""
+        self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
         self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more
 
     def _count(self, what: str) -> None:
@@ -176,7 +176,7 @@ class Emulator:
         self._od[COUNTERS, 1 if what == "missing" else 2] = self._counts[what]
 
     def _move(self) -> None:
-        """The plant goes on to the next cycle, under the load of this one."""
+        """Advance the plant by one cycle under the load of this cycle."""
         k = self._cycle
         self._plant.advance(self._current, self._load[k] if k < len(self._load) else 0.0)
         self._moved = True

@@ -1,4 +1,4 @@
-"""Node 2, the reference firmware: a position loop in a CANopen device, so that the bench works alone.
+"""Node 2, the reference firmware: a position loop in a CANopen device. With it the bench needs no external controller.
 
 It answers each feedback frame with a drive frame. The control word (CiA 408) lets current flow only in device mode
 ACTIVE without a fault; any fault is latched until it has gone and the control word's reset bit rises.
@@ -42,7 +42,7 @@ def read_gains(model: Model) -> Gains:
 
 
 class Firmware:
-    """A controller node. `receive` and `tick` are its whole outside; `gains` hold until the rig writes others.
+    """The controller node. Its interface is `receive` and `tick`; `gains` are used until the rig writes others.
 
     `model`: whose effects in the firmware this one has (port `command`); none by default.
     """
@@ -76,7 +76,7 @@ class Firmware:
             self._lost = False
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        """A gain that is no number would make a current that is none."""
+        """Reject NaN and infinite gains: they would produce a NaN current."""
         if index == GAINS and not isfinite(struct.unpack("<d", data)[0]):
             raise SdoAbort(Abort.VALUE)
 
@@ -84,12 +84,12 @@ class Firmware:
         self._fault = True
 
     def _on_sync(self) -> None:
-        """The command of this cycle is latched; feedback follows. Without it the loop must not stay as it was."""
+        """The command of this cycle is latched and feedback follows. After LOST_AFTER cycles without feedback, trip."""
         self._silent += 1
         if self._silent > LOST_AFTER:
             self._lost = True
             self._trip()
-            self.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x02")
+            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x02")
             self._drive(0.0, self._status())
 
     def _on_rpdo(self, n: int) -> None:
@@ -109,7 +109,7 @@ class Firmware:
         self._drive(current, status)
 
     def _status(self) -> int:
-        """Status word: the level bits of the control word as far as no fault forbids them."""
+        """Status word: the level bits of the control word, unless a fault is latched."""
         control = cast(int, self._od[0x6040, 0])
         reset = bool(control & _RESET)
         if self._fault and reset and not self._acknowledged and not self.device.emcy.active:

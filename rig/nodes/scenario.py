@@ -1,4 +1,4 @@
-"""What the plant emulator is told before a run: which plant, what goes wrong when, which load. One SDO download."""
+"""The scenario of the plant emulator: model, faults and load of a run, sent before it by one SDO download."""
 from __future__ import annotations
 
 import json
@@ -20,7 +20,7 @@ WHERE = "scenario (object 0x2210)"
 
 
 class Scenario(NamedTuple):
-    """A plant and its fate. `force`: load on the ram in counts of FORCE, one a cycle from the start of set-up."""
+    """A plant with its faults and load; `force` is the load on the ram, cycle by cycle, in FORCE_RESOLUTION."""
 
     model: Model
     plan: Plan
@@ -32,7 +32,7 @@ class Scenario(NamedTuple):
         """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load.
 
         Raises:
-            InputError: a fault that contradicts this model's parameters, or a plant that this bus does not speak of.
+            InputError: a fault that contradicts this model's parameters, or a plant that this bus cannot drive.
         """
         require_servovalve(model)
         require_sensible(plan, model)
@@ -47,7 +47,7 @@ class Scenario(NamedTuple):
         """JSON, compressed. Loads are second differences: constant and ramp are zeros.
 
         Raises:
-            InputError: it is more than a node takes.
+            InputError: it is longer than the SDO server accepts.
         """
         changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
         data = zlib.compress(json.dumps({
@@ -63,7 +63,7 @@ class Scenario(NamedTuple):
         """The scenario that was sent.
 
         Raises:
-            InputError: it is none, or names what this node does not know.
+            InputError: the bytes are not a scenario, or name something this node does not know.
         """
         try:
             table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, LARGEST_JSON))
@@ -82,7 +82,7 @@ class Scenario(NamedTuple):
 
 
 def require_servovalve(model: Model) -> None:
-    """Refuse a plant that the bench's bus has no words for: what is sent to it is the current of a servovalve."""
+    """Refuse a plant other than the servovalve actuator: the bus carries the current of a servovalve."""
     if model.plant != "eha":
         raise InputError("--model", model.name, "a model of eha; the bench drives a servovalve")
 

@@ -1,4 +1,4 @@
-"""An MCAP file being written: the container alone, knowing nothing of what the messages mean.
+"""Writes an MCAP file: the container only, without knowledge of the messages.
 
 The mcap library's own Writer spends 4-5 us of Python on each message; here a chunk arrives as finished bytes with its
 index, and the library's record classes write the rest (specification: mcap.dev/spec). A closed chunk reaches the kernel
@@ -67,23 +67,23 @@ class McapFile:
             view = view[self._file.write(view):]
         self._offset += len(data)
 
-    def gone(self) -> bool:
-        """True when the file was deleted under us: Linux would go on writing into nothing without an error."""
+    def is_deleted(self) -> bool:
+        """Whether the file was deleted while it is open: Linux would continue to write without an error."""
         return os.fstat(self._file.fileno()).st_nlink == 0
 
-    def attachment(self, name: str, media_type: str, data: bytes, time_ns: int = 0) -> None:
-        """A file to keep with the log."""
+    def write_attachment(self, name: str, media_type: str, data: bytes, time_ns: int = 0) -> None:
+        """Write a file into the log."""
         raw = encode_records([Attachment(time_ns, time_ns, name, media_type, data)])
         self._attachments.append(AttachmentIndex(self._offset, len(raw), time_ns, time_ns, len(data), name, media_type))
         self._write(raw)
 
-    def metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Names and values of the run."""
+    def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a metadata record: names and values."""
         raw = encode_records([Metadata(name=name, metadata=dict(values))])
         self._metadata.append(MetadataIndex(self._offset, len(raw), name))
         self._write(raw)
 
-    def chunk(self, raw: bytes, index: Mapping[int, array[int]]) -> None:
+    def write_chunk(self, raw: bytes, index: Mapping[int, array[int]]) -> None:
         """Messages as records, and for each channel its pairs (log time ns, offset in `raw`) in one flat array."""
         if not self._declared:
             head = encode_records([*self.schemas.values(), *self.channels.values()])
@@ -105,8 +105,8 @@ class McapFile:
                                        where - self._offset - length, offsets, chunk.message_start_time, len(raw)))
         self._write(b"".join(out))
 
-    def statistics(self) -> Statistics:
-        """Of what is in the file so far."""
+    def build_statistics(self) -> Statistics:
+        """Statistics of the file so far."""
         return Statistics(attachment_count=len(self._attachments), channel_count=len(self.channels),
                           channel_message_counts=dict(self._counts), chunk_count=len(self._chunks),
                           message_count=sum(self._counts.values()), metadata_count=len(self._metadata),
@@ -120,7 +120,7 @@ class McapFile:
         start, summary, offsets = self._offset, b"", []
         groups: list[tuple[int, list[McapRecord]]] = [
             (Opcode.SCHEMA, [*self.schemas.values()]), (Opcode.CHANNEL, [*self.channels.values()]),
-            (Opcode.STATISTICS, [self.statistics()]), (Opcode.CHUNK_INDEX, [*self._chunks]),
+            (Opcode.STATISTICS, [self.build_statistics()]), (Opcode.CHUNK_INDEX, [*self._chunks]),
             (Opcode.ATTACHMENT_INDEX, [*self._attachments]), (Opcode.METADATA_INDEX, [*self._metadata])]
         for opcode, records in groups:
             if records:

@@ -1,4 +1,4 @@
-"""Where a run came from: what the metadata record `run` of a log says."""
+"""Provenance of a run: the content of the metadata record `run` of its log."""
 from __future__ import annotations
 
 import os
@@ -12,7 +12,7 @@ RECORDED_PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap
 
 
 def collect_provenance(**given: object) -> dict[str, str]:
-    """Host, time, package versions and state of the checkout, with what only the caller knows (seed, bus, pace, model).
+    """Collect host, time, package versions and state of the checkout; `given` adds seed, bus, pace, model.
 
     >>> provenance(seed=1)["seed"]
     '1'

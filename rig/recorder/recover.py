@@ -1,4 +1,4 @@
-"""Salvage of a log whose writer died: every sound chunk is kept, the indexes are made anew."""
+"""Salvage of a log whose writer died: every intact chunk is kept, and the indexes are rebuilt."""
 from __future__ import annotations
 
 import struct
@@ -24,7 +24,7 @@ _DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, M
 
 @dataclass(frozen=True)
 class Salvage:
-    """What came back from a broken log."""
+    """The result of a salvage."""
 
     path: Path  # the log written anew
     complete: bool  # the log was whole: nothing to salvage
@@ -39,12 +39,12 @@ class Salvage:
         kept = f"{self.messages} messages, {self.cycles} cycles, {self.duration:.3f} s, {len(self.attachments)} files"
         if self.complete:
             return f"{self.path}: the log was complete: {kept}"
-        return (f"{self.path}: kept {kept}; lost {self.lost_bytes} bytes that hold no sound chunk ({self.reason}) and "
-                f"what the writer had not yet written, at most about 0.25 s")
+        return (f"{self.path}: kept {kept}; lost {self.lost_bytes} bytes without an intact chunk ({self.reason}) and "
+                f"data not yet written, at most about 0.25 s")
 
 
 def recover_log(path: Path, out: Path) -> Salvage:
-    """Write what is sound in `path` to `out`, a complete indexed MCAP file with the attachments and metadata.
+    """Write the intact part of `path` to `out`, a complete indexed MCAP file with the attachments and metadata.
 
     Raises InputError when `path` cannot be read or holds nothing sound, and when `out` cannot be written.
     """
@@ -95,9 +95,9 @@ def _write_salvage(records: Iterator[McapRecord], reading: _IntactRecords, out: 
     for record in records:
         if isinstance(record, Attachment):
             names.append(record.name)
-            file.attachment(record.name, record.media_type, record.data, record.log_time)
+            file.write_attachment(record.name, record.media_type, record.data, record.log_time)
         elif isinstance(record, Metadata):
-            file.metadata(record.name, record.metadata)
+            file.write_metadata(record.name, record.metadata)
         elif isinstance(record, Chunk):
             for item in breakup_chunk(record) if not file.channels else ():
                 _add_declaration(file, item)
@@ -105,12 +105,12 @@ def _write_salvage(records: Iterator[McapRecord], reading: _IntactRecords, out: 
             raw = stream.read(size)
             index = _index_messages(raw)
             if index:
-                file.chunk(raw, index)
+                file.write_chunk(raw, index)
         else:
             _add_declaration(file, record)
     if reading.reason:
-        file.metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
-    counts = file.statistics()
+        file.write_metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
+    counts = file.build_statistics()
     cycles = sum(n for c, n in counts.channel_message_counts.items() if file.channels[c].topic == "/signals")
     file.finish()
     return Salvage(out, not reading.reason, counts.message_count, cycles,

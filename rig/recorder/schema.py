@@ -72,7 +72,7 @@ class Timing:
 
 @dataclass(slots=True)
 class Event:
-    """Something that happened once: phase change, fault on or off, EMCY, safe state, operator."""
+    """A single event: phase change, fault on or off, EMCY, safe state, operator."""
 
     level: str = _describe_field("INFO, WARN or ERROR")
     kind: str = _describe_field("one word: phase, segment, fault, emcy, safe_state, abort, ...")

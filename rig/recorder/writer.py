@@ -60,7 +60,7 @@ class Recorder:
 
     attachments: name -> (media type, bytes); metadata: name -> text. Times are ns since the run's start.
     Raises RecorderError when the file cannot be made; later, once, from `cycle` or `put` when it cannot be written, or
-    from `close` if the loop has not been told by then. After that everything is accepted and dropped, so that the loop
+    from `close` if neither was called since. After that everything is accepted and dropped, so that the loop
     can still bring the run to rest.
     """
 
@@ -77,8 +77,8 @@ class Recorder:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = McapFile(path, LIBRARY, *list_channels())
             for name, (media_type, data) in attachments.items():
-                self._file.attachment(name, media_type, data, time.time_ns())
-            self._file.metadata("run", metadata)
+                self._file.write_attachment(name, media_type, data, time.time_ns())
+            self._file.write_metadata("run", metadata)
         except OSError as error:
             raise _describe_failure(path, error) from error
         self._packers = {record: make_packer(record) for record in TOPICS.values()}
@@ -159,7 +159,7 @@ class Recorder:
             t_ns, record = item
             pack = packers.get(type(record))
             if pack is None:
-                self._file.metadata(*record)
+                self._file.write_metadata(*record)
             else:
                 self._add(t_ns, CHANNELS[type(record)], pack(t_ns, record))
 
@@ -178,10 +178,10 @@ class Recorder:
 
     def _close_chunk(self) -> None:
         self._closed_at = time.monotonic()
-        if self._file.gone():
+        if self._file.is_deleted():
             raise OSError(0, "the file was deleted while it was being written")
         if self._parts:
-            self._file.chunk(b"".join(self._parts), self._index)
+            self._file.write_chunk(b"".join(self._parts), self._index)
             self._parts, self._size, self._index = [], 0, {}
 
 

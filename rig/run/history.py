@@ -1,4 +1,4 @@
-"""What the verdict needs to remember of every cycle, as columns of numbers: 80 bytes a cycle, so that an hour fits."""
+"""The signals of all cycles as columns, for the verdict: 80 bytes per cycle, so that an hour fits in memory."""
 from __future__ import annotations
 
 from array import array
@@ -12,7 +12,7 @@ _FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness"
 
 
 class History:
-    """The closed cycles of a run. A field by name is a column, (cycles,) SI; missing samples are NaN."""
+    """The complete cycles of a run. A field by name is a column, (cycles,) SI; missing samples are NaN."""
 
     def __init__(self) -> None:
         self._numbers = array("d")
@@ -21,7 +21,7 @@ class History:
         return len(self._numbers) // len(_FIELDS)
 
     def add(self, row: Signals, timing: Timing) -> None:
-        """One more cycle."""
+        """Append one cycle."""
         self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
                               timing.lateness, timing.response))
 

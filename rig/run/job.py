@@ -1,4 +1,4 @@
-"""A run as data: everything that decides what happens, from the command line or from an earlier run's log."""
+"""A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 from __future__ import annotations
 
 import atexit
@@ -24,7 +24,7 @@ _EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the att
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One run to be done. `plant` and `controller`: "builtin", "external", or for the plant "auto"."""
+    """One run. `plant` and `controller`: "builtin", "external", or for the plant "auto"."""
 
     sequence: Sequence
     model: Model
@@ -48,7 +48,7 @@ class Job:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What the plant is to be told; laid out once, for a long test has many cycles."""
+        """The plant's scenario; computed once, because a long test has many cycles."""
         sequence = self.sequence
         return Scenario.of(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
 
@@ -60,14 +60,14 @@ class Job:
         return found | {path.name: ("text/plain", path.read_bytes()) for path in (dbc.DBC, *dbc.EDS.values())}
 
     def settings(self) -> dict[str, object]:
-        """The rest of it, for the log's metadata."""
+        """The settings of the run, for the log's metadata."""
         return {"seed": self.seed, "bus": self.bus, "pace": self.pace, "controller": self.controller,
                 "plant": self.plant, "model": self.model.name, "sequence": self.sequence.title,
                 "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
 
 
 def read_job(path: Path) -> Job:
-    """The job that made a log.
+    """Read the job that produced a log.
 
     Raises:
         InputError: the file is no log of a run.
@@ -91,7 +91,7 @@ def _select_attachments(attachments: Mapping[str, bytes], prefix: str) -> dict[s
 
 
 def _write_effect_files(files: Mapping[str, bytes]) -> tuple[Path, ...]:
-    """User effects as files again; they must outlive this call, because code is compiled from them later."""
+    """Write user effects to files. They must outlive this call, because code is compiled from them later."""
     if not files:
         return ()
     folder = Path(tempfile.mkdtemp(prefix="eha-rig-effects-"))

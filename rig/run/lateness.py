@@ -1,4 +1,4 @@
-"""How late this machine wakes a periodic task, and which real-time rights it grants."""
+"""Wake-up lateness of a periodic task on this machine, and the real-time rights it grants."""
 from __future__ import annotations
 
 import os
@@ -25,7 +25,7 @@ class Lateness(NamedTuple):
 
 
 def summarise_lateness(late_ns: np.ndarray, period_ns: int) -> Lateness:
-    """Sum up wake-ups that came `late_ns` (n,) after they were due."""
+    """Summarise wake-ups that came `late_ns` (n,) after they were due."""
     p50, p99, p99_9 = (float(value) for value in np.percentile(late_ns, [50, 99, 99.9]) / 1e3)
     missed = int(np.count_nonzero(late_ns >= period_ns))
     return Lateness(p50, p99, p99_9, float(late_ns.max()) / 1e3, late_ns.size, missed)
@@ -69,7 +69,7 @@ def read_clock_resolution_ns() -> float:
 
 
 def read_memory_lock_limit() -> int:
-    """Bytes that may be locked in memory; -1 means no limit (also for root, whom the limit does not bind)."""
+    """Bytes that may be locked in memory; -1 means no limit (also for root, who is exempt)."""
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     return -1 if soft == resource.RLIM_INFINITY or os.geteuid() == 0 else soft
 

@@ -22,23 +22,23 @@ _ALL = _XJ | _XS | _COR
 
 
 class CycleObserver(Protocol):
-    """Who is told of a cycle when it is over."""
+    """Receives each cycle when it is complete."""
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """A cycle is over."""
 
 
 class CycleInput(NamedTuple):
-    """What one cycle is asked to do."""
+    """Inputs of one cycle."""
 
     phase: int  # 0 set-up, 1 main, 2 clean-up
     demand: float  # m
-    load: float  # N, what the plant was told to expect
+    load: float  # N, force on the ram from the scenario
     control: int  # control word
 
 
 class CycleLoop:
-    """Runs cycles one by one and tells `log` of each when it is closed."""
+    """Runs cycles one by one and passes each to `log` when it is complete."""
 
     def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire
@@ -67,12 +67,12 @@ class CycleLoop:
                       step.load, step.control, 0, 0)
         timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
         self._open, self._seen = (self._t_ns, row, timing), 0
-        master.silent = not self._faults.heartbeat_alive("rig", k)
+        master.silent = not self._faults.is_heartbeat_alive("rig", k)
         self._command(codec.pack_command(step.demand, step.control, k))
         self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
         master.send(codec.SYNC, b"")
         if not self._realtime:
-            self._wire.settle(self._t_ns, lambda: self._seen == _ALL)
+            self._wire.wait_for_answers(self._t_ns, lambda: self._seen == _ALL)
             self._send_held(self._t_ns + self._period)
         master.tick()
         self.k += 1

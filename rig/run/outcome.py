@@ -1,4 +1,4 @@
-"""What came of a run: verdict, checks, timing. For the table, for verdict.json and for the exit status."""
+"""The outcome of a run: verdict, checks, timing. Used for the table, verdict.json and the exit status."""
 from __future__ import annotations
 
 import json
@@ -35,11 +35,11 @@ class Outcome:
     timing: dict[str, Any]
     counters: dict[str, int]
     speed: float  # multiple of real time, of the cycles alone
-    fdi: dict[str, Any] = field(default_factory=dict)  # what `rig fdi` says of it, if it was asked
+    fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, INVALID_TIMING or ABORTED. A bench that was late itself blames nobody else for what follows."""
+        """PASS, FAIL, INVALID_TIMING or ABORTED. If the bench itself was late, the controller is not judged."""
         late = self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]
         if late and not self.interrupted:
             return "INVALID_TIMING"
@@ -49,16 +49,16 @@ class Outcome:
 
     @property
     def failures(self) -> list[str]:
-        """The checks that did not pass, and an end other than the sequence's own."""
+        """The checks that did not pass, and an end other than the one the sequence requires."""
         failed = [check.name for check in self.checks if not check.passed]
         meant = self.job.sequence.ends == "safe_state"
-        return failed if self.safe or not meant else [*failed, "the run was to end in the safe state"]
+        return failed if self.safe or not meant else [*failed, "the run did not end in the safe state"]
 
     @property
     def why(self) -> str:
         """The reason of a verdict other than PASS, in words."""
         late = (f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
-                f"more than {100 * self.job.max_overruns:g} %: nothing can be said of the controller")
+                f"more than {100 * self.job.max_overruns:g} %: the controller cannot be judged")
         words = {"FAIL": "; ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
         return words.get(self.verdict, "")
 
@@ -68,7 +68,7 @@ class Outcome:
         return INTERRUPTED if self.interrupted else STATUS_OF_VERDICT[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
-        """As interface and verdict.json have it; a number that is not there is null."""
+        """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [_replace_nan(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
@@ -88,7 +88,7 @@ def summarise_timing(history: History, overruns: int, scheduler: str) -> dict[st
 
 
 def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
-    """Of the values that are there, in us."""
+    """Percentiles of the values that are not missing, in us."""
     values = seconds[~np.isnan(seconds)] * 1e6
     if not len(values):
         return dict.fromkeys(("p50", "p99", "p99_9", "max"))

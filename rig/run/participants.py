@@ -1,4 +1,4 @@
-"""Who is on the bus of a run: nodes inside this process, processes of our own, or somebody else's."""
+"""The nodes on the bus of a run: in this process, in processes of our own, or external ones."""
 from __future__ import annotations
 
 import contextlib
@@ -32,11 +32,11 @@ Child = subprocess.Popen[bytes]
 
 @contextlib.contextmanager
 def open_wire(job: Job) -> Iterator[Wire]:
-    """The bus with all nodes that are ours to run on it: inside this process, or as processes of their own.
+    """Open the bus and start the nodes of this job on it: inside this process, or as processes of their own.
 
     Raises:
-        InputError: an external node was asked for on a bus that no other program can reach, or a firmware of somebody
-            else's with an effect of ours.
+        InputError: an external node on a bus that no other program can reach, or an external firmware together with
+            an effect in the firmware.
         BusError: an external node does not answer.
     """
     if job.controller == "external" and find_firmware_parameters(job.model):
@@ -61,11 +61,11 @@ def open_wire(job: Job) -> Iterator[Wire]:
 
 
 def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> None:
-    """Start what is ours to run, having looked who is there. Raises BusError."""
-    if master.rival(RIVAL_TIMEOUT):  # before the first word: a reset would end somebody's test
-        raise BusError(f"another rig is at work on {job.bus}: a SYNC or heartbeat of node 1 was heard")
+    """Start the nodes of this job that do not answer on the bus. Raises BusError."""
+    if master.hears_rival(RIVAL_TIMEOUT):  # before sending anything: a reset would end the other rig's test
+        raise BusError(f"another rig is active on {job.bus}: received a SYNC or heartbeat of node 1")
     for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
-        there = (wanted != "builtin" or node == CONTROLLER) and master.present(node, BOOT_TIMEOUT)
+        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, BOOT_TIMEOUT)
         if wanted == "external" and not there:
             raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
         if node == CONTROLLER and wanted == "builtin" and there:
@@ -76,7 +76,7 @@ def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> Non
 
 
 def _stop_processes(children: Sequence[Child]) -> None:
-    """End the processes that we started, kindly first."""
+    """Terminate the processes that we started; kill those that do not end within 5 s."""
     for child in children:
         child.terminate()
     for child in children:
@@ -110,7 +110,7 @@ def _start_node(job: Job, name: str) -> Child:
 def _wait_for_node(master: Master, node: int, child: Child) -> None:
     """Until a node of our own answers. Raises BusError when it does not."""
     for _ in range(round(START_TIMEOUT)):
-        if master.present(node, 1.0):
+        if master.is_present(node, 1.0):
             return
         if child.poll() is not None:
             break

@@ -14,7 +14,7 @@ LOOP_PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
 
 @contextlib.contextmanager
 def raise_priority() -> Iterator[None]:
-    """The calling thread under SCHED_FIFO where that is allowed; as before afterwards.
+    """Run the calling thread under SCHED_FIFO where that is allowed; restore its priority afterwards.
 
     The process's other threads (the recorder) get the lowest real-time priority: while one of them holds the
     interpreter lock, other programs must not keep it from going on, for the loop would wait with it.
@@ -32,7 +32,7 @@ def raise_priority() -> Iterator[None]:
 
 @contextlib.contextmanager
 def suspend_garbage_collection() -> Iterator[None]:
-    """No garbage collection, which takes ms; and a thread that holds the interpreter lock gives it up when asked.
+    """Switch garbage collection off, which takes ms, and make threads release the interpreter lock within 50 us.
 
     By default it may keep the lock for 5 ms, five cycles, while the loop waits for it.
     """

@@ -1,4 +1,4 @@
-"""A job from start to finish: nodes and bus, log, session, checks, verdict.json, report.html."""
+"""Runs one job: nodes and bus, log, session, checks, verdict.json."""
 from __future__ import annotations
 
 import contextlib
@@ -25,12 +25,12 @@ from rig.sequences.checks import CheckResult, evaluate_checks
 
 
 def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
-    """Do a job; what comes of it lies in `folder`.
+    """Run a job; its log and verdict are written to `folder`.
 
     Raises:
-        RigError: bad input, a bus or node that is not there, or a log that cannot be written. The log is closed first.
+        RigError: bad input, a missing bus or node, or a log that cannot be written. The log is closed first.
     """
-    if job.plant != "external":  # here, where a law that cannot be compiled can be told in words
+    if job.plant != "external":  # here, where an effect that cannot be compiled is still reported as bad input
         Actuator(job.scenario.model).warm()
     with lock_folder(folder), open_wire(job) as wire, open_recorder(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
@@ -43,7 +43,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
                 rights.enter_context(raise_priority())
                 rights.enter_context(suspend_garbage_collection())
             scheduled = name_scheduler()
-            session.play()
+            session.run_phases()
         spent = stopwatch.now() * 1e-9
         loop = session.loop
         history = session.history
@@ -61,7 +61,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
 
 
 def judge_run(job: Job, session: Session) -> list[CheckResult]:
-    """The job's checks on the main phase."""
+    """Judge the main phase by the checks of the sequence."""
     main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
@@ -71,10 +71,10 @@ def judge_run(job: Job, session: Session) -> list[CheckResult]:
 
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, and locked against a second run.
+    """Create the folder if needed and lock it against a second run.
 
     Raises:
-        InputError: it cannot be made or written, or another run is writing there.
+        InputError: the folder cannot be created or written, or another run is writing there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def open_recorder(job: Job, folder: Path) -> Iterator[Recorder]:
-    """The run's log in place of an earlier run's results, closed whatever happens."""
+    """Replace the results of an earlier run by the log of this one; it is closed whatever happens."""
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
     recorder = Recorder(folder / "trace.mcap", job.attachments(), collect_provenance(**job.settings()))
@@ -103,7 +103,7 @@ def open_recorder(job: Job, folder: Path) -> Iterator[Recorder]:
 
 
 def _count_lost_frames(history: History) -> dict[str, int]:
-    """Cycles whose answers did not come, from what the rig itself saw and what the plant flagged."""
+    """Count the cycles with missing answers: those the rig saw and those the plant flagged."""
     flags = history.column("flags").astype(int)
     return {"no_feedback": int(np.isnan(history.column("xj")).sum()),
             "no_drive": int(np.isnan(history.column("cor")).sum()),

@@ -1,8 +1,8 @@
-"""One run from bring-up to clean-up on a bus that is already there: the sequencer.
+"""The sequencer: one run from bring-up to clean-up on an open bus.
 
 Set-up, main and clean-up are cycles of one loop. Clean-up always runs. A node in trouble puts the bench into its safe
-state (no current). Where the sequence is meant to end there, main goes on, for the response is what is tested; else it
-ends.
+state (no current). A sequence that must end in the safe state continues with main, because it tests that response;
+every other sequence ends main.
 """
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class SessionEvent(NamedTuple):
 
 
 class Session:
-    """Plays a job's sequence on a wire. `stop()` is asked every cycle whether the operator wants to end."""
+    """Runs a job's sequence on a wire. `stop()`, called every cycle, is True when the operator wants to end."""
 
     def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
         self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
@@ -69,23 +69,23 @@ class Session:
         self._master.on_frame = recorder.frame
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
-        self._master.on_lost = self._silent
-        self._master.on_rival = lambda cob_id: self._trouble("bus", f"somebody else sends 0x{cob_id:03X}, a frame of "
-                                                             f"node {NODE} {NAMES[NODE]}")
-        self._master.on_back = lambda node: self.say("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+        self._master.on_lost = self._handle_silence
+        self._master.on_rival = lambda cob_id: self._handle_trouble(
+            "bus", f"another node sends 0x{cob_id:03X}, a frame of node {NODE} {NAMES[NODE]}")
+        self._master.on_back = lambda node: self.log_event("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
 
     def now(self) -> int:
         """Time for the log, ns since the run began."""
         return self.loop.now() if self.loop else self._clock.now()
 
-    def say(self, level: str, kind: str, text: str) -> None:
-        """Something happened."""
+    def log_event(self, level: str, kind: str, text: str) -> None:
+        """Record an event of the run."""
         t_ns = self.now()
         self.events.append(SessionEvent(self._main_time(), level, kind, text))
         self.recorder.put(t_ns, Event(level, kind, text))
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        """The loop has closed a cycle."""
+        """Record a complete cycle (called by the loop)."""
         self.history.add(signals, timing)
         self.recorder.cycle(t_ns, signals, timing)
 
@@ -96,7 +96,7 @@ class Session:
             BusError: a node does not answer or refuses.
         """
         job = self.job
-        self.say("INFO", "phase", "bring-up")
+        self.log_event("INFO", "phase", "bring-up")
         self._master.reset()
         gains = firmware.read_gains(job.model) if job.controller == "builtin" else None
         patient = not job.realtime and isinstance(self._clock, WallClock)
@@ -105,28 +105,28 @@ class Session:
         self._master.start()
         self.loop = CycleLoop(self._master, self._faults, self, job.period_ns, job.realtime)
 
-    def play(self) -> None:
-        """All three phases. Whatever is raised in them, clean-up runs and the nodes are stopped."""
+    def run_phases(self) -> None:
+        """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
         assert self.loop is not None
         try:
             self._run(SETUP, self._setup) and self._run(MAIN, self._main)
         finally:
             try:
-                self._powered = self._recovered()
+                self._powered = self._restore_nodes()
                 self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
                 self.loop.finish()
             finally:
                 self._playing = False
                 self._master.stop()
-                self.say("INFO", "phase", "end")
+                self.log_event("INFO", "phase", "end")
 
-    def _recovered(self) -> bool:
-        """Try to have all nodes OPERATIONAL and without error again; whether clean-up may use current."""
+    def _restore_nodes(self) -> bool:
+        """Try to set all nodes to OPERATIONAL without errors; return whether clean-up may use current."""
         if self.safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
             self._master.start()
         return not self.safe or not self._master.errors()
 
-    def _control(self, phase: int, i: int) -> int:
+    def _choose_control_word(self, phase: int, i: int) -> int:
         """Control word of the phase's cycle `i`."""
         if self.safe if phase != CLEANUP else not self._powered:
             return 0
@@ -138,15 +138,15 @@ class Session:
     def _run(self, phase: int, profile: Profile) -> bool:
         """The cycles of one phase; False when it was ended early."""
         assert self.loop is not None
-        self.say("INFO", "phase", PHASES[phase])
+        self.log_event("INFO", "phase", PHASES[phase])
         for section in profile.sections:
-            self.say("INFO", "section", f"{PHASES[phase]}: {section.name}")
+            self.log_event("INFO", "section", f"{PHASES[phase]}: {section.name}")
             shown = section.name if phase == MAIN else PHASES[phase]
             for i in range(section.start, section.stop):
                 self._announce_faults()
                 self._demand = float(profile.command[i])
                 load = self.scenario.force[self.loop.k] * FORCE_RESOLUTION if phase == MAIN else 0.0
-                closed = self.loop.cycle(CycleInput(phase, self._demand, load, self._control(phase, i)))
+                closed = self.loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
                 if self.loop.k % 50 == 0:
                     self._progress(shown, self.loop.k / max(self._plan.stop, self.loop.k))
                 if phase != CLEANUP and self._must_end(closed):
@@ -159,33 +159,33 @@ class Session:
             self._abort("operator", "stopped by the operator")
         if row is not None:
             measured = {name: getattr(row, name) for name in ("com", "xj", "cor", "p12", "xs", "load")}
-            passed = self._watch.see({**measured, "error": row.com - row.xj})
+            passed = self._watch.find_passed({**measured, "error": row.com - row.xj})
             if passed:
                 self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
         return bool(self.aborted)
 
     def _abort(self, kind: str, why: str) -> None:
         self.aborted = self.aborted or why
-        self.say("ERROR", kind, why)
+        self.log_event("ERROR", kind, why)
 
-    def _trouble(self, kind: str, what: str) -> None:
-        """A node is in trouble: no current from here on, and the end of main unless the sequence is about that."""
-        self.say("ERROR", kind, what)
+    def _handle_trouble(self, kind: str, what: str) -> None:
+        """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""
+        self.log_event("ERROR", kind, what)
         if not self.safe:
             self.safe = True
-            self.say("WARN", "safe_state", f"no current from here on: {what}")
+            self.log_event("WARN", "safe_state", f"no current from here on: {what}")
         if self.job.sequence.ends != "safe_state" and not self.aborted:
             self._abort("abort", what)
 
     def _emcy(self, node: int, error: EmcyError) -> None:
         if error.code & 0xFF00 == 0:
             left = "an error is gone, others stand" if error.register else "no error any more"
-            self.say("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
+            self.log_event("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
         else:
-            self._trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
+            self._handle_trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
 
-    def _silent(self, node: int) -> None:
-        self._trouble("heartbeat", f"node {node} {NAMES[node]} is silent")
+    def _handle_silence(self, node: int) -> None:
+        self._handle_trouble("heartbeat", f"node {node} {NAMES[node]} is silent")
 
     def _state(self, node: int, state: int) -> None:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
@@ -195,17 +195,18 @@ class Session:
             self._operational.add(node)
         elif node in self._operational:
             self._operational.discard(node)
-            if self._playing:  # a watchdog's reset, a node switched off and on, somebody else's command
-                self._trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}")
+            if self._playing:  # a watchdog reset, a power cycle, or an NMT command of another master
+                self._handle_trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}")
 
     def _announce_faults(self) -> None:
         assert self.loop is not None
         while self._edges and self._edges[0].cycle <= self.loop.k:
             edge = self._edges.pop(0)
-            self.say("WARN" if edge.begins else "INFO", "fault", f"{edge.label} {'begins' if edge.begins else 'ends'}")
+            level, word = ("WARN", "begins") if edge.begins else ("INFO", "ends")
+            self.log_event(level, "fault", f"{edge.label} {word}")
 
     def _main_time(self) -> float:
-        """Now, s of main; negative before it."""
+        """The time now, s of main; negative before main."""
         if self.loop is None:
             return -self._plan.start / RATE
         return (self.loop.k - self._plan.start) / RATE

@@ -1,4 +1,4 @@
-"""What a check is: a window of a run, a number measured there, limits, and a verdict. checks.py has the kinds."""
+"""A check: a window of a run, a number measured there, limits, and a verdict. checks.py has the kinds."""
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ LATEST_TIME = 1e6  # s, later than any run ends
 
 
 def require_check(holds: bool, key: str, expected: str) -> None:
-    """Refuse a check; whoever read it knows the file and the line and adds them."""
+    """Raise InputError unless `holds`; the caller adds file and line."""
     if not holds:
         raise InputError("check", key, expected)
 
@@ -77,10 +77,10 @@ class Check(ABC):
 
     @abstractmethod
     def measure(self, run: RunData, span: slice) -> float:
-        """The number in rows `span`, SI; raises NotMeasurable with the reason."""
+        """Measure the number in rows `span`, SI; raises NotMeasurable with the reason."""
 
     def judge(self, run: RunData) -> CheckResult:
-        """Measure and hold against the limits."""
+        """Measure the number and compare it with the limits."""
         value, t0, t1, detail = nan, nan, nan, ""
         try:
             span = run.span(self.window, self.skip)

@@ -190,7 +190,7 @@ class ResponseWithin(Check):
         if self.signal:
             rest = run.span((after, span.stop / RATE))
             return measures.find_crossing(run.signal(self.signal, rest), self.above, self.below)
-        events = run.matching(self.event, after)
+        events = run.find_events(self.event, after)
         if not events:
             raise NotMeasurable(f"no event {self.event!r} after {after:g} s")
         return events[0].t - after
@@ -209,7 +209,7 @@ class EventOccurs(Check):
         require_check(bool(self.event.split()), "event", "at least one word")
 
     def measure(self, run: RunData, span: slice) -> float:
-        return float(len(run.matching(self.event, span.start / RATE, span.stop / RATE)))
+        return float(len(run.find_events(self.event, span.start / RATE, span.stop / RATE)))
 
 
 @dataclass(frozen=True, kw_only=True)

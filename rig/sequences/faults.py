@@ -1,8 +1,8 @@
-"""Faults as data, and the schedule that says what is wrong in each cycle.
+"""Faults as data, and the schedule of the faults that act in each cycle.
 
-A `Schedule` is asked every millisecond by the node that injects the fault, so everything random or periodic is laid out
-when it is made; the same seed gives the same faults in the same cycles. Times in a fault are seconds from the start of
-the main phase; a fault ends when main ends, so that clean-up finds a sound plant.
+The node that injects a fault asks the `Schedule` every millisecond, so everything random or periodic is computed when
+it is created; the same seed gives the same faults in the same cycles. Times in a fault are seconds from the start of
+the main phase; a fault ends when main ends, so that clean-up runs on a healthy plant.
 """
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LARGEST_COUNT = 1_000_000_000  # cycles or frames to count to
 
 @dataclass(frozen=True, kw_only=True)
 class Fault(ABC):
-    """Something wrong from `start` until before `end` (without one: until main ends). `name` is what checks call it."""
+    """A fault that acts from `start` until before `end` (default: the end of main). Checks refer to it by `name`."""
 
     kind: ClassVar[str]
     start: Second
@@ -64,7 +64,7 @@ class _Ramped(Fault):
         _require(self.ramp >= 0, "ramp", f"0 s or more, not {self.ramp:g}")
 
     def growth(self, t: float) -> float:
-        """How much of it is there at `t` s after its start, 0..1."""
+        """Share of the full size at `t` s after the start, 0..1."""
         return 1.0 if t >= self.ramp else t / self.ramp
 
 
@@ -94,7 +94,7 @@ class Parameter(_Ramped):
 
 @dataclass(frozen=True, kw_only=True)
 class Offset(_Ramped):
-    """A sensor reads `value` too much."""
+    """A sensor reads too high by `value`."""
 
     kind = "offset"
     signal: Sensor
@@ -114,7 +114,7 @@ class Noise(Offset):
 
 @dataclass(frozen=True, kw_only=True)
 class Stuck(Fault):
-    """A sensor stays at `value`, or without one at what it last read."""
+    """A sensor stays at `value` or, without one, at its last reading."""
 
     kind = "stuck"
     signal: Sensor
@@ -127,7 +127,7 @@ class Stuck(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class _Frames(Fault):
-    """Hits every `every`-th frame, each with a probability, until `count` were hit."""
+    """Affects every `every`-th frame, each with a probability, until `count` frames were affected."""
 
     frame: FrameName
     every: int = 1
@@ -216,7 +216,7 @@ class Plan:
 
 
 class Schedule:
-    """What is wrong in cycle k. `base` gives the model's own value of every parameter that a fault changes.
+    """The faults in cycle k. `base` gives the model's own value of every parameter that a fault changes.
 
     Cycles are counted from the start of set-up. Only a stuck sensor has a memory (what it last read), so ask for them
     in the order of the cycles; everything else may be asked in any order. InputError for a parameter without a base.
@@ -281,13 +281,13 @@ class Schedule:
         return value
 
     def frame(self, name: str, cycle: int) -> Drop | Delay | None:
-        """What happens to the frame `name` of this cycle; None: it goes its way."""
+        """What happens to the frame `name` of this cycle; None: it is sent normally."""
         for first, hit, action in self._frames.get(name, ()):
             if 0 <= cycle - first < len(hit) and hit[cycle - first]:
                 return action
         return None
 
-    def heartbeat_alive(self, node: str, cycle: int) -> bool:
+    def is_heartbeat_alive(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) sends its heartbeat."""
         return not any(cycle in cycles for cycles in self._silent.get(node, ()))
 

@@ -1,4 +1,4 @@
-"""Guards: limits that are watched in every cycle; the run goes to its safe state when one is passed."""
+"""Guards: limits that are monitored in every cycle; the run goes to its safe state when one is exceeded."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
@@ -36,14 +36,14 @@ class Guard:
 
 
 class GuardWatch:
-    """Follows a run and says which guard it has passed."""
+    """Monitors the guards of a run, cycle by cycle."""
 
     def __init__(self, guards: Iterable[Guard]) -> None:
         self._watched = [(guard, *guard.limits()) for guard in guards]
         self._outside = [0] * len(self._watched)
 
-    def see(self, values: Mapping[str, float]) -> Guard | None:
-        """The first guard that this cycle's `values` (SI, by signal name) complete the passing of.
+    def find_passed(self, values: Mapping[str, float]) -> Guard | None:
+        """The first guard whose limit this cycle's `values` (SI, by signal) exceed for its number of cycles.
 
         A missing value (absent or NaN) is not outside, and does not count as back inside either.
         """

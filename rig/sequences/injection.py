@@ -1,11 +1,11 @@
-"""What a fault does to the samples of a sensor or to frames, laid out before the run."""
+"""Effects of faults on sensor samples and on frames, computed before the run."""
 from __future__ import annotations
 
 import numpy as np
 
 
 class AddedSignal:
-    """A sensor that reads more than there is: from cycle `first` on by `values`, one a cycle."""
+    """An additive sensor fault: `values`, one per cycle, are added from cycle `first` on."""
 
     def __init__(self, first: int, values: list[float]) -> None:
         self._first, self._values = first, values
@@ -16,7 +16,7 @@ class AddedSignal:
 
 
 class StuckSignal:
-    """A sensor stuck within `cycles`, at `value` or without one at what it last read."""
+    """A sensor that is stuck during `cycles`, at `value` or, without one, at its last reading."""
 
     def __init__(self, cycles: range, value: float | None) -> None:
         self._cycles, self._last_read, self._value = cycles, 0.0, value

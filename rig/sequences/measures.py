@@ -1,4 +1,4 @@
-"""Single numbers out of sampled signals: overshoot, settling time, phase lag and their like.
+"""Measures of sampled signals: overshoot, settling time, phase lag and so on, each a single number.
 
 Signals have shape (n,), SI, one sample per cycle. Position carries some 2 um rms of sensor noise; where one sample
 could decide (a peak, the last sample outside a band) a centred moving median of MEDIAN samples goes first. It keeps
@@ -17,7 +17,7 @@ SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of positi
 
 
 class NotMeasurable(Exception):
-    """Why a signal does not have the number that was asked for."""
+    """A measure does not exist for a signal; the message says why."""
 
 
 def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:

@@ -1,4 +1,4 @@
-"""Parameters that a sequence changes: they exist, their values are possible, and never contradict each other."""
+"""Checks of the parameters that a sequence changes: they exist, their values are possible, none contradicts another."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -83,7 +83,7 @@ def require_sensible(plan: Plan, model: Model) -> None:
 
 
 def _list_extreme_cycles(plan: Plan, fault: Parameter) -> tuple[int, ...]:
-    """Where a parameter on its straight line may be furthest out: it begins, is all there, last acts, is over."""
+    """The cycles in which a ramped parameter may be extreme: first, end of the ramp, last, and the one after."""
     first, last = plan.cycles(fault)
     end = max(first, last - 1)
     return first, min(first + ceil(min(fault.ramp, LATEST_START) * RATE), end), end, last

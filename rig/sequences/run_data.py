@@ -1,4 +1,4 @@
-"""What a check may look at: a run's columns by window and signal, its events, and when its faults began."""
+"""The data that checks use: columns of a run by window and signal, its events, and when its faults began."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ class TraceLike(Protocol):
 
 
 class EventLike(Protocol):
-    """Something that happened at `t` seconds of the main phase."""
+    """An event at `t` seconds of the main phase."""
 
     @property
     def t(self) -> float: ...
@@ -39,7 +39,7 @@ class EventLike(Protocol):
 
 @dataclass(frozen=True)
 class RunData:
-    """All that a check may look at: trace, sections, events, and when each fault started (s of main, by label)."""
+    """The data of a run that checks use: trace, sections, events, and when each fault started (s of main, by label)."""
 
     trace: TraceLike
     sections: Mapping[str, slice] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class RunData:
         position = self.signal("xj", span)
         return position, self.signal("com", span), float(self.trace.com[span.start - 1] if span.start else position[0])
 
-    def matching(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
+    def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
         words = set(event.lower().split())
         found = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))

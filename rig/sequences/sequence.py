@@ -1,4 +1,4 @@
-"""A test sequence: what is asked of the actuator, what goes wrong meanwhile, what must be true afterwards. All data.
+"""A test sequence as data: the command of the actuator, the faults during the test, and the checks afterwards.
 
 A sequence is a TOML file (rig/sequences/ has examples): set-up, main and clean-up as lists of segments, the load on the
 ram, faults, checks and guards. Times of loads, faults and checks count from the start of main.

@@ -1,4 +1,4 @@
-"""TOML text to frozen dataclasses. A refusal names file and line, key, and what was expected there.
+"""Reads TOML text into frozen dataclasses. Errors name file and line, key, and what was expected there.
 
 The dataclass is the schema: its fields are the keys, its annotations the types (`Annotated[float, "s"]` adds the unit),
 its defaults say what may be left out. A base class whose subclasses are told apart by the key `kind` is read by the

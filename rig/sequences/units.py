@@ -1,4 +1,4 @@
-"""Units a limit may be written in: the table that a person reads says 41.3 um, the computation says 4.13e-5 m."""
+"""Units of limits: a table may show 41.3 um while the computation uses 4.13e-5 m."""
 from __future__ import annotations
 
 from plant.errors import InputError

@@ -63,13 +63,13 @@ LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are li
 
 
 class ViewerError(RigError):
-    """The viewer cannot be had or does not show what it should."""
+    """The viewer is not installed, or does not show what it should."""
 
     status = 1
 
 
 def import_rerun() -> Any:
-    """The rerun package. Raises ViewerError with the way to get it."""
+    """Import the rerun package. Raises ViewerError, which says how to install it."""
     try:
         import rerun as rr
     except ImportError as error:

@@ -65,7 +65,7 @@ def take_screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0
     fewest = {TEXTS: FEWEST_TEXT_PIXELS, LIMITS: 0}
     empty = [title for title, count in pixels.items() if count < fewest.get(title, FEWEST_PIXELS)]
     if empty:
-        raise ViewerError(f"{image}: views in which nothing is to be seen: {', '.join(empty)}")
+        raise ViewerError(f"{image}: empty views: {', '.join(empty)}")
     return pixels
 
 
@@ -108,7 +108,7 @@ def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
             ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image.resolve()))
         except (ConnectionError, TimeoutError, RuntimeError) as error:
             output.seek(0)
-            last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it said nothing")
+            last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it printed nothing")
             raise ViewerError(f"the viewer does not draw: {error}; its last line: {last.strip()}") from error
         finally:
             with contextlib.suppress(ProcessLookupError):

@@ -136,7 +136,7 @@ def test_master_decodes_pdos(bench: Bench) -> None:
 
 
 def test_master_collects_emergencies(bench: Bench) -> None:
-    bench.devices[3].emcy.raise_(0x8250, 0x10, b"\1\2")
+    bench.devices[3].emcy.raise_error(0x8250, 0x10, b"\1\2")
     bench.wait(0)
     bench.devices[3].emcy.clear()
     bench.wait(0)

@@ -104,7 +104,7 @@ def test_asynchronous_pdos_only_in_operational(state: NmtState) -> None:
 @states
 def test_emcy_in_pre_operational_and_operational(state: NmtState) -> None:
     rack = rack_in(state)
-    rack.device.emcy.raise_(EmcyCode.RPDO_TIMEOUT, 0x10)
+    rack.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, 0x10)
     assert [cob_id for cob_id, _ in rack.wait(0)] == ([] if state is STOPPED else [0x083])
     assert rack.device.read(0x1001) == 0x11  # the register knows in any state
 

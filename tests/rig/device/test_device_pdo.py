@@ -187,8 +187,8 @@ def test_error_register_and_history() -> None:
     """Errors stand side by side; the history is newest first, eight deep, and erased by writing 0."""
     rack = running()
     emcy = rack.device.emcy
-    emcy.raise_(0x8250, 0x10, b"\1")
-    emcy.raise_(0x5000, 0x80, b"\xaa\xbb\xcc\xdd\xee")
+    emcy.raise_error(0x8250, 0x10, b"\1")
+    emcy.raise_error(0x5000, 0x80, b"\xaa\xbb\xcc\xdd\xee")
     assert [data.hex() for _, data in rack.wait(0)] == ["5082110100000000", "005091aabbccddee"]
     assert (rack.device.read(0x1003, 0), rack.device.read(0x1003, 1)) == (2, 0xBBAA5000)
     assert rack.device.read(0x1003, 2) == 0x00018250
@@ -198,7 +198,7 @@ def test_error_register_and_history() -> None:
     emcy.clear()
     assert [data.hex() for _, data in rack.wait(0)] == ["0000000000000000"]
     for code in range(0x6101, 0x610C):
-        emcy.raise_(code)
+        emcy.raise_error(code)
     assert len(rack.wait(0)) == 11
     assert [rack.device.read(0x1003, sub) for sub in (0, 1, 8)] == [8, 0x610B, 0x6104]
     assert download(rack, 0x1003, 0, 1, 1).hex() == "8003100030000906"

@@ -75,12 +75,12 @@ def test_bring_up(wire: Wire) -> None:
     for node in (CONTROLLER, PLANT):
         states = [state for n, state in seen if n == node]
         assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
-    assert master.errors() == [] and not master.rival(0.0)
+    assert master.errors() == [] and not master.hears_rival(0.0)
 
 
 def test_who_answers(wire: Wire) -> None:
     master = Master(wire, wire.clock.now)
-    assert master.present(PLANT, 2.0) and master.present(CONTROLLER, 2.0)
+    assert master.is_present(PLANT, 2.0) and master.is_present(CONTROLLER, 2.0)
 
 
 def test_refusals_name_node_and_object(wire: Wire) -> None:
@@ -98,7 +98,7 @@ def test_nobody_there() -> None:
         master.reset()
     with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210"):
         master.configure(SCENARIO, None, 0)
-    assert not master.present(PLANT, 0.1)
+    assert not master.is_present(PLANT, 0.1)
 
 
 @pytest.mark.parametrize("cob_id", [0x082, 0x083, 0x582, 0x583, 0x702, 0x703, 0x704, 0x084, 0x7E4, 0x7FF, 0x183])
@@ -137,7 +137,7 @@ def test_another_rig_is_noticed_once(cob_id: int) -> None:
     master.on_rival = heard.append
     for _ in range(3):
         master.receive(Frame(0, cob_id, b""))
-    assert heard == [cob_id] and master.rival(0.0)
+    assert heard == [cob_id] and master.hears_rival(0.0)
 
 
 def test_heartbeats_are_watched_from_the_first_on() -> None:

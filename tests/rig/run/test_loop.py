@@ -48,7 +48,7 @@ class Bench:
     def wait(self, done: Callable[[], bool], seconds: float) -> bool:
         return done()
 
-    def settle(self, t_ns: int, done: Callable[[], bool]) -> None:
+    def wait_for_answers(self, t_ns: int, done: Callable[[], bool]) -> None:
         self.run_until(t_ns)
 
     def run_until(self, t_ns: int) -> None:
@@ -221,11 +221,11 @@ def test_a_node_that_is_gone_does_not_hold_up_lockstep_for_long() -> None:
     clock = VirtualClock()
     wire = LinkWire(Slow(clock), clock)  # type: ignore[arg-type]  # any clock will do
     for _ in range(500):
-        wire.settle(0, lambda: False)
+        wire.wait_for_answers(0, lambda: False)
     assert clock.now() < 15e9
-    wire.settle(0, lambda: True)  # it is back: patience too
+    wire.wait_for_answers(0, lambda: True)  # it is back: patience too
     before = clock.now()
-    wire.settle(0, lambda: False)
+    wire.wait_for_answers(0, lambda: False)
     assert clock.now() - before == pytest.approx(0.2e9, rel=0.01)
 
 

@@ -90,7 +90,7 @@ def test_a_rig_does_not_disturb_another(tmp_path: Path) -> None:
     heard = {frame.cob_id for frame in listener.poll(0.0)}
     other.close()
     listener.close()
-    assert said.status == 2 and "another rig is at work" in said.err and heard == {codec.SYNC}
+    assert said.status == 2 and "another rig is active" in said.err and heard == {codec.SYNC}
 
 
 def killed(where: str, folder: Path, cycles: int) -> int:

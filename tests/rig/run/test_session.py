@@ -114,7 +114,7 @@ def test_a_sequence_may_be_about_trouble(tmp_path: Path) -> None:
 def test_a_meant_end_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
     outcome = play(job(SAFE), tmp_path)
     assert (outcome.verdict, outcome.status) == ("FAIL", 1)
-    assert outcome.failures == ["the run was to end in the safe state"]
+    assert outcome.failures == ["the run did not end in the safe state"]
 
 
 @pytest.mark.parametrize(("node", "says"), [("rig", "0x8130"), ("plant", "node 3 plant is silent")])
@@ -163,14 +163,14 @@ def play_with(intruder: Intruder, tmp_path: Path) -> Session:
     with runner.open_recorder(job(), tmp_path) as recorder:
         session = Session(job(), wire, recorder, ignore_progress, lambda: False)
         session.bring_up()
-        session.play()
+        session.run_phases()
     return session
 
 
 @pytest.mark.parametrize(("frames", "why"), [
-    ([(0x080, b"")], "somebody else sends 0x080"),
-    ([(0x202, bytes(8))], "somebody else sends 0x202"),
-    ([(0x000, b"\x80\x02")], "somebody else sends 0x000"),
+    ([(0x080, b"")], "another node sends 0x080"),
+    ([(0x202, bytes(8))], "another node sends 0x202"),
+    ([(0x000, b"\x80\x02")], "another node sends 0x000"),
     ([(0x702, b"\0")], "node 2 controller left OPERATIONAL: boot-up"),
     ([(0x703, b"\x7f")], "node 3 plant left OPERATIONAL: pre-operational"),
     ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330"),

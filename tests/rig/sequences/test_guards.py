@@ -13,8 +13,8 @@ def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:
     guard = Guard(name="far", signal="xj", high=10.0, unit="mm", cycles=3)
     watch = GuardWatch([Guard(name="other", signal="p12", low=-1.0, high=1.0), guard])
     values = [0.011, 0.011, 0.0, 0.011, float("nan"), 0.011, 0.011]
-    assert [watch.see({"xj": x}) for x in values] == [None] * 6 + [guard]
-    assert GuardWatch([]).see({"xj": 1e9}) is None
+    assert [watch.find_passed({"xj": x}) for x in values] == [None] * 6 + [guard]
+    assert GuardWatch([]).find_passed({"xj": 1e9}) is None
 
 
 @pytest.mark.parametrize("keys", [

@@ -143,7 +143,7 @@ def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monke
         pytest.skip(missing)
     monkeypatch.setattr(rerun_log, part, lambda *_: None)
     rerun_log.write_rrd(trace, tmp_path / "view.rrd")
-    with pytest.raises(rerun_log.ViewerError, match=f"nothing is to be seen: {title}$"):
+    with pytest.raises(rerun_log.ViewerError, match=f"empty views: {title}$"):
         viewer.take_screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
 
 
