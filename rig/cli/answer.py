@@ -43,12 +43,14 @@ def choose_file(out: str | None, suffixes: Sequence[str], source: str | Path | N
 def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Places:
     """The page and the JSON file of --out, and the page that --report puts beside the trace as `page_name`.
 
+    Without a `page_name` the command has no --report.
+
     Raises:
         InputError: a place that cannot be written, or a kind of file that the command does not make.
     """
     out = choose_file(args.out or None, (".html", ".json"), source, expected="FILE.html for a page, or FILE.json")
     page = out if out is not None and out.suffix == ".html" else None
-    if args.report and page is None:
+    if page_name and args.report and page is None:
         folder = Path(source) if Path(source).is_dir() else Path(source).parent
         page = choose_file(str(folder / page_name), (".html",), source, "--report")
     return Places(page, out if out is not None and out.suffix == ".json" else None)
@@ -79,6 +81,6 @@ def show_answer(report: Report, args: argparse.Namespace) -> None:
         print(to_json(report.data))
     elif not args.quiet:
         from fdi.report.terminal import print_report
-        from rig.cli.terminal import console
+        from rig.cli.terminal import open_console
 
-        print_report(report, console())
+        print_report(report, open_console())

@@ -39,11 +39,11 @@ def load_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     """
     from fdi.discovery.model_file import Provenance, load_model_file
 
-    options.load_user_effects([*args.effects, *options.named_in(args.model, args.effects)])
+    options.load_user_effects([*args.effects, *options.find_effect_files(args.model, args.effects)])
     if args.model and Path(args.model).is_file():
         model, known = load_model_file(Path(args.model))
-        return model.replace(options.changes(args.set)), known
-    return options.model_of(args), Provenance()
+        return model.replace(options.parse_changes(args.set)), known
+    return options.load_chosen_model(args), Provenance()
 
 
 def list_effect_files(args: argparse.Namespace, known: Provenance) -> tuple[str, ...]:

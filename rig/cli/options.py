@@ -1,4 +1,4 @@
-"""Options that mean the same in every command, and what they stand for."""
+"""The options that have the same meaning in every command, and the values they stand for."""
 from __future__ import annotations
 
 import argparse
@@ -11,46 +11,46 @@ if TYPE_CHECKING:
     from plant.model import Model
 
 
-def add_model(parser: argparse.ArgumentParser) -> None:
-    """--model, --set, --seed, --effects: which plant to run."""
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Add --model, --set, --effects and --seed, which choose the plant."""
     add = parser.add_argument
-    add("--model", metavar="FILE|NAME", help="model file, or a nominal plant: eha (default), ehs (a pump-driven servo)")
+    add("--model", metavar="FILE|NAME", help="model file, or a shipped plant: eha (default), ehs (pump-driven servo)")
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
         help="change a parameter of the model or of an effect, SI units (repeatable)")
     add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")
-    add_seed(parser)
+    add_seed_option(parser)
 
 
-def add_seed(parser: argparse.ArgumentParser) -> None:
-    """--seed: of all random numbers of a run."""
-    parser.add_argument("--seed", type=whole, default=0, metavar="N", help="seed of the noise (default 0)")
+def add_seed_option(parser: argparse.ArgumentParser) -> None:
+    """Add --seed."""
+    parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
 
 
-def whole(text: str) -> int:
-    """A whole number from 0, for argparse."""
+def parse_whole_number(text: str) -> int:
+    """Parse a whole number from 0, as an argparse type."""
     value = int(text)
     if value < 0:
         raise ValueError
     return value
 
 
-def counted(text: str) -> int:
-    """A whole number from 1, for argparse."""
-    value = whole(text)
+def parse_count(text: str) -> int:
+    """Parse a whole number from 1, as an argparse type."""
+    value = parse_whole_number(text)
     if value < 1:
         raise ValueError
     return value
 
 
-whole.__name__ = "whole number from 0"
-counted.__name__ = "whole number from 1"
+parse_whole_number.__name__ = "whole number from 0"
+parse_count.__name__ = "whole number from 1"
 
 
-def changes(pairs: list[str]) -> dict[str, str]:
-    """The --set options as a dict.
+def parse_changes(pairs: list[str]) -> dict[str, str]:
+    """Parse the --set options: "GROUP.FIELD" to value.
 
     Raises:
-        InputError: one that is not GROUP.FIELD=VALUE.
+        InputError: an option that is not GROUP.FIELD=VALUE.
     """
     table: dict[str, str] = {}
     for pair in pairs:
@@ -61,39 +61,39 @@ def changes(pairs: list[str]) -> dict[str, str]:
     return table
 
 
-def model_of(args: argparse.Namespace) -> Model:
-    """The model that --model, --set and --effects describe.
+def load_chosen_model(args: argparse.Namespace) -> Model:
+    """Load the model that --model, --set and --effects describe.
 
     Raises:
-        InputError: a file, name or value that cannot be used.
+        InputError: a file, name or value that is invalid.
     """
     from plant.model import load_model
 
-    load_user_effects([*args.effects, *named_in(args.model, args.effects)])
-    return load_model(args.model or "eha").replace(changes(args.set))
+    load_user_effects([*args.effects, *find_effect_files(args.model, args.effects)])
+    return load_model(args.model or "eha").replace(parse_changes(args.set))
 
 
-def named_in(model: str | None, given: list[Path]) -> list[Path]:
-    """The files of a user's own effects that a model file names, where they are found: here or beside it.
+def find_effect_files(model: str | None, given: list[Path]) -> list[Path]:
+    """The effect files that a model file names, as far as they are found in this folder or beside the model file.
 
-    A file of the same name among the `given` ones takes the place of one.
+    A file in `given` replaces one of the same name.
     """
     if model is None or not Path(model).is_file():
         return []
     from plant.parameters import read_toml
 
-    said = read_toml(Path(model)).get("provenance", {})
-    named = said.get("effect_files", []) if isinstance(said, dict) else []
-    files = [Path(name) for name in named if isinstance(name, str)]
+    provenance = read_toml(Path(model)).get("provenance", {})
+    names = provenance.get("effect_files", []) if isinstance(provenance, dict) else []
+    files = [Path(name) for name in names if isinstance(name, str)]
     places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
     return [p for p in places if p is not None and p.name not in [g.name for g in given]]
 
 
 def load_user_effects(files: list[Path]) -> None:
-    """Put the user's own effects into the catalogue.
+    """Add the user's own effects to the catalogue.
 
     Raises:
-        InputError: a file that cannot be used, or two of one name: a log keeps them by name.
+        InputError: an invalid file, or two files of one name: a log stores them by name.
     """
     if files:
         from plant.effects import load_effects

@@ -18,6 +18,6 @@ class _Pipe(Console):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def console() -> Console:
+def open_console() -> Console:
     """A rich console on standard output that colours only what it is told to."""
     return _Pipe(highlight=False)

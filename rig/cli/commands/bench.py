@@ -58,7 +58,7 @@ def _run_trial(args: argparse.Namespace) -> int:
     from fdi.output import writable, write_text
     from plant.errors import InputError
     from rig.cli.answer import show_answer
-    from rig.cli.terminal import console
+    from rig.cli.terminal import open_console
     from rig.studies.trial.blackbox import RIG_EXPLAIN
     from rig.studies.trial.run_trial import run_trial
     from rig.studies.trial.score import summarise_trial
@@ -69,7 +69,7 @@ def _run_trial(args: argparse.Namespace) -> int:
             raise InputError(option, str(count), "1 or more")
     if args.out is not None:
         writable(args.out, "--out")
-    out = console()
+    out = open_console()
 
     def report_progress(progress: BatchProgress) -> None:
         if not (args.json or args.quiet):

@@ -28,14 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
              "to resume")
     add("--summary", action="store_true", help="run nothing; summarise the finished cases")
     add("--scheduler", metavar="ADDRESS", help="use the workers of the Dask cluster at tcp://HOST:PORT")
-    add("--jobs", type=options.whole, metavar="N", help="processes on this machine (default: one per core)")
-    add("--most", type=options.counted, metavar="N", help="stop after the first N cases (a fair sample of all)")
+    add("--jobs", type=options.parse_whole_number, metavar="N",
+        help="processes on this machine (default: one per core)")
+    add("--most", type=options.parse_count, metavar="N", help="stop after the first N cases (a fair sample of all)")
     add("--again", action="store_true", help="judge failed cases once more")
     add = parser.add_argument_group("the matrix").add_argument
     add("--fault", action="append", default=[], metavar="EFFECT=SIZE,..",
         help="cases: healthy, EFFECT=SIZE,SIZE.., or both at once EFFECT=SIZE/EFFECT=SIZE (repeatable)")
-    add("--seeds", type=options.whole, metavar="N", help="runs of each size (default 20)")
-    add("--seed", type=options.whole, metavar="N", help="seed of the first run (default 0)")
+    add("--seeds", type=options.parse_whole_number, metavar="N", help="runs of each size (default 20)")
+    add("--seed", type=options.parse_whole_number, metavar="N", help="seed of the first run (default 0)")
     add("--tolerance", metavar="X,..", help="standard deviation of the base parameters, relative (default 0.015)")
     add("--simulator", choices=("plant", "independent"), help="the plant model (default), or the blind trial's "
                                                                "simulator in C, which shares no physics with it")
@@ -111,7 +112,7 @@ def _choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
         if changed or args.fault or args.model or args.set or args.out:
             raise InputError(args.what, "", "no other option about the matrix: this folder has its own")
         return read_matrix_of_folder(args.what), Path(args.what)
-    model = load_model(args.model or "eha").replace(options.changes(args.set))
+    model = load_model(args.model or "eha").replace(options.parse_changes(args.set))
     work = WORKS.get(args.work, args.work)
     if args.what and Path(args.what).is_dir():
         if changed or args.fault:

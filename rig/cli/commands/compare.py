@@ -10,7 +10,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     add = parser.add_argument
     add("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
-    options.add_model(parser)
+    options.add_model_options(parser)
     add("--repeat", action="append", default=[], metavar="TRACE",
         help="the same command again: measures the noise, whatever its colour (repeatable)")
     add("--signals", metavar="xj,p12,xs", help="what to compare (default: what the trace has)")
@@ -27,7 +27,7 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.progress_bar import show_progress
 
     places = choose_places(args, "compare.html", args.trace)
-    model = options.model_of(args)
+    model = options.load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         trace = Trace.read(args.trace)
         repeats = [Trace.read(file) for file in args.repeat]

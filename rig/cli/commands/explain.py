@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
     discovery_options.add_run_options(parser)
-    options.add_model(parser)
+    options.add_model_options(parser)
     add("--write-effect", metavar="FILE.py", help="write the shape of the residual as an effect, to edit and add")
     add("--report", action="store_true", help="write a page with pictures, explain.html beside the trace, or where "
                                               "--out FILE.html says")

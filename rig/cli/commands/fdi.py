@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("trace", metavar="TRACE", nargs="?",
         help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
-    options.add_model(parser)
+    options.add_model_options(parser)
     add("--bands", metavar="FILE", help="bands to judge by (default: the shipped ones, for the preflight command)")
     add("--optimisers", action="store_true",
         help="compare with differential evolution, simulated annealing and a genetic algorithm: error, simulations, "
@@ -47,21 +47,22 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.diagnosis.diagnosis import diagnose
     from fdi.report.diagnosis_report import build_diagnosis_report
     from fdi.trace.trace import Trace
-    from rig.cli.answer import show_answer
+    from rig.cli.answer import choose_places, show_answer, write_answer
     from rig.cli.progress_bar import show_progress
 
-    out = choose_output(args)
-    model = options.model_of(args)
+    if args.trace is None:
+        raise InputError("TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
+    places = choose_places(args, "", args.trace)
+    model = options.load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         diagnosis = diagnose(Trace.read(args.trace), model, load_bands(args), progress, str(args.trace))
         report = replace(build_diagnosis_report(diagnosis), next_command=suggest_next_command(args, diagnosis),
-                         files=[("written", str(out))] if out is not None else [])
+                         files=places.files)
         rows = apply_other_methods(args, diagnosis, progress)
         if rows:
             report = add_methods(report, rows)
-        if out is not None:
-            progress("writing", 0.0)
-            write_answer(report, out)
+        progress("writing", 0.0)
+        write_answer(report, places)
     show_answer(report, args)
     return 0 if diagnosis.is_acceptable else 1
 
@@ -88,18 +89,6 @@ def add_methods(report: Report, rows: Sequence[Row]) -> Report:
                    data={**report.data, "methods": [row._asdict() for row in rows]})
 
 
-def write_answer(report: Report, out: Path) -> None:
-    """Write the report as a page or as JSON, by the suffix of `out`."""
-    from fdi.output import write_text
-    from fdi.report.html import write_html
-    from fdi.report.json import to_json
-
-    if out.suffix == ".html":
-        write_html(report, out)
-    else:
-        write_text(out, to_json(report.data) + "\n")
-
-
 def learn_bands(args: argparse.Namespace) -> int:
     """Make bands for a command and write them; exit status 0."""
     from fdi.diagnosis.learn_bands import make_bands_file
@@ -113,7 +102,7 @@ def learn_bands(args: argparse.Namespace) -> int:
         raise InputError("--learn-bands", str(args.trace), "traces after the option, not before it")
     if not args.out or Path(args.out).suffix != ".toml":
         raise InputError("--out", str(args.out or ""), "FILE.toml, where the bands go")
-    model = options.model_of(args)
+    model = options.load_chosen_model(args)
     com, _, name = load_command(args.command_file, model["controller.period"])
     with show_progress(is_silent=args.json or args.quiet) as progress:
         made = make_bands_file(args.learn_bands, args.out, model, com, name, args.seed, progress)
@@ -128,25 +117,6 @@ def load_bands(args: argparse.Namespace) -> Bands | None:
     from fdi.diagnosis import bands_file
 
     return bands_file.load_bands(Path(args.bands))
-
-
-def choose_output(args: argparse.Namespace) -> Path | None:
-    """Path of the page or JSON file that --out asks for; checked before the work is done.
-
-    Raises:
-        InputError: no trace, a path that cannot be written, or a kind of file that this command does not write.
-    """
-    from fdi.output import writable
-    from plant import InputError
-
-    if args.trace is None:
-        raise InputError("TRACE", "", "a trace: trace.mcap, the folder of a run, or a CSV")
-    if not args.out:
-        return None
-    out = Path(args.out)
-    if out.suffix not in (".html", ".json"):
-        raise InputError("--out", str(out), "FILE.html for a page, or FILE.json")
-    return writable(out, "--out", source=Path(args.trace))
 
 
 def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
                         help="for example socketcan:vcan0 or udp_multicast (default: the value of EHA_RIG_BUS)")
     parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # the node ends when this process ends
-    options.add_model(parser)
+    options.add_model_options(parser)
 
 
 def run_command(args: argparse.Namespace) -> int:
@@ -67,7 +67,7 @@ def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
     from rig.nodes.scenario import Scenario, require_servovalve
     from rig.sequences.faults import Plan
 
-    model = options.model_of(args)
+    model = options.load_chosen_model(args)
     require_servovalve(model)
     if args.node == "plant":
         return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))

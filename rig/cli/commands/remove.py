@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("words", nargs="+", metavar="EFFECT [TRACE]", help="the effect, and the measured run to fit the rest to")
     add("--trace", metavar="TRACE", help="same as the positional TRACE")
     discovery_options.add_run_options(parser)
-    options.add_model(parser)
+    options.add_model_options(parser)
 
 
 def run_command(args: argparse.Namespace) -> int:

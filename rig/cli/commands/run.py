@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("sequence", nargs="?", metavar="SEQUENCE",
         help="test sequence: a .toml file, or the name of a shipped one (default: preflight)")
-    options.add_model(parser)
+    options.add_model_options(parser)
     parser.set_defaults(seed=None)  # None: not given; --from takes the seed of the log
     add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
         help="virtual: the embedded bus in this process (default); or socketcan:can0, udp_multicast, ...")
@@ -69,7 +69,7 @@ def run_command(args: argparse.Namespace) -> int:
 def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
     """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
     from rig.cli.progress_bar import show_progress
-    from rig.cli.terminal import console
+    from rig.cli.terminal import open_console
 
     is_announced = is_silent
     with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
@@ -78,7 +78,7 @@ def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
             if not is_announced:  # not before there is a bus and a place for the results: an error is one line
                 is_announced = True
                 text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
-                console().print(text, markup=False, soft_wrap=True)
+                open_console().print(text, markup=False, soft_wrap=True)
             update(stage, share)
 
         yield announce
@@ -137,7 +137,7 @@ def build_job(args: argparse.Namespace) -> Job:
     options.load_user_effects(args.effects)
     sequence = load_sequence(args.sequence or "preflight")
     chosen = load_model(args.model or sequence.model.name).replace(sequence.model.overrides, sequence.name)
-    model = chosen.replace(options.changes(args.set))
+    model = chosen.replace(options.parse_changes(args.set))
     if model["controller.period"] != 1e-3:
         raise InputError("--set", "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:

@@ -9,11 +9,11 @@ from rig.cli import options
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig simulate`."""
-    options.add_model(parser)
+    options.add_model_options(parser)
     parser.add_argument("--command", dest="command_file", metavar="FILE",
                         help="CSV with t,com and optionally load (default: the main phase of preflight); of rows up to "
                              "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
-    parser.add_argument("--steps", type=options.whole, default=None, metavar="N",
+    parser.add_argument("--steps", type=options.parse_whole_number, default=None, metavar="N",
                         help="steps of the plant per cycle (default 100)")
 
 
@@ -28,7 +28,7 @@ def run_command(args: argparse.Namespace) -> int:
     from plant.model import STEPS
     from rig.cli.answer import show_answer
 
-    model = options.model_of(args)
+    model = options.load_chosen_model(args)
     com, load, name = load_command(args.command_file, model["controller.period"])
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")

@@ -18,13 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("folder", nargs="?", metavar="FOLDER", help="traces of one unit, dated by their logs, names or dates.csv; "
                                                     "or the JSON file of an earlier answer")
-    options.add_model(parser)
+    options.add_model_options(parser)
     add("--axis", choices=("date", "hours", "flights"),
         help="time axis of the trend (default: the first of these that all traces have)")
     add("--dates", metavar="FILE.csv", help="table file,date[,hours][,flights] (default: dates.csv in the folder)")
     add("--again", action="store_true", help="diagnose every trace again, even if its sizes are stored")
     add("--score", action="store_true", help="instead: score the prognosis method on simulated units")
-    add("--units", type=options.whole, default=20, metavar="N",
+    add("--units", type=options.parse_whole_number, default=20, metavar="N",
         help="with --score: simulated units of each growth law (default 20)")
 
 
@@ -39,13 +39,13 @@ def run_command(args: argparse.Namespace) -> int:
     if args.folder is None:
         raise InputError("FOLDER", "", "a folder of dated traces, or --score")
     from fdi.report.trend_report import build_trend_report
-    from rig.cli.answer import show_answer
+    from rig.cli.answer import choose_file, show_answer
 
-    out = choose_output(args, (".html", ".png", ".svg", ".json"))
+    out = choose_file(args.out or None, (".html", ".png", ".svg", ".json"), args.folder)
     unit = follow_traces(args)
     report = build_trend_report(unit)
     if out is not None:
-        write_answer(unit, report, out)
+        write_file(unit, report, out)
         report = replace(report, files=[("written", str(out))])
     show_answer(report, args)
     return 0 if unit.level == 0 else 1
@@ -57,7 +57,7 @@ def follow_traces(args: argparse.Namespace) -> UnitTrend:
     from fdi.prognosis.unit_trend import follow_unit, read_points
     from rig.cli.progress_bar import show_progress
 
-    model, source = options.model_of(args), Path(args.folder)
+    model, source = options.load_chosen_model(args), Path(args.folder)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         if source.suffix == ".json" and not source.is_dir():
             return follow_unit(read_points(source))
@@ -65,50 +65,28 @@ def follow_traces(args: argparse.Namespace) -> UnitTrend:
         return follow_unit(gather_sizes(source, model, Options(args.axis, table, args.again), progress))
 
 
-def choose_output(args: argparse.Namespace, suffixes: tuple[str, ...]) -> Path | None:
-    """Path of the file that --out asks for; checked before the work is done.
-
-    Raises:
-        InputError: a path that cannot be written, or a kind of file that this command does not write.
-    """
-    from fdi.output import writable
-    from plant import InputError
-
-    if not args.out:
-        return None
-    out = Path(args.out)
-    if out.suffix not in suffixes:
-        raise InputError("--out", str(out), f"FILE with one of {', '.join(suffixes)}")
-    return writable(out, "--out", source=args.folder)
-
-
-def write_answer(unit: UnitTrend, report: Report, out: Path) -> None:
+def write_file(unit: UnitTrend, report: Report, out: Path) -> None:
     """Write the page, figure or JSON file that was asked for, by its suffix."""
-    if out.suffix == ".json":
-        from fdi.output import write_text
-        from fdi.report.json import to_json
+    from rig.cli.answer import Places, write_answer
 
-        write_text(out, to_json(report.data) + "\n")
-    elif out.suffix == ".html":
-        from fdi.report.html import write_html
-
-        write_html(report, out)
-    else:
+    if out.suffix in (".png", ".svg"):
         from fdi.report.trend_figure import save_trends
 
         save_trends(unit, out)
+    else:
+        write_answer(report, Places(out, None) if out.suffix == ".html" else Places(None, out))
 
 
 def score_method(args: argparse.Namespace) -> int:
     """Score the prognosis on simulated units; always exit status 0."""
     from fdi.output import write_text
     from fdi.report.json import to_json
-    from rig.cli.answer import show_answer
+    from rig.cli.answer import choose_file, show_answer
     from rig.cli.progress_bar import show_progress
     from rig.studies.prognosis.score_report import build_score_report
     from rig.studies.prognosis.summary import score_laws
 
-    out = choose_output(args, (".json",))
+    out = choose_file(args.out or None, (".json",), None)
     with show_progress(is_silent=args.json or args.quiet) as progress:
         report = build_score_report(score_laws(args.units, args.seed, progress))
     if out is not None:
