@@ -30,6 +30,8 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
     rows: list[list[Cell | str]] = [
         ["preflight, simulated", f"{figures['times_real_time']:.0f} x real time", "", ""],
         ["preflight on the embedded bus", f"{figures['lockstep']:.1f} x real time", "", ""],
+        ["rig run preflight, the whole process", f"{figures['run_process']:.1f} x real time", "", ""],
+        ["rig --help, the whole process", f"{figures['help_process']:.2f} s", "", ""],
         ["one cycle of Actuator from Python", f"{figures['cycle'] * 1e6:.1f} us", "", ""]]
     if step is not None:
         is_same = step["identical"]

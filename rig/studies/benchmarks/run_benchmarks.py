@@ -11,6 +11,7 @@ from rig.studies.benchmarks.grid_runs import compare_grid_runs
 from rig.studies.benchmarks.many_runs import compare_many_runs
 from rig.studies.benchmarks.plant_step import compare_step_with_c
 from rig.studies.benchmarks.single_run import measure_bus_run_speed, measure_cycle_cost, measure_simulation_speed
+from rig.studies.benchmarks.whole_process import measure_help_time, measure_run_process_speed
 
 Array = NDArray[np.float64]
 
@@ -23,5 +24,7 @@ def run_benchmarks(command: Array, progress: Progress = ignore_progress) -> dict
             "times_real_time": measure_simulation_speed(command),
             "cycle": measure_cycle_cost(),
             "lockstep": measure_bus_run_speed(),
+            "run_process": measure_run_process_speed(),
+            "help_process": measure_help_time(),
             "many": [rival._asdict() for rival in compare_many_runs(command, progress)],
             "grid": [rival._asdict() for rival in compare_grid_runs(command, progress)]}

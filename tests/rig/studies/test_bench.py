@@ -9,7 +9,15 @@ import pytest
 from physics_cases import PREFLIGHT
 
 from rig.cli import main
-from rig.studies.benchmarks import grid_runs, many_runs, plant_step, rivals, run_benchmarks, single_run
+from rig.studies.benchmarks import (
+    grid_runs,
+    many_runs,
+    plant_step,
+    rivals,
+    run_benchmarks,
+    single_run,
+    whole_process,
+)
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {rivals.GET_GCC}")
 
@@ -28,6 +36,8 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(run_benchmarks, "measure_cycle_cost", lambda: 4e-6)
     monkeypatch.setattr(run_benchmarks, "measure_bus_run_speed", lambda: 10.0)
+    monkeypatch.setattr(run_benchmarks, "measure_run_process_speed", lambda: 6.0)
+    monkeypatch.setattr(run_benchmarks, "measure_help_time", lambda: 0.1)
     assert main.main(["bench"]) == 0
     words = " ".join(capsys.readouterr().out.split())
     assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
@@ -40,6 +50,8 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     monkeypatch.setattr(run_benchmarks, "compare_step_with_c", lambda command: None)
     monkeypatch.setattr(run_benchmarks, "measure_bus_run_speed", lambda: 10.0)
+    monkeypatch.setattr(run_benchmarks, "measure_run_process_speed", lambda: 6.0)
+    monkeypatch.setattr(run_benchmarks, "measure_help_time", lambda: 0.1)
     for part in ("compare_many_runs", "compare_grid_runs"):
         rival = rivals.Rival("jax, vmap", 5e7, 7.0, 1e-12, "")
         monkeypatch.setattr(run_benchmarks, part, lambda command, progress, rival=rival: [rival])
@@ -50,6 +62,12 @@ def test_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     assert 0 < answer["cycle"] < 1e-3
     assert answer["many"] == [{"name": "jax, vmap", "speed": 5e7, "ratio": 7.0, "difference": 1e-12, "note": ""}]
     assert answer["grid"] == answer["many"]
+    assert (answer["run_process"], answer["help_process"]) == (6.0, 0.1)
+
+
+def test_whole_processes_are_timed() -> None:
+    assert whole_process.measure_help_time(rounds=1) > 0
+    assert whole_process.measure_run_process_speed(rounds=1) > 0
 
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
