@@ -15,6 +15,9 @@ from __future__ import annotations
 INTERVAL_95_SD = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
+NOISE_BAND_RATIO = 2.0
+"""Noise floors on either side of zero that a figure shades: noise alone stays within them for 95 % of the time."""
+
 RESIDUAL_IS_NOISE = 1.08
 """RMS residual over noise up to which only noise is left; what is above is physics that the model lacks.
 

@@ -49,7 +49,7 @@ JERK = 4.0  # standard deviations, that accelerations over two and four samples 
 LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
 SATURATED = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
 PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
-FEWEST = 400  # rows in which the forces are known; fewer are the ends of steps, where speed is hardest to tell
+FEWEST_FORCE_ROWS = 400  # with known forces; fewer are the ends of steps, where speed is hardest to tell
 OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
 SPARSE = 0.2  # of the rows; where more are missing, accelerations are guesses
 FLOAT32 = 1e-7  # of the current limit: a firmware may calculate in single precision
@@ -246,12 +246,13 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     floor = {name: math.hypot(value, OWN[name]) for name, value in floor.items()}
     known = {name: getattr(trace, name) if name in trace.outputs else run[name] for name in ("xs", "p12")}
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
-    if (~np.isnan(b.way)).sum() < FEWEST or not floor.get("way", 0.0) > 0.0:
+    if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
         return None
     noisy = floor_from_data(trace.measured("xj")).value > NOISY_SENSOR_RATIO * level["xj"] if "xj" in level else False
     flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
-    told = (~np.isnan(b.force)).sum() >= FEWEST and floor.get("force", 0.0) > 0.0 and trace.filled.mean() < SPARSE
+    is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < SPARSE
+    told = is_enough and floor.get("force", 0.0) > 0.0
     return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
 
 

@@ -26,7 +26,7 @@ REACH = 100  # lags, of the autocorrelation
 AFTER, BEFORE = 60, 20  # lags, of the residual after and before the input
 BINS = 15
 OWN = {("xj", "Cor"), ("p12", "P12")}  # a signal's own noise or error is in these; that they go together says nothing
-ORDER = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
+WHITENING_ORDER = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
 WILD = 5.0  # standard deviations; what is larger is an event and has no say in a colour
 WHITE = np.ones(1)  # the filter of what is white already
 SHAPES = ("proportional to", "steps with the sign of", "even in")
@@ -95,7 +95,7 @@ def fit_whitener(x: Floats) -> Floats:
     if level == 0.0:
         return WHITE
     x = np.clip(x, -WILD * level, WILD * level)
-    covariance = correlate(x, x, 0, ORDER) / len(x)
+    covariance = correlate(x, x, 0, WHITENING_ORDER) / len(x)
     covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
     weights = solve_yule_walker(covariance, by_elimination=True)
     out: Floats = np.concatenate([WHITE, -weights])

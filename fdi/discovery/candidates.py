@@ -26,7 +26,7 @@ from fdi.thresholds import (
 from plant.effects import CATALOGUE
 from plant.model import Model, meaning, offered
 
-LEAST = 1e-300
+SMALLEST_CHANCE = 1e-300
 
 
 class Value(NamedTuple):
@@ -205,7 +205,7 @@ def _printed(e: Explanation, p: Fingerprint) -> Candidate:
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
     evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
     return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
-                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), LEAST),
+                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), SMALLEST_CHANCE),
                      "explains" if p.effect in e.effects else "no")
 
 

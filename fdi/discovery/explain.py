@@ -29,10 +29,10 @@ from plant.model import Model, offered
 Floats = NDArray[np.float64]
 
 FINE = 20  # steps a cycle of the last fits
-FINEST = 50  # the same where that is not enough: a resonance of trapped oil, say
+FINEST_FIT_STEPS = 50  # the same where that is not enough: a resonance of trapped oil, say
 TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
-MOST = 3  # effects looked for one after the other
+MOST_EFFECTS = 3  # effects looked for one after the other
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
 def _levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
-    for count in range(1, MOST + 1):
+    for count in range(1, MOST_EFFECTS + 1):
         progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
         tried: list[Hypothesis] = []
         for parent in beam:
@@ -168,7 +168,7 @@ def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[F
     ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.floor(close[0] if close else base)
     if search.solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
-        search.refine(FINEST, TRUEST)
+        search.refine(FINEST_FIT_STEPS, TRUEST)
         base, close = search.settle(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]

@@ -35,8 +35,8 @@ from plant.model import Model, offered
 Floats = NDArray[np.float64]
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
-LAST, BEFORE = 8, 2  # of the last fit, and of those before it in the ledger
-STEPS = 50  # a cycle, of the last fits' residuals; their slopes make do with those of the first
+LAST_FIT_ROUNDS, EARLIER_FIT_ROUNDS = 8, 2  # of the last fit, and of those before it in the ledger
+LAST_FIT_STEPS = 50  # a cycle, of the last fits' residuals; their slopes make do with those of the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,16 +119,16 @@ def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     """All of them with the noise that the last one leaves, with the repeats and with finer steps."""
     search.learn_noise(chain[-1])
     coarse = search.problem.steps
-    search.refine(STEPS, STEPS)
+    search.refine(LAST_FIT_STEPS, LAST_FIT_STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
-    last = finish_fit(search.problem, chain[-1].fit, LAST, slopes)
+    last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes)
     if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):
         again = replace(last, x=np.where(_healthy(last.free), 0.0, last.x))
-        last = min(last, finish_fit(search.problem, again, LAST, slopes), key=lambda fit: fit.cost)
+        last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes), key=lambda fit: fit.cost)
     done = [search.judged(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
         begun = _nearer(search, h.fit, done[0].fit)
-        done.insert(0, search.judged(h.effects, finish_fit(search.problem, begun, BEFORE, slopes)))
+        done.insert(0, search.judged(h.effects, finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes)))
     return done
 
 

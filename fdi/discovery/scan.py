@@ -27,7 +27,7 @@ FINER = 16  # times the length of a run: bins of a spectrum fine enough for a fi
 AROUND = 3.0  # Hz, on either side: what a line has to stand out of
 APART = 1.0  # Hz, between lines
 LINES = 4  # tried
-THINNED = 5  # every so many samples, for the linear shift alone
+SCAN_STRIDE = 5  # every so many samples, for the linear shift alone
 
 
 # effects that other unknowns can make up for, all but a little: directions of level.FLAT by which these then go with
@@ -188,7 +188,7 @@ class Slope(NamedTuple):
     """A fit's Jacobian as `absorbed` needs it: whole, thinned, and what is known of the unknowns."""
 
     whole: Floats  # (p, s * n)
-    thin: Floats  # (p, s, n / THINNED)
+    thin: Floats  # (p, s, n / SCAN_STRIDE)
     prior: Floats  # (p,)
     low: Floats  # (p,)
     high: Floats  # (p,)
@@ -197,7 +197,7 @@ class Slope(NamedTuple):
 def prepare_slope(fit: Fit) -> Slope:
     """Prepared once for many residuals."""
     low, high = scaled_bounds(fit.free)
-    return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::THINNED]),
+    return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE]),
                  np.array([f.prior**-2 for f in fit.free]), low, high)
 
 
@@ -211,9 +211,9 @@ def absorb_shift(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Float
     move = np.array([f.name not in held for f in fit.free])
     prior = np.where(move, s.prior, 1e30)  # what is held does not move
     flat, left, x = s.thin.reshape(len(begun), -1), white, begun
-    few = white[:, ::THINNED].reshape(-1)
+    few = white[:, ::SCAN_STRIDE].reshape(-1)
     for _ in range(2):
-        heavy = (THINNED * s.thin * compute_weights(left)[:, ::THINNED]).reshape(flat.shape)
+        heavy = (SCAN_STRIDE * s.thin * compute_weights(left)[:, ::SCAN_STRIDE]).reshape(flat.shape)
         hessian = heavy @ flat.T + np.diag(prior + 1e-9)
         gradient = heavy @ few + s.prior * begun * move
         x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), s.low, s.high), begun)

@@ -21,7 +21,7 @@ from plant.lanes import Lanes
 
 Floats = NDArray[np.float64]
 
-ROUNDS = 3  # of that fit
+SEPARATION_ROUNDS = 3  # of that fit
 PAIRS = 3  # looked at of a larger set
 SECONDS = 3.0
 
@@ -117,4 +117,4 @@ def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
                                      for s in seen.outputs)
     problem: Problem = replace(search.problem, trace=seen, noise=noise, also=())
-    return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, ROUNDS).misfit
+    return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, SEPARATION_ROUNDS).misfit

@@ -16,7 +16,7 @@ from plant.effects import CATALOGUE
 
 Floats = NDArray[np.float64]
 
-THINNED = 3
+NULL_STRIDE = 3
 
 
 class Sensitivity(NamedTuple):
@@ -37,8 +37,8 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
     white = np.concatenate([problem.whitened(problem.left(problem.predict(names, part)))
                             for part in np.array_split(rows, -(-len(rows) // 64))])
-    thin = (white[1:] - white[0])[:, :, ::THINNED].reshape(len(starts), -1) * np.sqrt(THINNED)
-    own = fit.jacobian[:, :, ::THINNED].reshape(len(fit.x), -1) * np.sqrt(THINNED)
+    thin = (white[1:] - white[0])[:, :, ::NULL_STRIDE].reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
+    own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), -1) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
     left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
     gains = np.einsum("ij,ij->i", left, left)

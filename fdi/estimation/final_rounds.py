@@ -25,13 +25,13 @@ from fdi.thresholds import CONVERGED_GAIN
 
 Floats = NDArray[np.float64]
 
-ROUNDS = 8
+FINAL_FIT_ROUNDS = 8
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
-WIDTH = 3.0  # of a difference, standard deviations
-WIDEST, NARROWEST = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
+DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
+WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
-def finish_fit(problem: Problem, fit: Fit, rounds: int = ROUNDS, slopes: Problem | None = None) -> Fit:
+def finish_fit(problem: Problem, fit: Fit, rounds: int = FINAL_FIT_ROUNDS, slopes: Problem | None = None) -> Fit:
     """A fit taken to the end, with a covariance that holds at the width of its own intervals.
 
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.
@@ -70,9 +70,9 @@ def linearise_along(problem: Problem, free: Sequence[Free], x: Floats, covarianc
 
 
 def _principal(covariance: Floats) -> Floats:
-    """Principal directions (p, p), one a column, `WIDTH` standard deviations long."""
+    """Principal directions (p, p), one a column, `DIRECTION_WIDTH_SD` standard deviations long."""
     variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    wide: Floats = WIDTH * vectors * np.sqrt(np.clip(variances, NARROWEST, WIDEST))
+    wide: Floats = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, NARROWEST_VARIANCE, WIDEST_VARIANCE))
     return wide
 
 
@@ -115,7 +115,7 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
     basis = np.column_stack([np.eye(len(free))[:, places], flat])
     inverse = np.linalg.inv(basis)[:len(places)]  # of the coordinates across by all unknowns
     variances, vectors = np.linalg.eigh(inverse @ covariance @ inverse.T)
-    wide = WIDTH * vectors * np.sqrt(np.clip(variances, 1e-12, 9.0))
+    wide = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, 1e-12, 9.0))
     moves = np.zeros((len(places), len(free)))
     moves[:, places] = wide.T
     moves = np.array([cut_at_bounds(free, x, way) for way in moves])

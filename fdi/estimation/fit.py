@@ -15,9 +15,9 @@ from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 Floats = NDArray[np.float64]
 
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-WIDTH = 3.0  # of a difference, in standard deviations of a parameter: wide enough for stick-slip, narrow at the end
-NARROWEST = 0.01  # times the first width
-ROUNDS = 12
+DIFFERENCE_WIDTH_SD = 3.0  # of a parameter: differences wide enough for stick-slip, narrow at the end
+NARROWEST_SHARE = 0.01  # times the first width
+FIT_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,13 @@ class Fit:
         return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
 
 
-def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = ROUNDS) -> Fit:
+def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = FIT_ROUNDS) -> Fit:
     """The most likely parameters near `start` (p,), scaled (default: the centres)."""
     x = np.zeros(len(free)) if start is None else np.array(start, float)
     return continue_fit(problem, linearise(problem, free, x), rounds)
 
 
-def continue_fit(problem: Problem, now: Fit, rounds: int = ROUNDS) -> Fit:
+def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
         gradient, hessian = _normal(now)
@@ -112,7 +112,8 @@ def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats
 
 def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
     widest = np.array([f.step for f in free])
-    widths: Floats = np.clip(WIDTH / np.sqrt(np.maximum(np.diag(hessian), 1e-12)), NARROWEST * widest, widest)
+    wanted = DIFFERENCE_WIDTH_SD / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    widths: Floats = np.clip(wanted, NARROWEST_SHARE * widest, widest)
     return widths
 
 

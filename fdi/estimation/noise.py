@@ -40,11 +40,11 @@ LAGS = 40  # samples, of the noise's autocorrelation
 MAINS = (50.0, 60.0, 400.0)  # Hz, and what is an odd or even multiple of them below half the sampling rate
 HARMONICS = 4
 NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it would look without hum
-FEWEST = 10  # windows that a search for hum needs
+FEWEST_HUM_WINDOWS = 10  # windows that a search for hum needs
 WHITE_DIFFERENCE = 6.0  # variance of the second difference of white noise, over its own
 FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
 SWEEP = 4000  # positions
-ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
+NOISE_ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
 CONSISTENT = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
 
 
@@ -192,7 +192,7 @@ def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, f
     power = np.zeros(grid.shape)
     for r in runs:
         loud = _loudness(r)
-        if np.isfinite(loud).sum() < FEWEST or not grid.size:
+        if np.isfinite(loud).sum() < FEWEST_HUM_WINDOWS or not grid.size:
             return []
         rows = loud <= np.nanquantile(loud, 0.5)
         power += np.abs(_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
@@ -293,7 +293,7 @@ def solve_yule_walker(covariance: Floats, by_elimination: bool = False) -> Float
     return np.asarray(solve_toeplitz(covariance[:-1], covariance[1:]), np.float64)
 
 
-def fit_noise(residual: Floats, order: int = ORDER) -> Noise:
+def fit_noise(residual: Floats, order: int = NOISE_ORDER) -> Noise:
     """The autoregressive model of noise, (n,), that its length supports (Yule-Walker; Akaike's choice of order)."""
     x = residual[~np.isnan(residual)]
     sigma = measure_level(x)

@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Columns = dict[str, Floats]  # by signal, (n,)
 
-STEPS, FINEST = 50, 800  # a cycle
+REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
 SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
 
@@ -44,7 +44,7 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
 
 
-def replay_current(trace: Trace, model: Model, steps: int = STEPS, anchor: float = ANCHOR_RATE) -> Columns:
+def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
     out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if has_known_start(trace) else None, anchor)
@@ -65,7 +65,7 @@ def has_known_start(trace: Trace) -> bool:
 def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     values = vary_frictions(model)
-    lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), STEPS)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), REPLAY_STEPS)
     position = trace.xj if has_known_start(trace) else None
     runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR_RATE)
     others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR_RATE) for cor in guess_current(trace)]
@@ -76,14 +76,14 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
             moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
             large = _windows_above(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
             undecided |= large & ~np.isnan(trace.measured(name))
-    coarse, steps = runs[0], STEPS
+    coarse, steps = runs[0], REPLAY_STEPS
     while True:
         finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
         fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR_RATE)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
         small = all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error)
         coarse, steps = fine, 2 * steps
-        if small or steps >= FINEST:
+        if small or steps >= FINEST_REPLAY_STEPS:
             break
     found = {name: coarse[:, i] for i, name in enumerate(OUTPUTS)}
     guessed = runs[len(values):] - runs[:1]
@@ -138,7 +138,7 @@ def _windows_above(moved: Floats, floor: float) -> Flags:
     return out
 
 
-def measure_drift(trace: Trace, model: Model, steps: int = STEPS) -> tuple[float, float]:
+def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
     free = trace.measured("xj") - replay_current(trace, model, steps, 0.0)["xj"]
     there = ~np.isnan(free)
@@ -146,7 +146,7 @@ def measure_drift(trace: Trace, model: Model, steps: int = STEPS) -> tuple[float
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
 
 
-def replay_command(trace: Trace, model: Model, steps: int = STEPS) -> Columns:
+def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
     before = round(SETTLED / trace.period)
     com = np.concatenate([np.full(before, trace.com[0]), trace.com])

@@ -22,8 +22,8 @@ from plant.model import Model
 
 Floats = NDArray[np.float64]
 
-STEPS = 20  # a cycle; only sizes matter here
-ROUNDS = 2
+SCATTER_STEPS = 20  # a cycle; only sizes matter here
+SCATTER_ROUNDS = 2
 STEP = 0.3  # tolerances, of the differences that the Jacobian is made of
 ALIKE = 20  # neighbouring samples that say the same thing
 
@@ -42,7 +42,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     known = tolerance_sizes(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
-    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), STEPS)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), SCATTER_STEPS)
     measured = np.array([trace.measured(name) for name in trace.outputs])
     columns = [OUTPUTS.index(name) for name in trace.outputs]
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
@@ -57,7 +57,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
 
     x = np.zeros(len(base))
     now = residual(x[None])[0]
-    for _ in range(ROUNDS):
+    for _ in range(SCATTER_ROUNDS):
         slope = (residual(x + STEP * np.eye(len(base))) - now) / STEP
         weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))

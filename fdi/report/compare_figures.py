@@ -11,6 +11,7 @@ from fdi.comparison.compare import Comparison
 from fdi.comparison.residual_tests import Depends, ResidualTests
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, RED, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES, format_ratio
+from fdi.thresholds import NOISE_BAND_RATIO
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +22,6 @@ COLOURS = {"xj": "#1f6feb", "p12": "#0f8b8d", "xs": "#bf3989"}
 MODEL, NOISE = "#d9730d", "#2b8a3e"
 QUANTITIES = {"speed": ("speed [mm/s]", 1e3), "position": ("position [mm]", 1e3), "P12": ("P12 [bar]", 1e-5),
               "acceleration": ("acceleration [m/s2]", 1.0)}
-BAND = 2.0  # noise floors: noise stays within for 95 % of the time
 
 
 def draw_overview(c: Comparison) -> str:
@@ -57,7 +57,7 @@ def _draw_replay(ax: Axes, c: Comparison, name: str) -> None:
 
 def _draw_residual(ax: Axes, c: Comparison, name: str) -> None:
     label, (unit, scale) = SIGNAL_NAMES[name], DRAWN_UNITS[name]
-    floor = BAND * c.signals[name].floor.value * scale
+    floor = NOISE_BAND_RATIO * c.signals[name].floor.value * scale
     ax.axhspan(-floor, floor, color=NOISE, alpha=0.25, lw=0)
     ax.plot(*thin_line(c.trace.t, c.replay.residual[name] * scale), color=INK, lw=0.7)
     ax.set_ylabel(f"residual of\n{label} [{unit}]")
@@ -139,7 +139,7 @@ def draw_dependence(c: Comparison) -> str:
         rows = figure.subplots(len(names), len(kinds), squeeze=False)
         for name, axes in zip(names, rows, strict=True):
             by = {d.on: d for d in c.diagnoses[name].depends}
-            _draw_means(axes, kinds, by, name, BAND * c.signals[name].floor.value)
+            _draw_means(axes, kinds, by, name, NOISE_BAND_RATIO * c.signals[name].floor.value)
         return to_svg(figure, "dependence")
 
 

@@ -12,6 +12,7 @@ from fdi.discovery.model_file import Row
 from fdi.discovery.search import Hypothesis
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES
+from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ Floats = NDArray[np.float64]
 AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar"), "spool": (1e6, "um"),
         "current": (1e3, "mA"), "time": (1.0, "s")}
 BEFORE, AFTER, HELD, FLOOR = "#c9ced6", "#1f6feb", "#d9730d", "#2b8a3e"
-BAND = 2.0  # noise floors: noise stays within for 95 % of the time
 
 
 def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor: Mapping[str, float],
@@ -43,7 +43,7 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
                 line = thin_line(t, after.fit.residuals[i, :n] * scale)
                 ax.plot(*line, color=AFTER, lw=0.9, label=name_of_after)
             for side in (-1, 1):
-                ax.axhline(side * BAND * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
+                ax.axhline(side * NOISE_BAND_RATIO * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
                            label="two noise floors" if side > 0 else None)
             ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
         axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)

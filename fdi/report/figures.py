@@ -17,7 +17,7 @@ from fdi.trace.trace import Trace
 Floats = NDArray[np.float64]
 FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
-SHORTEST = 0.1  # us, the left end of a histogram; no clock here tells less
+SHORTEST_TIME = 0.1  # us, the left end of a histogram; no clock here tells less
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
           ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
           ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
@@ -94,7 +94,7 @@ def timing(trace: Trace) -> str:
     columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
                ("controller's response", trace.timing.response, "#d9730d"),
                ("bench's own work", trace.timing.work, "#57606a"))
-    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, SHORTEST), colour)
+    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, SHORTEST_TIME), colour)
              for name, values, colour in columns if (values > 0).any()]
     if not drawn:
         return ""
