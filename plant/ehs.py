@@ -10,15 +10,17 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from plant.effects import base
-from plant.parameters import GROUPS, in_unit
+from plant.effects.sensors import Quantisation
+from plant.effects.valve import Compressibility
+from plant.parameters import GROUPS, in_unit, read_shipped_model
 from plant.plants import Array, Plant, Table, Term
 from plant.ports import at_current, at_position, at_valve
 from plant.quantity import Quantity
 from plant.state import Input, Line, Ports, State
 from plant.step import jack
 
-AREA, ROD = 1.963e-3, 0.686  # m2, piston of 50 mm; the other side over it: the usual rod of 28 mm
-SEALED = 1e-16  # m3/s/Pa, no leak to speak of: so pressure has an answer even where no oil gives way
+ROD_SIDE = 0.686  # area of the rod side over that of the piston side; a 50 mm piston usually has a 28 mm rod
+SEAL_LEAKAGE = 1e-16  # m3/s/Pa, negligible; it keeps the pressure finite in a model without leakage
 
 
 class Pump(NamedTuple):
@@ -34,7 +36,7 @@ Coefficients = namedtuple("Coefficients", "gain valve_slope jack_damping jack_fr
 
 def coefficients(p: Any, h: float) -> Any:
     """D w = AJ XJ' + CLK P12, solved for P12."""
-    slope, mass = p.jack.area / (p.jack.leakage + SEALED), p.jack.mass + h * p.jack.damping
+    slope, mass = p.jack.area / (p.jack.leakage + SEAL_LEAKAGE), p.jack.mass + h * p.jack.damping
     return Coefficients(p.pump.displacement / p.jack.area * slope, slope, p.jack.damping, 1.0 / mass,
                         1.0 / (mass + h * p.jack.area * slope))
 
@@ -55,26 +57,47 @@ def step(s: State, u: Input, p: Any, k: Any) -> State:
         m_drag, m_position, m.reading))
 
 
-def tare(c: Mapping[str, Array]) -> Array:
-    """The load of a run, N: in the sum of the pressures where the demand rises and where it falls friction cancels."""
-    rate, p = np.diff(c["com"], prepend=c["com"][0]), c["p12"]
-    return np.full_like(p, AREA * (np.nanmedian(p[rate > 0.0]) + np.nanmedian(p[rate < 0.0])))
+def estimate_load(columns: Mapping[str, Array]) -> Array:
+    """The constant load of a run, N, (n,): the mean of the pressure forces of both directions, where friction cancels.
+
+    `columns` holds com, m, and p12, Pa, each (n,).
+    """
+    rate, p12 = np.diff(columns["com"], prepend=columns["com"][0]), columns["p12"]
+    return np.full_like(p12, NOMINAL["jack.area"] * (np.nanmedian(p12[rate > 0.0]) + np.nanmedian(p12[rate < 0.0])))
 
 
 base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs", law="AJ times the ratio, backwards",
      symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
 
+PARAMETER_GROUPS: dict[str, type[Any]] = {
+    "controller": in_unit(GROUPS["controller"], "A", "raw", 1e6),
+    "pump": Pump,
+    "supply": GROUPS["supply"],
+    "jack": GROUPS["jack"],
+    "sensors": GROUPS["sensors"],
+}
+EFFECT_GROUPS = {"quantisation": Quantisation, "compressibility": Compressibility}  # the model file has values for them
+NOMINAL = read_shipped_model("ehs.toml", {**PARAMETER_GROUPS, **EFFECT_GROUPS})
+
+# The pressures in the file are means of the last 20 and 60 rows: `Term.later` shifts them back by half of that.
+COLUMNS = {
+    "t": (Term("EXP_Time"),),
+    "com": (Term("EXP_PosRef", 1e-3),),
+    "xj": (Term("EXP_PosFb", 1e-3),),
+    "cor": (Term("EXP_Velocity"),),
+    "p12": (Term("EXP_Pressure_A", 1e5, 10), Term("EXP_Pressure_B", -ROD_SIDE * 1e5, 30)),
+}
+
 PLANT = Plant(
-    "ehs", "raw", step, coefficients,
-    {"controller": in_unit(GROUPS["controller"], "A", "raw", 1e6), "pump": Pump, **{
-        name: GROUPS[name] for name in ("supply", "jack", "sensors")}},
-    {"controller.proportional_gain": 4e5, "controller.current_limit": 3e3, "controller.period": 1e-3,
-     "pump.displacement": 2.3e-8, "pump.area_ratio": 1.0, "pump.drain": 0.2, "supply.pressure": 1e7,
-     "jack.area": AREA, "jack.mass": 20.0, "jack.travel": 0.1, "sensors.position_noise": 1e-6,
-     "sensors.pressure_noise": 1e5, "sensors.spool_noise": 1e-6, "quantisation.lsb": 2.5e-5,
-     "compressibility.volume": 6e-3},  # m3, of oil between pump and ram, with its hoses
-    has=("quantisation",), lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
-    controller=False, scatter={"pump.displacement": 0.1}, table=Table(skip=60, separator=";", load=tare, columns={
-        "t": (Term("EXP_Time"),), "com": (Term("EXP_PosRef", 1e-3),), "xj": (Term("EXP_PosFb", 1e-3),),
-        "cor": (Term("EXP_Velocity"),),  # the pressures are means of 20 and 60 rows, here put back by half of that
-        "p12": (Term("EXP_Pressure_A", 1e5, 10), Term("EXP_Pressure_B", -ROD * 1e5, 30))}))
+    name="ehs",
+    unit="raw",
+    step=step,
+    coefficients=coefficients,
+    groups=PARAMETER_GROUPS,
+    given=NOMINAL,
+    has=("quantisation",),
+    lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
+    controller=False,
+    scatter={"pump.displacement": 0.1},
+    table=Table(skip=60, separator=";", load=estimate_load, columns=COLUMNS),
+)

@@ -1,8 +1,8 @@
 """What the actuator is made of: one NamedTuple a component, every field with unit, symbol and range.
 
-The numbers themselves are data (nominal.toml); this file says what they mean and refuses what cannot be. The ranges are
-generous, some three orders of magnitude either way: what is outside can only be a slip (of units, of an exponent), and
-inside the plant has a number for everything.
+The values are data (`plant/models/nominal.toml`); this file gives their meaning and rejects impossible values. The
+ranges are wide, about three orders of magnitude either way: a value outside is a mistake (a unit, an exponent), and for
+every value inside the simulation stays finite.
 """
 from __future__ import annotations
 
@@ -220,8 +220,17 @@ def nominal() -> dict[str, float]:
 
 @cache
 def _nominal() -> Mapping[str, float]:
-    source = files("plant") / "nominal.toml"
-    return flatten("nominal.toml", tomllib.loads(source.read_text(encoding="utf-8")), GROUPS)
+    return read_shipped_model("nominal.toml", GROUPS)
+
+
+def read_shipped_model(file: str, groups: Mapping[str, type[Any]]) -> dict[str, float]:
+    """The values in `plant/models/<file>`, "group.field" to SI value; `groups` are the parameter groups it may have.
+
+    Raises:
+        InputError: an unknown group or field, or a value out of range.
+    """
+    source = files("plant").joinpath("models", file)
+    return flatten(f"plant/models/{file}", tomllib.loads(source.read_text(encoding="utf-8")), groups)
 
 
 def sensible(where: object, values: Mapping[str, float]) -> None:

@@ -349,6 +349,9 @@ def test_every_package_and_data_file_is_installed() -> None:
     assert sorted(tools["packages"]) == sorted(name(folder).replace("/", ".") for folder in folders)
     for folder in folders:
         patterns = tools["package-data"].get(name(folder).replace("/", "."), [])
-        for path in folder.iterdir():
-            if path.is_file() and path.suffix not in {".py", ".pyc"}:
-                assert any(fnmatch.fnmatch(path.name, pattern) for pattern in patterns), f"{name(path)}: not installed"
+        for path in folder.rglob("*"):
+            is_data = path.is_file() and path.suffix not in {".py", ".pyc"}
+            package = next(parent for parent in path.parents if parent in folders)  # of plant/models: plant
+            if is_data and package == folder:
+                below = path.relative_to(folder).as_posix()
+                assert any(fnmatch.fnmatch(below, pattern) for pattern in patterns), f"{name(path)}: not installed"

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
 
-STATIC_OVER_DYNAMIC = 1.5  # FSS over FDS of the nominal spool (plant/nominal.toml)
+STATIC_OVER_DYNAMIC = 1.5  # FSS over FDS of the nominal spool (plant/models/nominal.toml)
 
 
 class Level(IntEnum):

@@ -118,10 +118,21 @@ def test_the_nominal_file_is_complete_and_is_that_of_the_issue() -> None:
     given_ = SHARED / "nominal.toml"
     if not given_.exists():
         pytest.skip("no ../shared to compare with")
-    ours = (Path(plant.__file__).parent / "nominal.toml").read_text()
+    ours = (Path(plant.__file__).parent / "models" / "nominal.toml").read_text()
     ours_ = tomllib.loads(ours)
     assert ours_["filter"].pop("law") == "sqrt"  # the one that is ours alone
     assert ours_ == tomllib.loads(given_.read_text())
+
+
+def test_the_shipped_servo_file_is_read_as_it_stands() -> None:
+    """Every number of the file is the model's; what the file does not list is zero."""
+    tables = tomllib.loads((Path(plant.__file__).parent / "models" / "ehs.toml").read_text())
+    listed = {f"{group}.{field}": value for group, fields in tables.items() for field, value in fields.items()}
+    assert len(listed) == 15
+    model = load_model("ehs")
+    assert {name: value for name, value in model.values.items() if value} == {
+        name: value for name, value in listed.items() if name in model.values}
+    assert model.having(["compressibility"])["compressibility.volume"] == listed["compressibility.volume"] == 6e-3
 
 
 def test_naming_an_effects_parameter_gives_the_model_that_effect() -> None:

@@ -186,7 +186,7 @@ def test_eds_is_well_formed(node: int) -> None:
 
 
 def test_gains_in_the_dictionary_are_the_nominal_ones() -> None:
-    nominal = tomllib.loads((files("plant") / "nominal.toml").read_text())["controller"]
+    nominal = tomllib.loads(files("plant").joinpath("models", "nominal.toml").read_text())["controller"]
     od = canopen.import_od(str(EDS[2]), 2)
     names = ("proportional_gain", "integral_gain", "derivative_gain", "current_limit", "period")
     assert [od[0x2110][sub].default for sub in range(1, 6)] == [nominal[name] for name in names]
