@@ -1,4 +1,4 @@
-"""Plain Python physics made fast: the only file that knows numba.
+"""Plain Python physics made fast: the only file that imports numba (machine_code.py stores what it compiled).
 
 The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls,
 puts the model's effects in place of the port functions, and compiles the lot as one, inlined: a call that passes the

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from plant import flat, plants, solve
 from plant import step as step_module
-from plant.compile import Function, compiled, interpreted
+from plant.compile import Function, cache_folder, compiled, fingerprint, interpreted
 from plant.effects import CATALOGUE, Effect, at
 from plant.errors import InputError
+from plant.machine_code import StoredCode
 from plant.parameters import accept, flatten, read_toml, resolve, sensible
 from plant.plants import Plant
 from plant.quantity import Quantity
@@ -203,6 +204,17 @@ def kernel(name: str, effects: tuple[str, ...], fast: bool = True, plant: str = 
 @cache
 def _kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str) -> Function:
     return (compiled if fast else interpreted)(getattr(solve, name), bindings(effects, plant))
+
+
+def stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
+    """The compiled `plant.solve.advance` for a plant with `effects`, from disk if it was stored there."""
+    return _stored_advance(effects, tuple(CATALOGUE[e].function for e in effects), plant)
+
+
+@cache
+def _stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> StoredCode:
+    source = fingerprint(interpreted(solve.advance, bindings(effects, plant)))
+    return StoredCode(cache_folder() / source, lambda: _kernel("advance", effects, laws, True, plant))
 
 
 def bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import packers, values
-from plant.model import STEPS, Model, initial, kernel
+from plant.machine_code import Advance
+from plant.model import STEPS, Model, initial, kernel, stored_advance
 from plant.solve import NOISES
 from plant.state import State
 
@@ -142,7 +143,8 @@ class Actuator:
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
         self._draws = draws(seed)
         self._noise = [0.0] * NOISES
-        self._advance = kernel("advance", model.effects, fast, model.plant)
+        self._code = stored_advance(model.effects, model.plant) if fast else None
+        self._advance = self._bind_advance()
         # a reading that nothing changes is faster without a call of compiled code
         changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
         self._read = kernel("read", model.effects, fast) if changed else None
@@ -160,7 +162,8 @@ class Actuator:
             InputError: an effect's law that cannot be compiled.
         """
         with laws(self.model):
-            self._advance(self._flat, 0.0, 0.0, 0.0, 0.0, self._record, 0)
+            if self._code is not None:
+                self._code.warm(self._flat, self._record)
             if self._read:
                 self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)
 
@@ -178,8 +181,14 @@ class Actuator:
     def advance(self, current: float, load: float = 0.0) -> None:
         """One cycle with `current` A in the torque motor and `load` N on the ram."""
         t = self.cycle * self._period
-        self._advance(self._flat, current, load, self._noise[3], t, self._record, self.steps)
+        self._advance(current, load, self._noise[3], t)
         self.cycle += 1
+
+    def _bind_advance(self) -> Advance:
+        if self._code is not None:
+            return self._code.bind(self._flat, self._record, self.steps)
+        run = kernel("advance", self.model.effects, fast=False, plant=self.model.plant)
+        return lambda current, load, noise, t: run(self._flat, current, load, noise, t, self._record, self.steps)
 
     def set(self, name: str, value: float) -> None:
         """Change the parameter "group.field" of the running plant; its effect must be in the model.

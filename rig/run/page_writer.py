@@ -5,6 +5,7 @@ real time it would compete with the loop, and on one CPU there is nothing to gai
 """
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -16,7 +17,7 @@ from plant.errors import InputError
 
 
 class PageWriter:
-    """A context in which `write_page` can be called once; whatever happens, no process is left behind."""
+    """A context for one page, `start_page` and `finish_page`; whatever happens, no process is left behind."""
 
     def __init__(self, *, in_background: bool) -> None:
         self._in_background = in_background and len(os.sched_getaffinity(0)) > 1
@@ -34,8 +35,16 @@ class PageWriter:
             self._process.kill()
             self._process.communicate()
 
-    def write_page(self, source: Path, out: Path) -> None:
-        """Write the page of the trace `source` as the HTML file `out`.
+    def start_page(self, source: Path, out: Path) -> None:
+        """Start to write the page of the trace `source` as the HTML file `out`; `finish_page` waits for it."""
+        self._source, self._out = source, out
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):  # it died: its status is reported by `finish_page`
+                self._process.stdin.write(json.dumps([str(source), str(out)]) + "\n")
+                self._process.stdin.flush()
+
+    def finish_page(self) -> None:
+        """Wait until the page is written.
 
         Raises:
             InputError: a trace that cannot be read, or a file that cannot be written.
@@ -44,11 +53,11 @@ class PageWriter:
         if self._process is None:
             from fdi.report.run_report import write_run_page
 
-            write_run_page(source, out)
+            write_run_page(self._source, self._out)
             return
-        answer, _ = self._process.communicate(json.dumps([str(source), str(out)]) + "\n")
+        answer, _ = self._process.communicate()
         if self._process.returncode != 0:
-            raise RuntimeError(f"the process that writes {out} ended with status {self._process.returncode}")
+            raise RuntimeError(f"the process that writes {self._out} ended with status {self._process.returncode}")
         if answer:
             raise InputError(*json.loads(answer))
 

@@ -56,8 +56,9 @@ def run_command(args: argparse.Namespace) -> int:
           announce_run(job, why, is_silent=args.json or args.quiet) as progress):
         outcome = run_job(job, folder, progress, is_to_stop)
         progress("report", 0.0)
-        pages.write_page(folder / "trace.mcap", folder / "report.html")
-        report = build_run_report(Trace.read(folder / "trace.mcap", all=True))
+        pages.start_page(folder / "trace.mcap", folder / "report.html")
+        report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
+        pages.finish_page()
         if args.fdi:
             outcome = diagnose_run(outcome, progress)
     with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
