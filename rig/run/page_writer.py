@@ -1,7 +1,8 @@
 """Writes the page of a run in a process of its own, which loads matplotlib while the run is under way.
 
 Loading takes as long as drawing. In lockstep the second process uses the time and a CPU that the run leaves idle; in
-real time it would compete with the loop, and on one CPU there is nothing to gain: then the page is written here.
+real time it would compete with the loop, and on one CPU there is nothing to gain: then the page is written here. It is
+written here as well if the second process cannot start or ends early: a run that was measured never lacks its page.
 """
 from __future__ import annotations
 
@@ -24,9 +25,8 @@ class PageWriter:
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> PageWriter:
-        if self._in_background:  # in a session of its own: Ctrl-C is for the run, which has clean-up to do
-            self._process = subprocess.Popen([sys.executable, "-m", __name__], stdin=subprocess.PIPE,
-                                             stdout=subprocess.PIPE, text=True, start_new_session=True)
+        if self._in_background:
+            self._process = _start_process()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
@@ -39,7 +39,7 @@ class PageWriter:
         """Start to write the page of the trace `source` as the HTML file `out`; `finish_page` waits for it."""
         self._source, self._out = source, out
         if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):  # it died: its status is reported by `finish_page`
+            with contextlib.suppress(BrokenPipeError):  # it died: `finish_page` writes the page
                 self._process.stdin.write(json.dumps([str(source), str(out)]) + "\n")
                 self._process.stdin.flush()
 
@@ -48,18 +48,30 @@ class PageWriter:
 
         Raises:
             InputError: a trace that cannot be read, or a file that cannot be written.
-            RuntimeError: the second process failed; its traceback is on standard error.
         """
-        if self._process is None:
-            from fdi.report.run_report import write_run_page
+        if self._process is not None:
+            answer, _ = self._process.communicate()
+            if answer:
+                raise InputError(*json.loads(answer))
+            if self._process.returncode == 0:
+                return
+        from fdi.report.run_report import write_run_page
 
-            write_run_page(self._source, self._out)
-            return
-        answer, _ = self._process.communicate()
-        if self._process.returncode != 0:
-            raise RuntimeError(f"the process that writes {self._out} ended with status {self._process.returncode}")
-        if answer:
-            raise InputError(*json.loads(answer))
+        write_run_page(self._source, self._out)
+
+
+def _start_process() -> subprocess.Popen[str] | None:
+    """Start `main` in a process of its own; None where the system refuses one.
+
+    It imports from the same folders as this process (-P: not from the working directory, where a file of the user's may
+    have a module's name). In a session of its own: Ctrl-C is for the run, which has clean-up to do.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    try:
+        return subprocess.Popen([sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                stderr=subprocess.DEVNULL, text=True, start_new_session=True, env=environment)
+    except OSError:
+        return None
 
 
 def main() -> None:
