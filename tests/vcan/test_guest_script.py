@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from vcan_host import FOLDER, GUEST, skip_or_fail
+from vcan_host import FOLDER, GUEST, kernel_has_vcan0, skip_or_fail
 
 PANIC = "ptrace set fp regs failed, errno = 14"
 
@@ -70,9 +70,11 @@ def check(home: Path, **settings: str | Path) -> tuple[int, str]:
 
 
 def need_guest() -> None:
-    """Skip without the packages of the guest."""
+    """Skip without the packages of the guest; CI does not install them where the kernel itself has vcan0."""
     path = os.environ["PATH"] + ":/usr/sbin:/sbin"
     if shutil.which("linux.uml") is None or shutil.which("insmod", path=path) is None:
+        if kernel_has_vcan0():
+            pytest.skip("the guest's packages are missing, and this kernel has vcan0")
         skip_or_fail("the guest's packages are missing")
 
 
