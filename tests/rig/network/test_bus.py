@@ -94,7 +94,7 @@ class TestEveryBus:
             heard = self.turn(master, nodes, places, 2)
             assert {frame.cob_id for frame in heard} == {0x702, 0x703}
             master.send(0x000, b"\1\0")
-            self.wait_for_answers(nodes, places)
+            self.settle(nodes, places)
             assert {node.state for node in nodes.values()} == {NmtState.OPERATIONAL}
             for k in range(50):
                 master.send(0x202, codec.pack_command(1e-3, 7, k))
@@ -135,7 +135,7 @@ class TestEveryBus:
         heard: list[Frame] = []
         end = time.monotonic() + 5
         while time.monotonic() < end and len(heard) < number:
-            TestEveryBus.wait_for_answers(nodes, places, 1)
+            TestEveryBus.settle(nodes, places, 1)
             heard += [frame for frame in master.poll(0.0005) if frame.data != bytes((NmtState.OPERATIONAL,))]
         return heard
 
