@@ -64,6 +64,11 @@ class HeartbeatConsumer:
         self._deadlines[node] = frame.t_ns + self._limits[node]
 
     def tick(self, t_ns: int) -> None:
+        for deadline in self._deadlines.values():
+            if t_ns > deadline:
+                break
+        else:
+            return  # nearly every tick: no list is made
         for node, deadline in list(self._deadlines.items()):
             if t_ns > deadline:
                 del self._deadlines[node]

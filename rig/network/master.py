@@ -119,8 +119,8 @@ class Master:
 
     def receive(self, frame: Frame) -> None:
         """A frame came in."""
-        if not self._stamped:
-            frame = Frame(self._now(), frame.cob_id, frame.data)
+        if not self._stamped and frame.t_ns != (now := self._now()):
+            frame = Frame(now, frame.cob_id, frame.data)
         self.on_frame(frame)
         cyclic = self.on_cyclic.get(frame.cob_id)
         if cyclic is not None:

@@ -25,6 +25,7 @@ SCENARIO, COUNTERS = 0x2210, 0x2211
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 _NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
 _HEARTBEAT = 0x700 + NODE
+_NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 
 class Emulator:
@@ -127,7 +128,7 @@ class Emulator:
     def _on_sync(self) -> None:
         """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""
         k, od = self._cycle, self._od
-        flags = Flags(0) if self._first else self._judge(k)
+        flags = _NO_FLAGS if self._first else self._judge(k)
         self._first = False
         for name, value in self._faults.parameters_at(k, self._changed).items():
             self._plant.set(name, value)
@@ -156,7 +157,7 @@ class Emulator:
             if self._missed >= MISSED_LIMIT:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
-            return Flags(0)
+            return _NO_FLAGS
         self._missed += 1
         self._count("late" if fresh else "missing")
         flags = Flags.DRIVE_LATE if fresh else Flags.DRIVE_MISSING

@@ -157,9 +157,9 @@ class Session:
         if self._stop() and not self.aborted:
             self.interrupted = True
             self._abort("operator", "stopped by the operator")
-        if row is not None:
-            measured = {name: getattr(row, name) for name in ("com", "xj", "cor", "p12", "xs", "load")}
-            passed = self._watch.find_passed({**measured, "error": row.com - row.xj})
+        if row is not None and self._watch:
+            passed = self._watch.find_passed({"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12,
+                                              "xs": row.xs, "load": row.load, "error": row.com - row.xj})
             if passed:
                 self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
         return bool(self.aborted)

@@ -259,6 +259,8 @@ class Schedule:
 
     def parameters_at(self, cycle: int, since: int | None = None) -> dict[str, float]:
         """The parameters, SI, that differ from what they were in cycle `since` (default: the cycle before)."""
+        if not self._parameters:
+            return {}
         before = cycle - 1 if since is None else since
         return {name: value for name in self._parameters
                 if (value := self._parameter(name, cycle)) != self._parameter(name, before)}

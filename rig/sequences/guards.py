@@ -42,6 +42,9 @@ class GuardWatch:
         self._watched = [(guard, *guard.limits()) for guard in guards]
         self._outside = [0] * len(self._watched)
 
+    def __bool__(self) -> bool:
+        return bool(self._watched)
+
     def find_passed(self, values: Mapping[str, float]) -> Guard | None:
         """The first guard whose limit this cycle's `values` (SI, by signal) exceed for its number of cycles.
 

@@ -2,7 +2,10 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,14 @@ import pytest
 from plant.errors import InputError
 from rig.run import page_writer
 from rig.run.page_writer import PageWriter
+
+OWNER = """
+import sys, time
+from rig.run.page_writer import PageWriter
+with PageWriter(in_background=True) as pages:
+    print(pages._process.pid, flush=True)
+    time.sleep(60)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -20,6 +31,14 @@ def two_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def is_page(file: Path) -> bool:
     return file.read_text().startswith("<!DOCTYPE html>") and "</html>" in file.read_text()
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_both_ways_write_the_same_page(preflight: Path, tmp_path: Path) -> None:
@@ -88,3 +107,17 @@ def test_without_a_page_no_process_is_left() -> None:
         process = pages._process
         assert process is not None and process.poll() is None
     assert process.returncode is not None
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_process_is_left_when_the_run_is_killed(number: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", OWNER], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                          text=True) as owner:
+        assert owner.stdout is not None
+        pid = int(owner.stdout.readline())
+        owner.send_signal(number)
+        owner.wait()
+    end = time.monotonic() + 60
+    while is_running(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not is_running(pid)
