@@ -73,15 +73,15 @@ def main() -> None:
         stiff = {f"FSS {f:g} N": run_preflight(folder, fss=f) for f in (35.0, 70.0)}
         cases = {number: run_preflight(folder, *faults) for number, faults in CASES.items()}
         again = run_preflight(folder, seed=2)
-    save("7", figures.steps({"healthy": healthy} | clogged))
-    save("8", figures.ramps({"healthy": healthy} | stiff))
+    save("7", figures.draw_steps({"healthy": healthy} | clogged))
+    save("8", figures.draw_ramps({"healthy": healthy} | stiff))
     case = cases["14"]
     bands = choose_bands(case.com, case.load, case.period, None, lambda *_: None)
     found, friction, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
     for number, kind, signal in (("10", "step", "position"), ("11", "ramp", "position"), ("12", "ramp", "speed")):
-        save(number, figures.banded(found, friction, bands, case, kind, signal))
+        save(number, figures.draw_bands(found, friction, bands, case, kind, signal))
     for number, trace in cases.items():
-        save(number, figures.maps(search_grid(trace), CASES[number]))
+        save(number, figures.draw_maps(search_grid(trace), CASES[number]))
         for drive in ("current", "command"):
             print(format_minima(f"{CASES[number][0]:g}, {CASES[number][1]:g} N", drive, trace))
     for drive in ("current", "command"):

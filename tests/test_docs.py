@@ -151,7 +151,8 @@ def test_the_commands_shown_are_accepted(page: str, line: str) -> None:
 
 def values(args: argparse.Namespace, *names: str) -> list[str]:
     found = [getattr(args, name, None) for name in names]
-    return [str(word) for value in found for word in (value if isinstance(value, list) else [value] if value else [])]
+    words = [word for value in found if value for word in (value if isinstance(value, list) else [value])]
+    return [str(word) for word in words]
 
 
 def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:

@@ -1,7 +1,8 @@
-"""The drawings of a diagnosis, as SVG text that stands inside an HTML page."""
+"""The figures of a diagnosis, as SVG text for an HTML page."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -36,42 +37,44 @@ AMBER, BLUE, SPEED = "#d9730d", "#1f6feb", "#0f8b8d"
 SHADES = {"middle": AMBER, "most": RED}
 UM, MM, MS = 1e6, 1e3, 1e3
 ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
+FIT_MARKER: dict[str, Any] = {"marker": "o", "ms": 6}
+GRID_MARKER: dict[str, Any] = {"marker": "D", "ms": 4}
 
 
-def overview(trace: Trace, judged: BandVerdict) -> str:
-    """Command and position of the whole trace, the stays outside the bands shaded."""
+def draw_overview(trace: Trace, judged: BandVerdict) -> str:
+    """Command and position of the whole trace, times outside the bands shaded."""
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 2.4), layout="constrained")
         ax = figure.subplots()
         ax.plot(*thin_line(trace.t, trace.com * MM), color=COMMAND, lw=2.2, label="Com, command")
         ax.plot(*thin_line(trace.t, trace.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
         ax.set_xlim(float(trace.t[0]), float(trace.t[-1]) + trace.period)
-        _shade(ax, judged.events, 1.0, 0.0)
+        _shade_events(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
         ax.set_xlabel("time [s]")
         ax.legend(loc="upper right", ncols=2, frameon=False)
         return to_svg(figure, "overview")
 
 
-def steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
+def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
     """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
     if not bands.steps:
         return ""
-    place = _places(trace, bands)
+    place = _find_sections(trace, bands)
     with rc_context(STYLE):
         across = min(2, len(bands.steps))
         down = -(-len(bands.steps) // across)
         figure = Figure(figsize=(11, 2.5 * down), layout="constrained")
         axes = figure.subplots(down, across, squeeze=False).ravel()
         for ax, step in zip(axes, bands.steps, strict=False):
-            _step(ax, trace, bands, step, place[step.section], judged)
+            _draw_step(ax, trace, bands, step, place[step.section], judged)
         for ax in axes[len(bands.steps):]:
             ax.set_axis_off()
         axes[0].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
         return to_svg(figure, "steps")
 
 
-def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: BandVerdict) -> None:
+def _draw_step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: BandVerdict) -> None:
     xj, t = trace.measured("xj"), step.t * MS
     centre, spread = step.centre(judged.friction, bands.friction)
     middle, most, there = bands.margins(step, spread)
@@ -84,44 +87,44 @@ def _step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judg
         ax.plot(t, np.where(there, side * limit, np.nan) * UM, color=colour, lw=1.6, label=label)
     ax.plot(t, (xj[rows] - centre) * UM, color=INK, lw=1.0, label="measured")
     ax.set_xlim(0.0, float(t[-1]))
-    _shade(ax, judged.events, MS, float(trace.t[s.start]), "position")
+    _shade_events(ax, judged.events, MS, float(trace.t[s.start]), "position")
     ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(trace.t[s.start]):.4g} s", fontsize=9)
     ax.set_xlabel("time from the step [ms]")
     ax.set_ylabel("off the healthy\nresponse [µm]")
 
 
-def ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
+def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
     """Each judged ramp: following error and speed within their limits, and events."""
     if not bands.ramps:
         return ""
-    place = _places(trace, bands)
+    place = _find_sections(trace, bands)
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 4.6), layout="constrained")
         axes = figure.subplots(2, len(bands.ramps), sharex="col", sharey="row", squeeze=False)
         for pair, ramp in zip(axes.T, bands.ramps, strict=True):
-            _ramp(pair, trace, ramp, place[ramp.section], judged)
+            _draw_ramp(pair, trace, ramp, place[ramp.section], judged)
         axes[0, 0].set_ylabel("error [µm]")
         axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
         axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
         return to_svg(figure, "ramps")
 
 
-def _ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: BandVerdict) -> None:
+def _draw_ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: BandVerdict) -> None:
     rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
     error = way * (trace.com[rows] - xj[rows])
     fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
     scale = ramp.scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
-        _widths(ax, width, unit, nearer)
+        _draw_limits(ax, width, unit, nearer)
         ax.plot(*thin_line(trace.t[rows], values * unit), color=INK, lw=0.8, label="measured")
         ax.set_xlim(float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
-        _shade(ax, judged.events, 1.0, 0.0, name)
+        _shade_events(ax, judged.events, 1.0, 0.0, name)
     axes[0].set_title(f"ramp at {s.rate * MM:+.3g} mm/s, judged from {float(trace.t[rows.start]):.4g} s", fontsize=9)
     axes[-1].set_xlabel("time [s]")
 
 
-def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
+def _draw_limits(ax: Axes, width: Width, unit: float, nearer: float) -> None:
     middle = width.centre * unit
     ax.axhspan(middle - width.healthy * unit, middle + width.healthy * unit, color=GREEN, alpha=0.15, lw=0,
                label="healthy")
@@ -131,15 +134,15 @@ def _widths(ax: Axes, width: Width, unit: float, nearer: float) -> None:
             ax.axhline(middle - nearer * limit * unit, color=colour, lw=1.2)
 
 
-def _places(trace: Trace, bands: Bands) -> dict[int, Section]:
+def _find_sections(trace: Trace, bands: Bands) -> dict[int, Section]:
     """The trace's sections by their number in the bands."""
     com = read_columns(trace)[0]
     own = [s for s in find_sections(com, trace.period) if s.kind in ("step", "ramp")]
     return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
 
 
-def _shade(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal: str = "") -> None:
-    """Stays outside over the whole height: one drawing a band, as there may be hundreds."""
+def _shade_events(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal: str = "") -> None:
+    """Shade the times outside over the whole height: one artist per band, as there may be hundreds of events."""
     low, high = ax.get_xlim()
     for band, colour in SHADES.items():
         ends = [((e.t_in - begin) * unit, (e.t_out - begin) * unit) for e in events
@@ -150,7 +153,7 @@ def _shade(ax: Axes, events: Sequence[Event], unit: float, begin: float, signal:
                            zorder=-1)
 
 
-def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerdict | None) -> str:
+def draw_sizes(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerdict | None) -> str:
     """Both faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
     marks: dict[str, list[tuple[str, Estimate]]] = {}
     for fault in (CLOGGING, FRICTION):
@@ -158,24 +161,25 @@ def estimates(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerd
         if grid is not None:
             found = (("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
                      ("grid, ramps", grid.ramp and grid.ramp.minimum))
-            own += [(label, _exact(float(getattr(point, fault.symbol)))) for label, point in found if point]
+            own += [(label, _make_point_estimate(float(getattr(point, fault.symbol))))
+                    for label, point in found if point]
         if judged is not None and fault == FRICTION:
-            own.append(("bands, ramps", _exact(judged.friction)))
+            own.append(("bands, ramps", _make_point_estimate(judged.friction)))
         marks[fault.name] = own
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 1.9), layout="constrained")
         for ax, fault in zip(figure.subplots(1, 2), (CLOGGING, FRICTION), strict=True):
-            _sizes(ax, fault, marks[fault.name])
+            _draw_sizes_of_fault(ax, fault, marks[fault.name])
         return to_svg(figure, "estimates")
 
 
-def _sizes(ax: Axes, fault: Fault, marks: list[tuple[str, Estimate]]) -> None:
+def _draw_sizes_of_fault(ax: Axes, fault: Fault, marks: list[tuple[str, Estimate]]) -> None:
     end = max(ENDS[fault.name], *(1.05 * e.high for _, e in marks))
     for low, high, colour in ((0.0, fault.middle, GREEN), (fault.middle, fault.most, AMBER), (fault.most, end, RED)):
         ax.axvspan(low, high, color=colour, alpha=0.13, lw=0)
     for row, (label, e) in enumerate(marks):
         ax.errorbar(e.value, row, xerr=[[max(e.value - e.low, 0.0)], [max(e.high - e.value, 0.0)]], color=INK,
-                    marker="o" if label == "refined" else "D", ms=6 if label == "refined" else 4, capsize=3)
+                    capsize=3, **FIT_MARKER if label == "refined" else GRID_MARKER)
     ax.set_yticks(range(len(marks)), [label for label, _ in marks])
     ax.set_ylim(len(marks) - 0.5, -0.5)
     ax.set_xlim(0.0, end)
@@ -183,11 +187,11 @@ def _sizes(ax: Axes, fault: Fault, marks: list[tuple[str, Estimate]]) -> None:
     ax.set_xlabel("Kintas" if fault == CLOGGING else "FSS [N]")
 
 
-def _exact(value: float) -> Estimate:
+def _make_point_estimate(value: float) -> Estimate:
     return Estimate(value, value, value)
 
 
-def telling(found: Mapping[str, Precursor]) -> str:
+def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
     """How many healthy standard deviations Table 2's lesser faults move each precursor by; "" without bands."""
     known = [p for p in found.values() if np.isfinite(p.clogging_ratio) and np.isfinite(p.friction_ratio)]
     if not known:
@@ -206,6 +210,6 @@ def telling(found: Mapping[str, Precursor]) -> str:
         ax.set_yticks(rows, [p.words for p in known])
         ax.invert_yaxis()
         ax.grid(axis="y", visible=False)
-        ax.set_xlabel("shift over healthy scatter (dotted: 3, below it a single test does not tell)")
+        ax.set_xlabel("shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")
         ax.legend(loc="lower right", frameon=False)
         return to_svg(figure, "telling")

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdi.diagnosis.bands import Event
@@ -176,7 +176,7 @@ def _show_faults(d: Diagnosis) -> list[Item]:
     def draw() -> str:
         from fdi.report import diagnosis_figures  # here: matplotlib takes half a second to import
 
-        return diagnosis_figures.estimates(d.sizes, d.grid, d.band_verdict)
+        return diagnosis_figures.draw_sizes(d.sizes, d.grid, d.band_verdict)
 
     return [Table(columns, rows, caption),
             Figure("Each estimate of the two sizes over the three levels: green acceptable, amber maintenance, red "
@@ -200,23 +200,28 @@ def _draw_bands(d: Diagnosis) -> list[Item]:
     if judged is None:
         return []
 
-    def draw(name: str) -> Callable[[], str]:
-        def draw_now() -> str:
-            from fdi.report import diagnosis_figures
+    def draw_overview() -> str:
+        from fdi.report import diagnosis_figures
 
-            if name == "overview":
-                return diagnosis_figures.overview(d.trace, judged)
-            return "" if bands is None else getattr(diagnosis_figures, name)(d.trace, bands, judged)
+        return diagnosis_figures.draw_overview(d.trace, judged)
 
-        return draw_now
+    def draw_steps() -> str:
+        from fdi.report import diagnosis_figures
+
+        return "" if bands is None else diagnosis_figures.draw_steps(d.trace, bands, judged)
+
+    def draw_ramps() -> str:
+        from fdi.report import diagnosis_figures
+
+        return "" if bands is None else diagnosis_figures.draw_ramps(d.trace, bands, judged)
 
     return [Figure("Command and ram position. Shaded: times outside MidBand (amber) and MaxBand (red).",
-                   draw("overview")),
+                   draw_overview),
             Figure("Steps judge filter clogging: measured position less that of a healthy unit with the friction that "
                    "the ramps show. Green: scatter of healthy units; amber and red: limits, drawn where clogging is "
-                   "distinguishable from healthy scatter.", draw("steps")),
+                   "distinguishable from healthy scatter.", draw_steps),
             Figure("Ramps judge spool friction: following error (top) and speed beyond the demand (bottom). Green: "
-                   "scatter of healthy units; amber and red: limits.", draw("ramps"))]
+                   "scatter of healthy units; amber and red: limits.", draw_ramps)]
 
 
 def _tabulate_events(d: Diagnosis) -> list[Item]:
@@ -262,9 +267,9 @@ def _show_maps(d: Diagnosis) -> list[Item]:
         return []
 
     def draw() -> str:
-        from fdi.report.paper_figures import maps
+        from fdi.report.paper_figures import draw_maps
 
-        return maps(grid)
+        return draw_maps(grid)
 
     found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
     rows = [[name, f"{m.minimum.kintas:.3f}", f"{m.minimum.fss:.3g}", f"{m.minimum.rms * 1e6:.2f}"]
@@ -300,7 +305,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
     def draw() -> str:
         from fdi.report import diagnosis_figures
 
-        return diagnosis_figures.telling(d.precursors)
+        return diagnosis_figures.draw_precursor_shifts(d.precursors)
 
     return [Table(columns, rows, "Deviation: measured less healthy mean, in standard deviations of healthy units; red "
                                  "beyond 4."),

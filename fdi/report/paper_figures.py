@@ -25,20 +25,22 @@ COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
 AMBER = "#d9730d"
 SHOWN = 0.1  # s of a step
 LEVELS = 7  # contours
+LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "position [departure, µm]",
+          ("ramp", "speed"): "speed [departure, mm/s]"}  # of the bands' axes
 
 
-def steps(traces: Mapping[str, Trace], number: int = 0) -> str:
+def draw_steps(traces: Mapping[str, Trace], number: int = 0) -> str:
     """Fig. 7: position over the first 0.1 s of a step, one line a trace, the same command in each.
 
     Args:
-        traces: by what the legend says.
+        traces: by their labels in the legend.
         number: which of the command's steps, from 0.
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 3.6), layout="constrained")
         near, far = figure.subplots(1, 2, width_ratios=(3, 2))
         for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
-            s = _section(trace, "step", number)
+            s = _select_section(trace, "step", number)
             rows = slice(s.start, s.start + round(SHOWN / trace.period))
             t = (np.arange(s.start, rows.stop) - s.start) * trace.period * 1e3
             for ax in (near, far):
@@ -54,14 +56,14 @@ def steps(traces: Mapping[str, Trace], number: int = 0) -> str:
         return to_svg(figure, "steps")
 
 
-def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
-    """Fig. 8: position over a slow ramp and its error, one line a trace; as `steps`."""
+def draw_ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
+    """Fig. 8: position over a slow ramp and its error, one line a trace; arguments as for `draw_steps`."""
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 4.6), layout="constrained")
         way, error = figure.subplots(2, 1, sharex=True)
         for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
-            s = _section(trace, "ramp", number)
-            t, rows = _time(trace, s), slice(s.start, s.stop)
+            s = _select_section(trace, "ramp", number)
+            t, rows = _select_time(trace, s), slice(s.start, s.stop)
             way.plot(*thin_line(t, trace.xj[rows] * 1e3), color=colour, lw=1.0, label=label)
             error.plot(*thin_line(t, (trace.com - trace.xj)[rows] * 1e6), color=colour, lw=1.0)
         way.plot(t, trace.com[rows] * 1e3, color=COMMAND, lw=1.0, ls=":", label="command")
@@ -72,16 +74,16 @@ def ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
         return to_svg(figure, "ramps")
 
 
-def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
+def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace: Trace, kind: str, signal: str) -> str:
     """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): a trace in the bands.
 
     A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
 
     Args:
         excursions: of the trace, from `fdi.diagnosis.bands.find_excursions`; positive is towards the fault.
-        friction: N, that a step is allowed, from there too.
-        bands: what they are excursions from.
-        trace: their trace.
+        friction: N, of the spool as the ramps show it, from `find_excursions` too.
+        bands: the bands that the trace left.
+        trace: the trace of the excursions.
         kind: of the sections, "step" or "ramp".
         signal: "position" or "speed".
 
@@ -96,27 +98,26 @@ def banded(excursions: list[Excursion], friction: float, bands: Bands, trace: Tr
         axes = figure.subplots(1, len(chosen), sharey=kind == "ramp", squeeze=False)[0]
         for ax, e in zip(axes, chosen, strict=True):
             if kind == "step":
-                band = _band(bands, trace, e)
-                _on_step(ax, trace, e, band, band.centre(friction, bands.friction)[0])
+                band = _find_step_band(bands, trace, e)
+                _draw_step_in_band(ax, trace, e, band, band.centre(friction, bands.friction)[0])
             else:
-                _on_ramp(ax, trace, e)
+                _draw_ramp_in_band(ax, trace, e)
             size = (e.section.last - e.section.first) * 1e3
             ax.set_title(f"{kind} of {size:+.2g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
-        unit = "mm" if kind == "step" else "departure, µm" if signal == "position" else "departure, mm/s"
-        axes[0].set_ylabel(f"{signal} [{unit}]")
+        axes[0].set_ylabel(LABELS[kind, signal])
         axes[0].legend(loc="best", frameon=True, edgecolor="none", fontsize=7)
         return to_svg(figure, f"banded {kind} {signal}")
 
 
-def _band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
-    """The band that a step was held against."""
+def _find_step_band(bands: Bands, trace: Trace, e: Excursion) -> StepBand:
+    """The band of the step that an excursion belongs to."""
     own = [s for s in trace.sections() if s.kind in ("step", "ramp")]
     known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
     return next(step for step in bands.steps if step.section == known[own.index(e.section)])
 
 
-def _on_step(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Floats) -> None:
-    """Position near a step's end, the healthy response with the friction there is, and the limits where they hold."""
+def _draw_step_in_band(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Floats) -> None:
+    """Position near a step's end, the healthy response with the measured friction, and the limits where they apply."""
     rows = slice(e.start, e.start + len(e.departure))
     t, x = (trace.t[rows] - trace.t[e.section.start]) * 1e3, trace.xj[rows] * 1e3
     held = np.isfinite(e.departure)
@@ -134,8 +135,8 @@ def _on_step(ax: Axes, trace: Trace, e: Excursion, band: StepBand, centre: Float
     ax.set_xlabel("time from the step [ms]")
 
 
-def _on_ramp(ax: Axes, trace: Trace, e: Excursion) -> None:
-    """Departure from the healthy centre over time, either way."""
+def _draw_ramp_in_band(ax: Axes, trace: Trace, e: Excursion) -> None:
+    """Departure from the healthy centre over time; positive is towards the fault."""
     scale = 1e6 if e.signal == "position" else 1e3
     t = trace.t[e.start:e.start + len(e.departure)]
     ax.fill_between(t, 0.0 * e.middle, e.middle * scale, color=GREEN, alpha=0.10, lw=0)
@@ -149,7 +150,7 @@ def _on_ramp(ax: Axes, trace: Trace, e: Excursion) -> None:
     ax.set_xlabel("time [s]")
 
 
-def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
+def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
     """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
 
     Args:
@@ -162,7 +163,7 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
         figure = Figure(figsize=(3.7 * len(drawn), 3.5), layout="constrained")
         axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
         for ax, (name, m, letter) in zip(axes, drawn, strict=True):
-            _map(ax, grid, m, letter)
+            _draw_map(ax, grid, m, letter)
             if m is grid.joint:
                 ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
             ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} µm at {letter}", fontsize=9)
@@ -179,7 +180,7 @@ def maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
         return to_svg(figure, "maps")
 
 
-def _map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
+def _draw_map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
     """One map as an image of its logarithm, with contours and its minimum."""
     half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
     box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
@@ -191,9 +192,9 @@ def _map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
     ax.grid(False)
 
 
-def _section(trace: Trace, kind: str, number: int) -> Section:
+def _select_section(trace: Trace, kind: str, number: int) -> Section:
     return [s for s in trace.sections() if s.kind == kind][number]
 
 
-def _time(trace: Trace, s: Section) -> Floats:
+def _select_time(trace: Trace, s: Section) -> Floats:
     return trace.t[s.start:s.stop]

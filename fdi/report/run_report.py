@@ -21,7 +21,7 @@ from fdi.report.report import (
     Section,
     Table,
 )
-from fdi.report.run_verdict import verdict
+from fdi.report.run_verdict import read_verdict
 from fdi.trace.trace import Check, Event, Trace
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad"}
@@ -40,7 +40,7 @@ def write_run_page(source: str | Path, out: str | Path) -> None:
 
 def build_run_report(trace: Trace) -> Report:
     """Report on a trace of `Trace.read(..., all=True)`: of a run with its checks, or of any other recording."""
-    word, reason = verdict(trace)
+    word, reason = read_verdict(trace)
     return Report(
         command="run",
         title=trace.provenance.get("sequence", trace.provenance.get("source", "trace")),
@@ -137,9 +137,9 @@ def _format_window(check: Check) -> str:
 
 def _draw_signals(trace: Trace) -> Figure:
     def draw() -> str:
-        from fdi.report import figures  # here: matplotlib takes half a second to import
+        from fdi.report import run_figures  # here: matplotlib takes half a second to import
 
-        return figures.signals(trace)
+        return run_figures.draw_signals(trace)
 
     return Figure("Command, ram position, following error, current, pressure difference and spool position over time. "
                   "Shaded: ramps (blue) and dynamic sections (violet) of the command, injected faults (orange). The "
@@ -158,9 +158,9 @@ def _show_timing(trace: Trace) -> list[Item]:
         return []
 
     def draw() -> str:
-        from fdi.report import figures
+        from fdi.report import run_figures
 
-        return figures.timing(trace)
+        return run_figures.draw_timing(trace)
 
     columns = [Column("wall clock"), *(Column(name, "µs", "right") for name in ("p50", "p99", "p99.9", "max"))]
     caption = "Number of cycles by duration, both axes logarithmic; the dotted line is the 99th percentile."

@@ -78,15 +78,18 @@ def _draw_fault(ax: Axes, trend: Trend, unit: UnitTrend) -> None:
 
 
 def _mark_arrival(ax: Axes, trend: Trend, level: str, limit: float, colour: str, last: Any, unit: UnitTrend) -> None:
-    """The 95 % interval of when a limit is reached, as a bar on its line; an arrow where it leaves the picture."""
+    """The 95 % interval of when a limit is reached, as a bar on its line; it ends at the edge of the figure."""
     left = trend.remaining.get(level)
     if left is None or trend.verdict != "TREND" or left.high == 0.0 or left.low == math.inf:
         return
     end = float(trend.t[-1])
-    a, b = (_convert_times(np.array([end + x if math.isfinite(x) else 1e9]), unit)[0] if math.isfinite(x) else last
-            for x in (left.low, left.high))
-    a, b = min(a, last), min(b, last)
-    ax.plot([a, b], [limit, limit], color=colour, lw=4, alpha=0.6, solid_capstyle="butt")
+
+    def place(time_left: float) -> Any:
+        if not math.isfinite(time_left):
+            return last
+        return min(_convert_times(np.array([end + time_left]), unit)[0], last)
+
+    ax.plot([place(left.low), place(left.high)], [limit, limit], color=colour, lw=4, alpha=0.6, solid_capstyle="butt")
     if math.isfinite(left.value) and (at := _convert_times(np.array([end + left.value]), unit)[0]) <= last:
         ax.plot([at], [limit], "D", color=colour, ms=6)
 

@@ -104,9 +104,10 @@ class LinkWire:
         return True
 
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
-        """See `Wire`; a frame that does not come within the grace time is missing, and then less is waited for it."""
-        patient = self._missed < _PATIENCE
-        self._missed = 0 if self.wait(done, self._grace if patient else 0.1 * self._grace) else self._missed + 1
+        """See `Wire`; a frame that does not come within the grace time is missing; after several, it waits less."""
+        is_patient = self._missed < _PATIENCE
+        is_answered = self.wait(done, self._grace if is_patient else 0.1 * self._grace)
+        self._missed = 0 if is_answered else self._missed + 1
 
     def run_until(self, t_ns: int) -> None:
         """See `Wire`."""

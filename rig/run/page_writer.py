@@ -79,7 +79,7 @@ def main() -> None:
 
     A trace or file that cannot be used is answered by the fields of the InputError, as one line of JSON.
     """
-    import fdi.report.figures  # noqa: F401 - loads matplotlib
+    import fdi.report.run_figures  # noqa: F401 - loads matplotlib
     from fdi.report.drawing import start_figure, to_svg
     from fdi.report.html import load_templates
     from fdi.report.run_report import write_run_page

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.output import writable
-from fdi.report.run_verdict import verdict
+from fdi.report.run_verdict import read_verdict
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Trace
 from plant.errors import RigError
@@ -140,7 +140,7 @@ def _send_limits(rr: Any, stream: rr.RecordingStream, checks: tuple[Check, ...])
 
 def _send_states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
     """Lanes: verdict, phase, sections of the command, each node's NMT state, each check over its window."""
-    result, first = verdict(trace), float(trace.t[0])
+    result, first = read_verdict(trace), float(trace.t[0])
     if result.word in VERDICTS:
         _send_lane(rr, stream, "0 verdict", [(first, str(result))], {str(result): VERDICTS[result.word]})
     names = np.array(["set-up", "main", "clean-up"])
@@ -157,16 +157,18 @@ def _send_states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
 
 
 def _send_check_lane(rr: Any, stream: rr.RecordingStream, number: int, check: Check, trace: Trace) -> None:
-    """In the sequence's order, the failed ones first; grey is a window that the run did not reach."""
+    """A lane with the window of a check, failed checks first; grey is a window that the run did not reach."""
     unreached = math.isnan(check.t0) and math.isnan(check.value)
     main = trace.t[trace.phase == MAIN]
     whole = (float(main[0]), float(main[-1]) + trace.period) if len(main) else (float(trace.t[0]), float(trace.t[-1]))
     start, stop = whole if math.isnan(check.t0) else (check.t0, check.t1)
-    word = f"{'PASS' if check.passed else 'FAIL'} {_format_value(check)}"
+    word, colour = f"FAIL {_format_value(check)}", NEUTRAL if unreached else FAIL
+    if check.passed:
+        word, colour = f"PASS {_format_value(check)}", PASS
     if math.isnan(check.value) and check.detail:
         word += f": {check.detail}"
     _send_lane(rr, stream, f"{5 if check.passed else 4}.{number:02} {check.name}", [(start, word), (stop, "")],
-          {word: PASS if check.passed else NEUTRAL if unreached else FAIL})
+          {word: colour})
 
 
 def _describe_section(section: Section) -> str:

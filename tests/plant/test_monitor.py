@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import time
-from math import exp, pi, sqrt
+from math import copysign, exp, pi, sqrt
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def explicit(s: Motion, current: float, h: float, c: Cell, model: Model, parts: 
     for _ in range(parts):
         xf = min(max(c.tilt * current - c.back * xs, -v["flapper.travel"]), v["flapper.travel"])
         stuck = stuck and abs(xf) <= c.dead and xf * s.sliding <= c.slide
-        free = 0.0 if stuck else max(abs(xf) - c.slide, 0.0) * (1.0 if xf > 0.0 else -1.0)
+        free = 0.0 if stuck else copysign(max(abs(xf) - c.slide, 0.0), xf)
         before, at = vj, xs
         xs = min(max(xs + dt * c.speed * free, -v["spool.travel"]), v["spool.travel"])
         p12 = c.pressure_gain * 0.5 * (at + xs) - c.pressure_slope * vj

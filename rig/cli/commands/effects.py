@@ -73,11 +73,14 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
             test = tests[row["effect"]]
             row["self_test"] = {"faults": list(test.faults), "visible": test.visible,
                                 "shown": [shown._asdict() for shown in test.shown]}
-    first = _describe_law(chosen[0]) if is_detailed else ""
+    if is_detailed:
+        title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, _describe_law(chosen[0]))))
+        items = _list_properties(chosen[0], rows[0])
+    else:
+        title, sentence, items = "effects", "", _tabulate_effects(chosen)
     return Report(
-        command="effects", title=chosen[0].name if is_detailed else "effects",
-        sentence=f"{chosen[0].name}: {first}" if first else chosen[0].name if is_detailed else "",
-        sections=[Section("", _list_properties(chosen[0], rows[0]) if is_detailed else _tabulate_effects(chosen)),
+        command="effects", title=title, sentence=sentence,
+        sections=[Section("", items),
                   *(Section(f"self-test of {name}", _show_test(test)) for name, test in tests.items())],
         data={"effects": rows})
 

@@ -24,7 +24,10 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out is not None else source.with_name(source.name.split(".")[0] + ".mcap")
     if not csv and source.suffix not in RAW_SUFFIXES:
         raise InputError(source, "", f"a file that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
-    cycles = import_csv(source, out) if csv else import_frames(source, out, Path(args.dbc) if args.dbc else dbc.DBC)
+    if csv:
+        cycles = import_csv(source, out)
+    else:
+        cycles = import_frames(source, out, Path(args.dbc) if args.dbc else dbc.DBC)
     data = {"trace": str(out), "cycles": cycles}
     show_answer(Report("import", str(source), sentence=f"{out}: {cycles} cycles", data=data), args)
     return 0

@@ -17,7 +17,8 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.answer import show_answer
 
     source = Path(args.trace)
-    out = Path(args.out) if args.out is not None else (source if source.is_dir() else source.parent) / "report.html"
+    folder = source if source.is_dir() else source.parent
+    out = folder / "report.html" if args.out is None else Path(args.out)
     write_run_page(source, out)
     show_answer(Report("report", str(source), sentence=str(out), data={"report": str(out)}), args)
     return 0

@@ -20,7 +20,7 @@ from fdi.diagnosis.precursors import (
     smooth_spikes,
 )
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
-from fdi.report.diagnosis_figures import estimates, telling
+from fdi.report.diagnosis_figures import draw_precursor_shifts, draw_sizes
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import load_model, simulate
@@ -177,6 +177,6 @@ def test_the_page(page: str) -> None:
 def test_pictures_without_bands() -> None:
     """Sizes can be drawn without grid and bands; precursors without a table are not."""
     sizes = {CLOGGING.name: Estimate(0.9, 0.8, 0.97), FRICTION.name: Estimate(150.0, 140.0, 170.0)}
-    assert estimates(sizes, None, None).startswith("<svg")
-    assert telling(measure_precursors(run())) == ""
+    assert draw_sizes(sizes, None, None).startswith("<svg")
+    assert draw_precursor_shifts(measure_precursors(run())) == ""
 

@@ -35,9 +35,9 @@ def texts(svg: str) -> set[str]:
 
 def test_either_fault_alone() -> None:
     runs = {"healthy": trace(0.0, 5.0), "Kintas 0.35": trace(0.35, 5.0), "FSS 70 N": trace(0.0, 70.0)}
-    for draw in (figures.steps, figures.ramps):
+    for draw in (figures.draw_steps, figures.draw_ramps):
         assert set(runs) <= texts(draw(runs))
-    assert "error [µm]" in texts(figures.ramps(runs, number=1))
+    assert "error [µm]" in texts(figures.draw_ramps(runs, number=1))
 
 
 def test_a_trace_in_its_bands() -> None:
@@ -47,17 +47,17 @@ def test_a_trace_in_its_bands() -> None:
     for kind, signal, first in (("step", "position", "step of +5 mm at 0.5 s"),
                                 ("ramp", "position", "ramp of +1 mm at 4.001 s"),
                                 ("ramp", "speed", "ramp of -1 mm at 6.501 s")):
-        said = texts(figures.banded(found, friction, bands, faulty, kind, signal))
+        said = texts(figures.draw_bands(found, friction, bands, faulty, kind, signal))
         assert {"measured", "MidBand", "MaxBand", "outside", first} <= said
-    assert figures.banded(found, friction, bands, faulty, "step", "speed") == ""
+    assert figures.draw_bands(found, friction, bands, faulty, "step", "speed") == ""
 
 
 def test_the_maps() -> None:
     grid = search_grid(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
-    said = texts(figures.maps(grid, truth=(0.25, 30.0)))
+    said = texts(figures.draw_maps(grid, truth=(0.25, 30.0)))
     assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
     assert any(text.startswith("step sections: ") for text in said)
-    assert "injected" not in texts(figures.maps(grid))
+    assert "injected" not in texts(figures.draw_maps(grid))
 
 
 @pytest.mark.parametrize("cells", [1, 2, 5])
@@ -65,5 +65,5 @@ def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
     com = build([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     measured = Trace.of(simulate(Model(), com)._asdict(), 1e-3, {})
     grid = search_grid(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
-    said = texts(figures.maps(grid))
+    said = texts(figures.draw_maps(grid))
     assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from synthetic_run import record
 
-from fdi.report import drawing, figures
+from fdi.report import drawing, run_figures
 from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report, write_run_page
-from fdi.report.run_verdict import verdict
+from fdi.report.run_verdict import read_verdict
 from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
 from rig.recorder import Check, Recorder, Signals, Timing
@@ -123,19 +123,19 @@ def test_a_real_run_has_a_report(preflight: Path) -> None:
 def test_a_late_run_says_how_late(log: Path) -> None:
     trace = Trace.read(log, all=True)
     said = {**trace.provenance, "verdict.verdict": "INVALID_TIMING", "verdict.overruns": "70", "max_overruns": "0.001"}
-    assert str(verdict(replace(trace, provenance=said))) == \
+    assert str(read_verdict(replace(trace, provenance=said))) == \
         "INVALID_TIMING: the bench itself was late: 70 overruns in 14000 cycles, more than 0.1 %"
     said["verdict.why"] = "a guard"
-    assert verdict(replace(trace, provenance=said)).why.endswith("0.1 %; a guard")
+    assert read_verdict(replace(trace, provenance=said)).why.endswith("0.1 %; a guard")
 
 
 def test_a_failed_run_names_its_checks(log: Path) -> None:
     trace = Trace.read(log)
-    assert verdict(trace) == ("FAIL", "1 of 4 checks failed: ramp error")
+    assert read_verdict(trace) == ("FAIL", "1 of 4 checks failed: ramp error")
     bad = tuple(trace.checks[0]._replace(name=f"c{i}", passed=False) for i in range(6))
-    assert verdict(replace(trace, checks=bad)).why == "6 of 6 checks failed: c0, c1, c2, c3 and 2 more"
-    assert verdict(replace(trace, checks=bad[:0])).word == "NOT JUDGED"
-    assert verdict(replace(trace, checks=trace.checks[:1])) == ("PASS", "")
+    assert read_verdict(replace(trace, checks=bad)).why == "6 of 6 checks failed: c0, c1, c2, c3 and 2 more"
+    assert read_verdict(replace(trace, checks=bad[:0])).word == "NOT JUDGED"
+    assert read_verdict(replace(trace, checks=trace.checks[:1])) == ("PASS", "")
 
 
 def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
@@ -143,12 +143,12 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     holes = values.copy()
     holes[1::2] = np.nan  # every second one: a line through single samples would have no stroke at all
     holes[60:80] = np.nan
-    line = figures._bridged(holes)
+    line = run_figures._bridge_short_gaps(holes)
     assert np.isnan(line).sum() == 22 and np.isnan(line[59:80]).all()  # and the last
     np.testing.assert_allclose(line[:59], values[:59], atol=0.01)
-    assert np.isnan(figures._bridged(np.full(5, np.nan))).all()
+    assert np.isnan(run_figures._bridge_short_gaps(np.full(5, np.nan))).all()
     columns = {"com": values, "xj": values, "cor": values}
-    sound, broken = (figures.signals(Trace.of({**columns, "xj": xj}, 1e-3, {})) for xj in (values, holes))
+    sound, broken = (run_figures.draw_signals(Trace.of({**columns, "xj": xj}, 1e-3, {})) for xj in (values, holes))
     assert drawing.RED in broken and drawing.RED not in sound
 
 
@@ -211,7 +211,7 @@ def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
              f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", (tmp_path / "report.html").as_uri()]
     subprocess.run(words, capture_output=True, check=True, timeout=120)
     shades = (imread(str(tmp_path / "page.png"))[..., :3] * 255).astype(int)
-    for name, _, _, colour in figures.PANELS[:4]:
+    for name, _, _, colour in run_figures.PANELS[:4]:
         wanted = np.array([int(colour[i:i + 2], 16) for i in (1, 3, 5)])
         assert (np.abs(shades - wanted).max(axis=2) < 30).sum() > 500, name
 
@@ -221,5 +221,6 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
     events = (Event(1.0, "WARN", "fault", "lost drive begins"), Event(2.5, "INFO", "fault", "lost drive ends"),
               Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
     faulty = replace(trace, events=events)
-    assert figures.faults(faulty) == [("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
-    assert "lost drive" in render_run(faulty) and figures.signals(faulty) != figures.signals(trace)
+    assert run_figures.list_faults(faulty) == [
+        ("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
+    assert "lost drive" in render_run(faulty) and run_figures.draw_signals(faulty) != run_figures.draw_signals(trace)

@@ -24,7 +24,8 @@ def test_a_share_has_its_exact_interval(good: int, of: int) -> None:
 def judged(label: str, kintas: float, fss: float, said: tuple[str, str], n: int, **more: Any) -> list[dict[str, Any]]:
     sizes = {"kintas": kintas, "kintas_low": kintas - 0.02, "kintas_high": kintas + 0.02, "fss": fss * 1.01,
              "fss_low": fss * 0.95, "fss_high": fss * 1.005}
-    ruling = "filter_clogging" if said[0] != "acceptable" else "spool_friction" if said[1] != "acceptable" else ""
+    levels = dict(zip(("filter_clogging", "spool_friction"), said, strict=True))
+    ruling = next((fault for fault, level in levels.items() if level != "acceptable"), "")
     return [{"label": label, "faults": len(label.split()) if label != "healthy" else 0, "tolerance": 0.015, "seed": i,
              "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss, "level_filter_clogging": said[0],
              "level_spool_friction": said[1], "ruling": ruling,

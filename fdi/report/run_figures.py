@@ -1,4 +1,4 @@
-"""The drawings of a report, as SVG text that stands inside an HTML page."""
+"""The figures of a run, as SVG text for an HTML page: signals over time, and timing."""
 from __future__ import annotations
 
 import math
@@ -17,16 +17,16 @@ from fdi.trace.trace import Trace
 Floats = NDArray[np.float64]
 FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
-SHORTEST_TIME = 0.1  # us, the left end of a histogram; no clock here tells less
+SHORTEST_TIME = 0.1  # us, the left end of a histogram: the resolution of the clock
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
           ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
           ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
           ("load", "load [kN]", 1e-3, "#57606a"))
 
 
-def signals(trace: Trace) -> str:
+def draw_signals(trace: Trace) -> str:
     """Command and position, error, current, pressure and spool over one time axis, with sections and checks."""
-    error, calm = trace.com - trace.xj, _calm(trace)
+    error, calm = trace.com - trace.xj, _choose_close_up(trace)
     values: dict[str, Floats] = {"xj": trace.xj, "error": error, "cor": trace.cor, "p12": trace.p12, "xs": trace.xs}
     if np.nan_to_num(trace.load).any():
         values["load"] = trace.load
@@ -35,30 +35,31 @@ def signals(trace: Trace) -> str:
     panels = [panel for panel in PANELS if panel[0] in values and not np.isnan(values[panel[0]]).all()]
     heights = [1.7] * len(panels) + [0.15 * len(trace.checks) + 0.25] * bool(trace.checks)
     with rc_context(STYLE):
-        figure, axes = _stack(heights)
+        figure, axes = _stack_panels(heights)
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
             if name == "xj":
                 ax.plot(*thin_line(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
-            ax.plot(*thin_line(trace.t, _bridged(values[name]) * scale), color=colour, lw=1.0, label="XJ, ram")
-            _missing(ax, trace, values[name])
+            line = thin_line(trace.t, _bridge_short_gaps(values[name]) * scale)
+            ax.plot(*line, color=colour, lw=1.0, label="XJ, ram")
+            _mark_missing(ax, trace, values[name])
             ax.set_ylabel(label)
             if name == "close":
                 ax.set_ylim(-calm * scale, calm * scale)
             shade_sections(ax, trace)
-            for fault, t0, t1 in faults(trace):
+            for fault, t0, t1 in list_faults(trace):
                 ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
                 if ax is axes[0]:
                     foot = ax.get_xaxis_transform()
                     ax.text(t0, 0.03, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
         if trace.checks:
-            _windows(axes[-1], trace)
+            _draw_checks(axes[-1], trace)
         axes[-1].set_xlabel("time from the start of the main phase [s]")
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
         return to_svg(figure, "signals")
 
 
-def _stack(heights: Sequence[float]) -> tuple[Figure, Sequence[Axes]]:
+def _stack_panels(heights: Sequence[float]) -> tuple[Figure, Sequence[Axes]]:
     """A figure of panels above each other, each as high as `heights` says (inches), on one time axis.
 
     The margins are fixed: a layout that measures every tick label first takes as long as the drawing.
@@ -76,8 +77,8 @@ def _stack(heights: Sequence[float]) -> tuple[Figure, Sequence[Axes]]:
     return figure, list(axes)
 
 
-def faults(trace: Trace) -> list[tuple[str, float, float]]:
-    """The faults that the run injected: name, begin and end in s; one that is never over ends with the trace."""
+def list_faults(trace: Trace) -> list[tuple[str, float, float]]:
+    """The faults that the run injected: name, begin and end in s; one that never ends lasts to the end of the trace."""
     begun: dict[str, float] = {}
     spans = []
     for event in trace.events:
@@ -89,7 +90,7 @@ def faults(trace: Trace) -> list[tuple[str, float, float]]:
     return spans + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
 
 
-def timing(trace: Trace) -> str:
+def draw_timing(trace: Trace) -> str:
     """Histograms of lateness, response and work; "" for a trace without timing."""
     columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
                ("controller's response", trace.timing.response, "#d9730d"),
@@ -117,8 +118,8 @@ def timing(trace: Trace) -> str:
         return to_svg(figure, "timing")
 
 
-def _bridged(values: Floats) -> Floats:
-    """Straight lines over up to BRIDGED missing samples: a line of single samples would not be seen at all."""
+def _bridge_short_gaps(values: Floats) -> Floats:
+    """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
     known = np.flatnonzero(~np.isnan(values))
     if not len(known):
         return values
@@ -129,7 +130,7 @@ def _bridged(values: Floats) -> Floats:
     return np.where(near, np.interp(rows, known, values[known]), values)
 
 
-def _missing(ax: Axes, trace: Trace, values: Floats) -> None:
+def _mark_missing(ax: Axes, trace: Trace, values: Floats) -> None:
     """A red mark at the foot of the panel wherever samples are missing."""
     pieces = np.array_split(np.isnan(values), min(LINE_COLUMNS, len(values)))
     lost = np.array([piece.any() for piece in pieces])
@@ -140,7 +141,7 @@ def _missing(ax: Axes, trace: Trace, values: Floats) -> None:
         ax.broken_barh(spans, (0.0, 0.04), transform=ax.get_xaxis_transform(), color=RED, lw=0.5, zorder=3)
 
 
-def _calm(trace: Trace) -> float:
+def _choose_close_up(trace: Trace) -> float:
     """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
     ramps = [np.arange(s.start, s.stop) for s in trace.sections() if s.kind == "ramp"]
     error = np.abs(trace.com - trace.xj)[np.concatenate(ramps)] if ramps else np.empty(0)
@@ -148,7 +149,7 @@ def _calm(trace: Trace) -> float:
     return 2.0 * float(np.percentile(error, 99)) if len(error) else 0.0
 
 
-def _windows(ax: Axes, trace: Trace) -> None:
+def _draw_checks(ax: Axes, trace: Trace) -> None:
     """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
     first, last = float(trace.t[0]), float(trace.t[-1])
     room, span = 0.005 * (last - first), last - first
