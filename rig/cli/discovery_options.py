@@ -21,9 +21,9 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     """--repeat, --holdout and --signals."""
     add = parser.add_argument
     add("--repeat", action="append", default=[], metavar="TRACE",
-        help="the same command again: discriminates noise from physics (repeatable)")
-    add("--holdout", metavar="TRACE", help="another command, a held-out run that no fit sees: reveals overfitting")
-    add("--signals", metavar="xj,p12,xs", help="what to explain (default: what the trace has)")
+        help="another run of the same command: measures the noise floor (repeatable)")
+    add("--holdout", metavar="TRACE", help="a run of another command that no fit sees: reveals overfitting")
+    add("--signals", metavar="xj,p12,xs", help="signals to use (default: all that the trace has)")
 
 
 def list_signals(args: argparse.Namespace) -> list[str] | None:

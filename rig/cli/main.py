@@ -50,7 +50,7 @@ class _CommandParser(_Parser):
         module.add_arguments(self)
         self.add_argument("--json", action="store_true", help="print one JSON object on standard output, nothing else")
         self.add_argument("--out", metavar="PATH", help="where to write the result")
-        self.add_argument("--quiet", action="store_true", help="print no progress and no tables")
+        self.add_argument("--quiet", action="store_true", help="print nothing but errors")
         self.set_defaults(run_command=module.run_command)
 
 
@@ -68,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
     """Build the parser of the whole command line; a command's own options are added when it is parsed."""
     parser = _Parser(prog="rig", description="Hardware-in-the-loop rig for an electrohydraulic actuator.",
                      epilog="For the options of a command: rig COMMAND --help. Exit status: 0 passed, 1 not passed, "
-                            "2 bad input, 3 timing invalid, 130 interrupted.")
+                            "2 bad input, 3 timing invalid, 70 internal error, 130 interrupted.")
     parser.add_argument("--version", action=_PrintVersion, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_CommandParser)
     for name, help_text in HELP_OF_COMMAND.items():

@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
     options.add_model_options(parser)
     add("--repeat", action="append", default=[], metavar="TRACE",
-        help="the same command again: measures the noise, whatever its colour (repeatable)")
+        help="another run of the same command: measures the noise floor (repeatable)")
     add("--signals", metavar="xj,p12,xs", help="what to compare (default: what the trace has)")
     add("--report", action="store_true", help="write a page with pictures, compare.html beside the trace, "
                                               "or where --out FILE.html says")
