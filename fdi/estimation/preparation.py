@@ -172,7 +172,11 @@ def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
 
 
 def _find_incomplete(trace: Trace) -> Flags:
-    """Rows in which Com, XJ or Cor was not recorded."""
+    """Rows in which Com, XJ or Cor was not recorded.
+
+    Where rows are resampled or moved onto those of another run, only the rows without XJ count as incomplete: Com and
+    Cor are then those that were filled in.
+    """
     return np.isnan(trace.com) | np.isnan(trace.xj) | np.isnan(trace.cor)
 
 
@@ -186,6 +190,7 @@ def _find_new_current(cor: Floats, rows: int) -> int | None:
 def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
     """Every so many rows, from row `phase` on."""
     columns: dict[str, Any] = {name: getattr(trace, name)[phase::rows] for name in COLUMNS}
+    columns["incomplete"] = np.isnan(columns["xj"])
     return replace(trace, **columns, period=trace.period * rows)
 
 
@@ -197,11 +202,9 @@ def _spread_rows(trace: Trace, cycles: int) -> Trace:
     for name in ("com", "cor", "load", *OUTPUTS):
         columns[name] = np.full(n, np.nan)
         columns[name][::cycles] = getattr(trace, name)
-    incomplete = np.ones(n, bool)
-    incomplete[::cycles] = trace.incomplete
     return replace(trace, **columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
                    phase=np.repeat(trace.phase, cycles)[:n], usable=np.ones(n, bool), filled=np.zeros(n, bool),
-                   incomplete=incomplete)
+                   incomplete=np.isnan(columns["xj"]))
 
 
 def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.3, abrupt: float = 0.1) -> Trace:
@@ -360,4 +363,4 @@ def align_repeat(repeat: Repeat, rows: int) -> Trace:
     place = np.clip(wanted, 0, len(trace) - 1)
     columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in COLUMNS}
     usable = (wanted == place) & trace.usable[place]
-    return replace(trace, **columns | {"usable": usable, "incomplete": columns["incomplete"] | ~usable})
+    return replace(trace, **columns | {"usable": usable, "incomplete": np.isnan(columns["xj"]) | ~usable})

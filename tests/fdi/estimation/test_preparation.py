@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.estimation.preparation import FEWEST_ROWS, align_columns, find_repeat, read_cycles
+from fdi.estimation.preparation import FEWEST_ROWS, align_columns, align_repeat, find_repeat, read_cycles
 from fdi.trace.columns import bridge_gaps, hold_last, shift_rows
 from fdi.trace.trace import Trace
 from plant import InputError, Model
@@ -145,3 +145,20 @@ def test_a_repeat_is_found_by_its_command() -> None:
         find_repeat(read_cycles(healthy(), MODEL, ["xs"])[0], made(xs=np.full(13_500, np.nan)), MODEL, 1)
     with pytest.raises(InputError, match="rows as in the trace"):
         find_repeat(c, Trace.of({name: x[::3] for name, x in columns().items()}, 2.5e-3, {}), MODEL, 1)
+
+
+def test_rows_that_the_check_of_the_firmware_leaves_out() -> None:
+    """Rows as recorded: those without Com, XJ or Cor. Rows moved or resampled: those without XJ, or outside the run."""
+    cor, com, xj = (columns()[name] for name in ("cor", "com", "xj"))
+    cor[5000], com[6000], xj[7000] = np.nan, np.nan, np.nan
+    (c,) = read_cycles(made(cor=cor, com=com, xj=xj), MODEL)
+    assert np.flatnonzero(c.incomplete).tolist() == [5000, 6000, 7000]
+
+    late = Trace.of({name: x[20:] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 1e-3, {})
+    (first,) = read_cycles(healthy(), MODEL)
+    moved = align_repeat(find_repeat(first, late, MODEL, 1), len(first))
+    assert np.flatnonzero(moved.incomplete).tolist() == [*range(20), 7000]
+
+    slow = Trace.of({name: x[::2] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 2e-3, {})
+    spread = read_cycles(slow, MODEL)[-1]
+    assert len(spread) == 2 * len(slow) - 1 and (spread.incomplete == np.isnan(spread.xj)).all()
