@@ -25,7 +25,7 @@ from plant import functions
 Function = Any  # a plain function, or numba's dispatcher of one
 
 
-def cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """Where compiled code is kept: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
     named = os.environ.get("EHA_RIG_CACHE")
     home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eha-rig"
@@ -37,29 +37,29 @@ def cache_folder() -> Path:
         return Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}"
 
 
-def rebind(function: Function, **names: Any) -> Function:
+def rebind_names(function: Function, **names: Any) -> Function:
     """A copy of `function` that sees `names` in place of its module's globals."""
     # said to be at home here: numba imports that home again when it reads its cache, and a user's file is no module
     there = function.__globals__ | names | {"__name__": __name__}
     return FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
 
 
-def interpreted(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
+def interpret_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` with `ports` in place, in plain Python: for debuggers, and for the test that compiled equals it."""
-    return _link(function, ports or {}, lambda f: f)
+    return _link_calls(function, ports or {}, lambda f: f)
 
 
-def compiled(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
+def compile_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
     """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
     import numba  # here and below: who only reads a trace need not load it, which takes 0.3 s
     import numba.core.compiler_lock
 
-    root = _link(function, ports or {}, lambda f: f)
-    linked = _link(function, ports or {}, lambda f: numba.njit(f, **INLINED))
-    plain = rebind(linked.py_func)
+    root = _link_calls(function, ports or {}, lambda f: f)
+    linked = _link_calls(function, ports or {}, lambda f: numba.njit(f, **INLINE_OPTIONS))
+    plain = rebind_names(linked.py_func)
     settings: Any = numba.config
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
-        before, settings.CACHE_DIR = settings.CACHE_DIR, str(cache_folder() / fingerprint(root))
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(find_cache_folder() / compute_fingerprint(root))
         try:
             return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
         finally:
@@ -68,10 +68,12 @@ def compiled(function: Function, ports: Mapping[str, Function] | None = None) ->
 
 # no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only
 # called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
-INLINED: Any = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+INLINE_OPTIONS: Any = {
+    "error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}
 
 
-def _link(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function]) -> Function:
+def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function]) -> Function:
     """Copy the call graph below `function`, names in `ports` replaced by theirs, each copy through `make`."""
     made: dict[Function, Function] = {}
 
@@ -80,14 +82,14 @@ def _link(function: Function, ports: Mapping[str, Function], make: Callable[[Fun
         if not isinstance(f, FunctionType):
             return f
         if f not in made:
-            calls = {name: link(ports.get(name, g)) for name, g in _calls(f).items()}
-            made[f] = make(rebind(f, **calls, **_libraries(f, link)))
+            calls = {name: link(ports.get(name, g)) for name, g in _find_calls(f).items()}
+            made[f] = make(rebind_names(f, **calls, **_copy_libraries(f, link)))
         return made[f]
 
     return link(function)
 
 
-def record_at(kind: np.dtype[Any], first: int, apart: int) -> Function:
+def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
     """For compiled code: `(array, place) -> record` of type `kind`, its float i from first + i * apart + place.
 
     The record is a copy, which the compiler dissolves into registers; laws get it by its address alone. Tried: a tuple
@@ -118,7 +120,7 @@ def record_at(kind: np.dtype[Any], first: int, apart: int) -> Function:
     return numba.extending.intrinsic(at)
 
 
-def _globals(function: Function) -> dict[str, Any]:
+def _find_globals(function: Function) -> dict[str, Any]:
     """The module-level names `function` reads, with their values."""
     function = getattr(function, "py_func", function)
     names = {i.argval for i in dis.get_instructions(function) if i.opname == "LOAD_GLOBAL"}
@@ -126,46 +128,47 @@ def _globals(function: Function) -> dict[str, Any]:
     return {name: there[name] for name in sorted(names) if name in there}
 
 
-def _calls(function: Function) -> dict[str, Function]:
-    named = {name: _ours(value) for name, value in _globals(function).items()}
+def _find_calls(function: Function) -> dict[str, Function]:
+    named = {name: _find_own_version(value) for name, value in _find_globals(function).items()}
     return {name: g for name, g in named.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
 
 
-def called(function: Function) -> set[str]:
+def list_called_names(function: Function) -> set[str]:
     """The names of all functions that `function` calls, and that these call."""
-    below = _calls(function)
-    return set(below).union(*(called(g) for g in below.values()))
+    below = _find_calls(function)
+    return set(below).union(*(list_called_names(g) for g in below.values()))
 
 
 @cache
-def costly(function: Function) -> bool:
+def is_costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
     plain: Any = getattr(function, "py_func", function)
     divides = any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(plain))
     elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
-    return divides or not elementary.isdisjoint(plain.__code__.co_names) or any(map(costly, _calls(plain).values()))
+    calls_elementary = not elementary.isdisjoint(plain.__code__.co_names)
+    return divides or calls_elementary or any(is_costly(f) for f in _find_calls(plain).values())
 
 
-def _ours(value: Any) -> Any:
+def _find_own_version(value: Any) -> Any:
     """Our own version of a function of `math` or `numpy` if there is one, else the value itself."""
     known = isinstance(value, BuiltinFunctionType | np.ufunc)
     return functions.IN_PLACE_OF.get(value, value) if known else value
 
 
-def _libraries(function: Function, link: Callable[[Function], Function]) -> dict[str, ModuleType]:
+def _copy_libraries(function: Function, link: Callable[[Function], Function]) -> dict[str, ModuleType]:
     """`math` and `np` as `function` calls them, with our own versions, through `link`, of what it uses of theirs."""
     copies = {}
-    for name, library in _globals(function).items():
+    for name, library in _find_globals(function).items():
         if library is math or library is np:
             used = {f: vars(library).get(f) for f in function.__code__.co_names}
-            own = {f: link(_ours(g)) for f, g in used.items() if _ours(g) is not g}
+            own = {f: link(_find_own_version(g)) for f, g in used.items() if _find_own_version(g) is not g}
             if own:
                 copies[name] = ModuleType(library.__name__)
                 copies[name].__dict__.update(vars(library) | own)
     return copies
 
 
-def fingerprint(function: Function) -> str:
+def compute_fingerprint(function: Function) -> str:
     """Changes when the code of `function` or of anything it calls changes, or a constant, table or field they name.
 
     The code that runs counts, not its file: that may have been edited since it was loaded. So does how it is compiled.
@@ -175,10 +178,11 @@ def fingerprint(function: Function) -> str:
     def text(f: Function) -> str:
         if f not in seen:
             seen[f] = ""
-            calls = _calls(f)
+            calls = _find_calls(f)
             below = [f"{name}={text(g)}" for name, g in calls.items()]
-            constants = [f"{name}={_constant(value)}" for name, value in _globals(f).items() if name not in calls]
-            whole = "\n".join([_code(f), *below, *constants])
+            constants = [f"{name}={_describe_constant(value)}"
+                         for name, value in _find_globals(f).items() if name not in calls]
+            whole = "\n".join([_describe_code(f), *below, *constants])
             seen[f] = hashlib.sha256(whole.encode()).hexdigest()
         return seen[f]
 
@@ -188,17 +192,17 @@ def fingerprint(function: Function) -> str:
 _THIS_FILE = "".join(Path(str(file)).read_text(encoding="utf-8") for file in (__file__, functions.__file__))
 
 
-def _code(f: Function) -> str:
+def _describe_code(f: Function) -> str:
     f = getattr(f, "py_func", f)
     held = [cell.cell_contents for cell in f.__closure__ or ()]
-    return " ".join([_constant(f.__code__), *map(_constant, (*(f.__defaults__ or ()), *held))])
+    return " ".join([_describe_constant(f.__code__), *map(_describe_constant, (*(f.__defaults__ or ()), *held))])
 
 
-def _constant(value: Any) -> str:
+def _describe_constant(value: Any) -> str:
     if isinstance(value, ModuleType):
         return value.__name__
     if isinstance(value, CodeType):
-        inner = " ".join(_constant(constant) for constant in value.co_consts)
+        inner = " ".join(_describe_constant(constant) for constant in value.co_consts)
         return f"{value.co_code.hex()} {inner} {value.co_names} {value.co_varnames}"
     if isinstance(value, np.ndarray):  # its repr would leave out the middle
         return f"{value.dtype} {value.shape} {value.tobytes().hex()}"

@@ -14,7 +14,7 @@ class Loop(NamedTuple):
     cycles: float = 0.0  # cycles since it was enabled
 
 
-def answer(c: Loop, demand: float, position: float, p: Any) -> tuple[float, Loop]:
+def compute_current(c: Loop, demand: float, position: float, p: Any) -> tuple[float, Loop]:
     """Current for the next cycle, A, from demand and sensed position, m; `p` has the fields of `Controller`.
 
     The integral part waits while the output is at its limit and the error would drive it further (anti-windup);

@@ -12,12 +12,12 @@ import numpy as np
 from plant.effects import base
 from plant.effects.sensors import Quantisation
 from plant.effects.valve import Compressibility
-from plant.parameters import GROUPS, in_unit, read_shipped_model
+from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
 from plant.plants import Array, Plant, Table, Term
 from plant.ports import at_current, at_position, at_valve
 from plant.quantity import Quantity
 from plant.state import Input, Line, Ports, State
-from plant.step import jack
+from plant.step import step_jack
 
 ROD_SIDE = 0.686  # area of the rod side over that of the piston side; a 50 mm piston usually has a 28 mm rod
 SEAL_LEAKAGE = 1e-16  # m3/s/Pa, negligible; it keeps the pressure finite in a model without leakage
@@ -34,14 +34,14 @@ class Pump(NamedTuple):
 Coefficients = namedtuple("Coefficients", "gain valve_slope jack_damping jack_free jack_coupled")
 
 
-def coefficients(p: Any, h: float) -> Any:
+def compute_servo_coefficients(p: Any, h: float) -> Any:
     """D w = AJ XJ' + CLK P12, solved for P12."""
     slope, mass = p.jack.area / (p.jack.leakage + SEAL_LEAKAGE), p.jack.mass + h * p.jack.damping
     return Coefficients(p.pump.displacement / p.jack.area * slope, slope, p.jack.damping, 1.0 / mass,
                         1.0 / (mass + h * p.jack.area * slope))
 
 
-def step(s: State, u: Input, p: Any, k: Any) -> State:
+def step_servo(s: State, u: Input, p: Any, k: Any) -> State:
     """The plant `u.h` seconds later; P12 is what pushes the ram, over the piston's larger side."""
     m = s.memory
     w, m_current = at_current(u.current, m.current, s, u, p)
@@ -50,7 +50,7 @@ def step(s: State, u: Input, p: Any, k: Any) -> State:
     before = State(0.0, 0.0, 0.0, 0.0, s.jack_position, s.jack_speed, held, s.sensed, m)
     pump = Line(r * k.gain * w, r * r * k.valve_slope, p.supply.pressure, 0.0)
     line, m_valve = at_valve(pump, m.valve, before, u, p)
-    x, v, p12, m_load, m_drag = jack(s, u, p, k, line, 0.0)
+    x, v, p12, m_load, m_drag = step_jack(s, u, p, k, line, 0.0)
     sensed, m_position = at_position(x, m.position, State(0.0, 0.0, 0.0, 0.0, x, v, p12, s.sensed, m), u, p)
     return State(0.0, 0.0, 0.0, 0.0, x, v, p12, sensed, Ports(
         m.command, m_current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m_valve, m_load,
@@ -70,7 +70,7 @@ base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs", law
      symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
 
 PARAMETER_GROUPS: dict[str, type[Any]] = {
-    "controller": in_unit(GROUPS["controller"], "A", "raw", 1e6),
+    "controller": convert_group_unit(GROUPS["controller"], "A", "raw", 1e6),
     "pump": Pump,
     "supply": GROUPS["supply"],
     "jack": GROUPS["jack"],
@@ -91,8 +91,8 @@ COLUMNS = {
 PLANT = Plant(
     name="ehs",
     unit="raw",
-    step=step,
-    coefficients=coefficients,
+    step=step_servo,
+    coefficients=compute_servo_coefficients,
     groups=PARAMETER_GROUPS,
     given=NOMINAL,
     has=("quantisation",),

@@ -12,25 +12,25 @@ from plant.compile import Function
 from plant.state import Memory, Ports, State
 
 
-def packers(state: State) -> tuple[Function, Function]:
+def make_packers(state: State) -> tuple[Function, Function]:
     """`pack(state, array)` and `unpack(array) -> state` for states shaped as `state`."""
-    pack, unpack, _ = _converters(state, "", lambda i: f"a[{i}]")
+    pack, unpack, _ = _make_converters(state, "", lambda i: f"a[{i}]")
     return pack, unpack
 
 
-def lane_packers(shape: Any, width: int, first: int) -> tuple[Function, Function, int]:
+def make_lane_packers(shape: Any, width: int, first: int) -> tuple[Function, Function, int]:
     """`keep(x, array, lane)` and `at(array, lane) -> x` for tuples like `shape`, and the first number after them.
 
     In the buffer number f of a lane stands at f * width + lane; those of `shape` begin with f = `first`.
     """
-    keep, at, numbers = _converters(shape, ", lane", lambda i: f"a[{(first + i) * width} + lane]")
+    keep, at, numbers = _make_converters(shape, ", lane", lambda i: f"a[{(first + i) * width} + lane]")
     return keep, at, first + numbers
 
 
-def _converters(shape: Any, lane: str, place: Callable[[int], str]) -> tuple[Function, Function, int]:
+def _make_converters(shape: Any, lane: str, place: Callable[[int], str]) -> tuple[Function, Function, int]:
     kinds: dict[str, type[Any]] = {}
     paths: list[str] = []
-    built = _built(shape, "s", kinds, paths, place)
+    built = _build_expression(shape, "s", kinds, paths, place)
     stores = [f"    {place(i)} = {path}" for i, path in enumerate(paths)]
     source = "\n".join([f"def keep(s, a{lane}):", *stores, f"def at(a{lane}):", f"    return {built}"])
     made: dict[str, Any] = dict(kinds)
@@ -38,14 +38,15 @@ def _converters(shape: Any, lane: str, place: Callable[[int], str]) -> tuple[Fun
     return made["keep"], made["at"], len(paths)
 
 
-def values(state: State) -> list[float]:
+def list_state_values(state: State) -> list[float]:
     """The numbers of `state` in the order of the array: the fields of `State` first, then what effects remember."""
     array: dict[int, float] = {}
-    packers(state)[0](state, array)
+    make_packers(state)[0](state, array)
     return [float(x) for x in array.values()]
 
 
-def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str], place: Callable[[int], str]) -> str:
+def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str],
+                      place: Callable[[int], str]) -> str:
     """The expression that builds `x` from the array `a`; notes the tuple types it needs and the path to each number."""
     if not isinstance(x, tuple):
         paths.append(path)
@@ -54,7 +55,7 @@ def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str], 
     parts = [(part, f"{path}.{named[i]}" if named else f"{path}[{i}]") for i, part in enumerate(x)]
     # a bare number among ports or effects says that nothing is remembered there
     bare = isinstance(x, Ports) or not named
-    inner = ["0.0" if bare and not isinstance(part, tuple) else _built(part, p, kinds, paths, place)
+    inner = ["0.0" if bare and not isinstance(part, tuple) else _build_expression(part, p, kinds, paths, place)
              for part, p in parts]
     if not named:
         return f"({', '.join(inner)},)"
@@ -63,11 +64,11 @@ def _built(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str], 
     return f"{kind}({', '.join(inner)})"
 
 
-def pack(s: State, a: Any) -> None:
+def pack_state(s: State, a: Any) -> None:
     """Write `s` into the array `a`. This one stands for a model's own, which is put in its place."""
     raise TypeError("no model is bound")
 
 
-def unpack(a: Any) -> Any:
+def unpack_state(a: Any) -> Any:
     """The state that the array `a` holds. This one stands for a model's own."""
     raise TypeError("no model is bound")

@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import Function, compiled
+from plant.compile import Function, compile_function
 from plant.effects import CATALOGUE
-from plant.model import Model, bindings
+from plant.model import Model, collect_bindings
 from plant.ports import at_jack_drag, at_load, at_position
-from plant.replay import rested
+from plant.replay import rest_at_reading
 from plant.state import Drag, Input, Memory, Ports, State
-from plant.step import Coefficients, coefficients, metering, oiled
+from plant.step import Coefficients, apply_oil, compute_coefficients, compute_metering_line
 
 Array = NDArray[np.float64]
 STEPS, FINE = 5, 100  # a cycle: what was stiff is given here, only effects that remember want many
 
 
-def flow_balance(model: Model, spool: Array, pressure: Array, position: float) -> tuple[Array, Array]:
+def compute_flow_balance(model: Model, spool: Array, pressure: Array, position: float) -> tuple[Array, Array]:
     """Ram position as sensed, m, and speed, m/s, that measured XS (n,) m and P12 (n,) Pa ask for; (n,) both.
 
     The metering edges' law P12(XS, v) solved for v; without effects AJ v = GQ (XS - P12/GP) - CLK P12. The run starts
@@ -32,11 +32,12 @@ def flow_balance(model: Model, spool: Array, pressure: Array, position: float) -
     """
     out = np.empty((len(spool), 2))
     columns = np.ascontiguousarray(np.column_stack([spool, pressure]), float)
-    _kernel(flow, model)(model.state(), columns, float(position), model.record(), _steps(model), out)
+    run = _find_kernel(run_flow_balance, model)
+    run(model.state(), columns, float(position), model.record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy()
 
 
-def force_balance(model: Model, position: Array, speed: Array, pressure: Array,
+def compute_force_balance(model: Model, position: Array, speed: Array, pressure: Array,
                   load: Array) -> tuple[Array, Array, Array]:
     """What the ram's motion takes, N: inertia, viscous drag and loads; and its static and dynamic dry friction.
 
@@ -46,54 +47,56 @@ def force_balance(model: Model, position: Array, speed: Array, pressure: Array,
     out = np.empty((len(speed), 3))
     rate = np.gradient(speed, model["controller.period"])
     columns = np.ascontiguousarray(np.column_stack([position, speed, rate, pressure, load]), float)
-    _kernel(force, model)(model.state(), columns, model.record(), _steps(model), out)
+    run = _find_kernel(run_force_balance, model)
+    run(model.state(), columns, model.record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
 
 
-def _steps(model: Model) -> int:
+def _choose_steps(model: Model) -> int:
     return FINE if any(CATALOGUE[e].memory is not None for e in model.effects) else STEPS
 
 
-def _kernel(function: Function, model: Model) -> Function:
-    return _compiled(function, model.effects, tuple(CATALOGUE[e].function for e in model.effects))
+def _find_kernel(function: Function, model: Model) -> Function:
+    return _compile_balance(function, model.effects, tuple(CATALOGUE[e].function for e in model.effects))
 
 
 @cache
-def _compiled(function: Function, effects: tuple[str, ...], laws: tuple[Function, ...]) -> Function:
-    return compiled(function, bindings(effects))  # by their laws too: a user's file may have been loaded anew
+def _compile_balance(function: Function, effects: tuple[str, ...], laws: tuple[Function, ...]) -> Function:
+    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
+    return compile_function(function, collect_bindings(effects))
 
 
-def excess(v: float, s: State, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
+def compute_pressure_excess(v: float, s: State, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
     """By how much the edges' pressure at ram speed v exceeds the state's, Pa; and what is remembered then."""
     m = s.memory
     s = State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, v, s.pressure,
               s.sensed, m)
-    k, m_supply, m_viscosity = oiled(constant, s, u, p)
-    line, m_metering, m_valve = metering(s, u, p, k, s.spool_position)
+    k, m_supply, m_viscosity = apply_oil(constant, s, u, p)
+    line, m_metering, m_valve = compute_metering_line(s, u, p, k, s.spool_position)
     ports = Ports(m.command, m.current, m_supply, m_viscosity, m.nozzle, m.feedback, m.spool_force, m_metering,
                   m_valve, m.load, m.jack_drag, m.position, m.reading)
     return line.offset - line.slope * v, ports
 
 
-def asked(s: State, p12: float, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
+def solve_ram_speed(s: State, p12: float, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
     """Ram speed at which the edges' pressure is `p12`, Pa; by secants from the last speed, exact for a line."""
     v0 = s.jack_speed
-    f0, ports = excess(v0, s, u, p, constant)
+    f0, ports = compute_pressure_excess(v0, s, u, p, constant)
     v1 = v0 + (f0 - p12) / constant.valve_slope
     for _ in range(3):
-        f1, ports = excess(v1, s, u, p, constant)
+        f1, ports = compute_pressure_excess(v1, s, u, p, constant)
         slope = (f1 - f0) / (v1 - v0) if v1 != v0 else 0.0
         v2 = v1 - (f1 - p12) / slope if slope != 0.0 else v1
         v0, f0, v1 = v1, f1, v2
     return v1, ports
 
 
-def flow(s: State, measured: Any, position: float, record: Any, steps: int, out: Any) -> None:
+def run_flow_balance(s: State, measured: Any, position: float, record: Any, steps: int, out: Any) -> None:
     """Fills out[k] = XJ as sensed and v at sample k, from measured (n, 2): spool position m, pressure Pa."""
     p = record[0]
     h = p.controller.period / steps
-    constant = coefficients(p, h)
-    s = rested(s, position, p, steps)
+    constant = compute_coefficients(p, h)
+    s = rest_at_reading(s, position, p, steps)
     last = len(measured) - 1
     for k in range(len(measured)):
         ahead = k + 1 if k < last else k
@@ -103,21 +106,21 @@ def flow(s: State, measured: Any, position: float, record: Any, steps: int, out:
             p12 = measured[k, 1] + part * (measured[ahead, 1] - measured[k, 1])
             u = Input(0.0, 0.0, 0.0, k * p.controller.period + i * h, i * h, h)
             s = State(0.0, 0.0, xs, 0.0, s.jack_position, s.jack_speed, s.pressure, s.sensed, s.memory)
-            v, m = asked(s, p12, u, p, constant)
+            v, m = solve_ram_speed(s, p12, u, p, constant)
             if i == 0:
                 out[k, 0], out[k, 1] = s.sensed, v
             now = State(0.0, 0.0, xs, 0.0, s.jack_position + h * v, v, p12, s.sensed, m)
             sensed, m_position = at_position(now.jack_position, m.position, now, u, p)
-            s = State(0.0, 0.0, xs, 0.0, now.jack_position, v, p12, sensed, placed(m, m_position))
+            s = State(0.0, 0.0, xs, 0.0, now.jack_position, v, p12, sensed, replace_position_memory(m, m_position))
 
 
-def placed(m: Ports, position: Memory) -> Ports:
+def replace_position_memory(m: Ports, position: Memory) -> Ports:
     """`m` with another memory of the port `position`."""
     return Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering, m.valve,
                  m.load, m.jack_drag, position, m.reading)
 
 
-def force(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
+def run_force_balance(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
     """Fills out[k] = MJ a + CJ v + FR, static and dynamic friction, N, at sample k, for a motion that is given.
 
     `motion` (n, 5): position m, speed m/s, acceleration m/s2, P12 Pa, load N.
@@ -125,7 +128,7 @@ def force(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
     p = record[0]
     g = p.jack
     h = p.controller.period / steps
-    constant = coefficients(p, h)
+    constant = compute_coefficients(p, h)
     m_load, m_drag = s.memory.load, s.memory.jack_drag
     for k in range(len(motion)):
         x, v, rate, p12, load = motion[k, 0], motion[k, 1], motion[k, 2], motion[k, 3], motion[k, 4]
@@ -135,6 +138,6 @@ def force(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
             outside, m_load = at_load(load, m_load, now, u, p)
             drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), m_drag, now, u, p)
             if i == 0:
-                oil, _, _ = oiled(constant, now, u, p)
+                oil, _, _ = apply_oil(constant, now, u, p)
                 out[k, 0] = g.mass * rate + (oil.jack_damping + drag.damping) * v + outside + drag.force
                 out[k, 1], out[k, 2] = drag.static, drag.dynamic

@@ -25,7 +25,7 @@ def play(x: float, held: float, half: float) -> float:
     return held if held < x + half else x + half
 
 
-def slide(v0: float, impulse: float, push: float, line: float, slope: float, limit: float, dry: float,
+def solve_velocity(v0: float, impulse: float, push: float, line: float, slope: float, limit: float, dry: float,
           free: float, coupled: float) -> float:
     """Velocity after the step of  m v' = F + A clip(p0 - s v, +-limit) - c v - dry(v), implicit in v.
 

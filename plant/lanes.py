@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import block, flat
-from plant.compile import Function, costly
+from plant.compile import Function, is_costly
 from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
-from plant.model import Model, bare
-from plant.threads import mapped, threads
+from plant.model import Model, build_bare_model
+from plant.threads import count_threads, map_in_threads
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
@@ -26,12 +26,12 @@ class Lanes:
 
     def __init__(self, model: Model, names: Sequence[str], steps: int = STEPS, workers: int | None = None) -> None:
         self.model, self.names, self.steps = model, tuple(names), steps
-        self.workers = workers or threads()
+        self.workers = workers or count_threads()
         known = model.names()
         for name in self.names:
             if name not in known or name == "controller.period":
                 raise InputError("lanes", name, f"a parameter of the model {model.name} other than the period")
-        self._rungs = ladder(model)
+        self._rungs = list_kernel_variants(model)
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
                anchor: float = 0.0) -> Array:
@@ -85,10 +85,10 @@ class Lanes:
             run, buffer, rows = task
             run(buffer, *inputs, rows, out)
 
-        mapped(do, work, self.workers)
+        map_in_threads(do, work, self.workers)
         return out[:-1].transpose(0, 2, 1)
 
-    def _shared_out(self, values: Array) -> list[tuple[Rung, NDArray[np.int64]]]:
+    def _shared_out(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """Which runs go where: each to the model with the fewest effects that has all that are at work in it."""
         effects = self.model.effects
         if len(self._rungs) == 1:
@@ -112,13 +112,13 @@ class Lanes:
         return changed
 
 
-class Rung:
+class KernelVariant:
     """A model's kernel, or that of the same model with fewer effects."""
 
     def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
-        own = set(bare(model.plant).having(effects).values)
+        own = set(build_bare_model(model.plant).having(effects).values)
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
-        self._names, self._laws = self.model.names(), laws(effects)
+        self._names, self._laws = self.model.names(), list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.record().view(np.float64)[:, None]
 
@@ -130,9 +130,9 @@ class Rung:
         """
         model = self.model
         width = block.WIDE if len(members) >= 2 * block.WIDE and not model.effects else block.NARROW
-        plan, run = _compiled(model.effects, self._laws, model.plant, width)
+        plan, run = _compile_layout(model.effects, self._laws, model.plant, width)
         if self._state is None:  # not sooner: it asks laws, which may be wrong
-            self._state = np.array(flat.values(model.state()))
+            self._state = np.array(flat.list_state_values(model.state()))
         start = np.zeros((plan.numbers, width))
         start[:len(self._state)] = self._state[:, None]
         start[plan.parameters:] = self._parameters
@@ -147,7 +147,7 @@ class Rung:
             yield run, buffer.reshape(-1), rows.astype(np.uint64)  # unsigned: no test for counting from the end
 
 
-def ladder(model: Model) -> list[Rung]:
+def list_kernel_variants(model: Model) -> list[KernelVariant]:
     """Kernels for the runs of a model, from few effects to all it has.
 
     An effect at its off value changes no bit, so a run may be made without it. A model with many effects has three:
@@ -155,18 +155,18 @@ def ladder(model: Model) -> list[Rung]:
     would save less than they take to compile.
     """
     if len(model.effects) <= FEW:
-        return [Rung(model, model.effects)]
-    cheap = tuple(name for name in model.effects if _cheap(CATALOGUE[name]))
-    return [Rung(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
+        return [KernelVariant(model, model.effects)]
+    cheap = tuple(name for name in model.effects if _is_cheap(CATALOGUE[name]))
+    return [KernelVariant(model, effects) for effects in dict.fromkeys(((), cheap, model.effects))]
 
 
-def warm(model: Model, progress: Callable[[str, float], None] = lambda stage, share: None) -> None:
+def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambda stage, share: None) -> None:
     """Compile what runs of the model may need, or load it from the cache.
 
     `progress` is called with each stage and the share done.
     The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
     """
-    rungs = ladder(model)
+    rungs = list_kernel_variants(model)
     for done, rung in enumerate(rungs):
         progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
         for run, buffer, rows in rung.blocks((), np.zeros((1, 0)), np.arange(1)):
@@ -175,20 +175,20 @@ def warm(model: Model, progress: Callable[[str, float], None] = lambda stage, sh
     progress("", 1.0)
 
 
-def _cheap(effect: Effect) -> bool:
+def _is_cheap(effect: Effect) -> bool:
     """Whether a law of ours neither divides nor calls elementary functions, nor changes the oil, which does both."""
     if effect.port in ("supply", "viscosity") or effect.function is None:
         return False
-    return effect.function.__module__.startswith("plant.") and not costly(effect.function)
+    return effect.function.__module__.startswith("plant.") and not is_costly(effect.function)
 
 
-def laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
+def list_laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
     """The functions behind the names, as a user's file may have been loaded anew."""
     return tuple(CATALOGUE[e].function for e in effects)
 
 
 @cache
-def _compiled(effects: tuple[str, ...], functions: tuple[Any, ...], plant: str, width: int
+def _compile_layout(effects: tuple[str, ...], functions: tuple[Any, ...], plant: str, width: int
               ) -> tuple[block.Layout, Function]:
-    plan = block.layout(effects, plant, width)
-    return plan, block.kernel(plan)
+    plan = block.plan_layout(effects, plant, width)
+    return plan, block.compile_block_kernel(plan)

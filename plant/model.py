@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from plant import flat, plants, solve
 from plant import step as step_module
-from plant.compile import Function, cache_folder, compiled, fingerprint, interpreted
-from plant.effects import CATALOGUE, Effect, at
+from plant.compile import Function, compile_function, compute_fingerprint, find_cache_folder, interpret_function
+from plant.effects import CATALOGUE, Effect, combine_laws
 from plant.errors import InputError
 from plant.machine_code import StoredCode
-from plant.parameters import accept, flatten, read_toml, resolve, sensible
+from plant.parameters import check_combinations, find_field, flatten_tables, parse_value, read_toml
 from plant.plants import Plant
 from plant.quantity import Quantity
 from plant.state import Input, Ports, State
@@ -25,26 +25,26 @@ from plant.state import Input, Ports, State
 STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
 
 
-def known_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
+def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
     """Every parameter group: the plant's own and those of `effects` (default: all in the catalogue that suit it)."""
-    kind = plants.find(plant)
-    chosen = offered(plant) if effects is None else [CATALOGUE[name] for name in effects]
+    kind = plants.find_plant(plant)
+    chosen = list_offered_effects(plant) if effects is None else [CATALOGUE[name] for name in effects]
     return {**kind.groups, **{e.name: e.group for e in chosen if e.group is not None}}
 
 
-def offered(plant: str = "eha") -> list[Effect]:
+def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that make sense in a plant."""
-    kind = plants.find(plant)
+    kind = plants.find_plant(plant)
     return [e for e in CATALOGUE.whole().values() if kind.offers(e)]
 
 
-def meaning(name: str, where: object = "--set", plant: str = "eha") -> Quantity:
+def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Quantity:
     """What the parameter "group.field" means, whichever effect it belongs to.
 
     Raises:
         InputError: there is no such parameter.
     """
-    return resolve(where, name, known_groups(plant=plant))
+    return find_field(where, name, find_parameter_groups(plant=plant))
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class Model:
     """A plant with parameter `values` ("group.field" to SI number) and `effects`, in catalogue order."""
 
     name: str = "eha"
-    values: Mapping[str, float] = field(default_factory=lambda: dict(plants.find("eha").nominal))
+    values: Mapping[str, float] = field(default_factory=lambda: dict(plants.find_plant("eha").nominal))
     effects: tuple[str, ...] = ()
     plant: str = "eha"
 
     @property
     def kind(self) -> Plant:
         """The plant itself: what the values are values of."""
-        return plants.find(self.plant)
+        return plants.find_plant(self.plant)
 
     def replace(self, changes: Mapping[str, object], where: object = "--set") -> Model:
         """The model with some parameters changed; naming an effect's parameter gives the model that effect.
@@ -67,12 +67,13 @@ class Model:
         Raises:
             InputError: an unknown name, an impossible value, or values that contradict each other.
         """
-        known = known_groups(plant=self.plant)
-        values = {name: accept(where, name, resolve(where, name, known), value) for name, value in changes.items()}
+        known = find_parameter_groups(plant=self.plant)
+        values = {name: parse_value(where, name, find_field(where, name, known), value)
+                  for name, value in changes.items()}
         model = self.having(name.partition(".")[0] for name in changes)
         merged = {**model.values, **values}
-        sensible(where, merged)
-        compatible(where, model.effects, merged)
+        check_combinations(where, merged)
+        check_exclusions(where, model.effects, merged)
         return replace(model, values=merged)
 
     def having(self, groups: Iterable[str]) -> Model:
@@ -104,7 +105,7 @@ class Model:
             if head != group:
                 group = head
                 lines += ["", f"[{group}]"]
-            quantity = meaning(name, plant=self.plant)
+            quantity = find_quantity(name, plant=self.plant)
             word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
             lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
         return "\n".join(lines) + "\n"
@@ -114,7 +115,7 @@ class Model:
         return [f"{group}.{f}" for group, cls in self._groups().items() for f in cls._fields]
 
     def _groups(self) -> dict[str, type[Any]]:
-        return known_groups(self.effects, self.plant)
+        return find_parameter_groups(self.effects, self.plant)
 
     def record(self) -> NDArray[Any]:
         """The values as a one-row record array, fields group.field: what compiled code reads, live."""
@@ -125,10 +126,11 @@ class Model:
 
     def state(self) -> State:
         """The centred actuator at rest, with the memory of this model's effects, as its transducer shows it."""
-        s = initial(self.effects)
+        s = build_initial_state(self.effects)
         if not any(CATALOGUE[e].port == "position" for e in self.effects):
             return s
-        law = at("position", self.effects)[0]  # once in plain Python: the first sample comes before the first step
+        # once in plain Python, because the first sample is read before the first step
+        law = combine_laws("position", self.effects)[0]
         return s._replace(sensed=float(law(s.jack_position, s.memory.position, s, Input(), self.record()[0])[0]))
 
 
@@ -138,17 +140,17 @@ def load_model(source: str | Path = "eha") -> Model:
     Raises:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
     """
-    if str(source) in plants.names():
-        return bare(str(source)).having(plants.find(str(source)).has)
+    if str(source) in plants.list_plants():
+        return build_bare_model(str(source)).having(plants.find_plant(str(source)).has)
     path = Path(source)
     if not path.is_file():
-        raise InputError(source, "", f"a model file, or one of {', '.join(plants.names())} for a nominal model")
+        raise InputError(source, "", f"a model file, or one of {', '.join(plants.list_plants())} for a nominal model")
     return parse_model(read_toml(path), path, path.stem)
 
 
-def bare(plant: str, name: str = "") -> Model:
+def build_bare_model(plant: str, name: str = "") -> Model:
     """A plant at its nominal values, without effects."""
-    kind = plants.find(plant)
+    kind = plants.find_plant(plant)
     own = {n: v for n, v in kind.nominal.items() if n.partition(".")[0] in kind.groups}
     return Model(name or plant, own, (), plant)
 
@@ -161,16 +163,17 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     tables.pop("provenance", None)
     if not isinstance(name, str) or not name:
         raise InputError(where, "name", f"a text, not {name!r}")
-    if plant not in plants.names():
-        raise InputError(where, "plant", f"one of {', '.join(plants.names())}, not {plant!r}")
-    known = [e.name for e in offered(plant)]  # a list, as what stands in a file need not be hashable
+    if plant not in plants.list_plants():
+        raise InputError(where, "plant", f"one of {', '.join(plants.list_plants())}, not {plant!r}")
+    known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
     if unknown:
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}")
-    return bare(plant, name).having(effects).replace(flatten(where, tables, known_groups(plant=plant)), where)
+    values = flatten_tables(where, tables, find_parameter_groups(plant=plant))
+    return build_bare_model(plant, name).having(effects).replace(values, where)
 
 
-def compatible(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
+def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
     """Refuse two effects at work that exclude each other; at its off value one may stand beside the other."""
     working = {e for e in effects if CATALOGUE[e].acts(values)}
     for e in sorted(working):
@@ -178,32 +181,32 @@ def compatible(where: object, effects: Iterable[str], values: Mapping[str, float
             raise InputError(where, e, f"{e} or {other}, not both at work")
 
 
-def entry(name: str, plant: str = "eha") -> Effect:
+def find_effect(name: str, plant: str = "eha") -> Effect:
     """An effect of the catalogue by name, as far as it makes sense in a plant.
 
     Raises:
         InputError: there is none of that name.
     """
-    known = {e.name: e for e in offered(plant)}
+    known = {e.name: e for e in list_offered_effects(plant)}
     if name not in known:
         raise InputError("effect", name, f"one of {', '.join(known)}")
     return known[name]
 
 
-def initial(effects: tuple[str, ...]) -> State:
+def build_initial_state(effects: tuple[str, ...]) -> State:
     """The actuator at rest with the memory of `effects`."""
-    return State(memory=Ports(*(at(port, effects)[1] for port in Ports._fields)))
+    return State(memory=Ports(*(combine_laws(port, effects)[1] for port in Ports._fields)))
 
 
-def kernel(name: str, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:
+def build_kernel(name: str, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:
     """The function `plant.solve.<name>` for a plant with `effects`, compiled once per set, or interpreted."""
     laws = tuple(CATALOGUE[e].function for e in effects)
-    return _kernel(name, effects, laws, fast, plant)
+    return _build_kernel(name, effects, laws, fast, plant)
 
 
 @cache
-def _kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str) -> Function:
-    return (compiled if fast else interpreted)(getattr(solve, name), bindings(effects, plant))
+def _build_kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str) -> Function:
+    return (compile_function if fast else interpret_function)(getattr(solve, name), collect_bindings(effects, plant))
 
 
 def stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
@@ -213,18 +216,19 @@ def stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
 
 @cache
 def _stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> StoredCode:
-    source = fingerprint(interpreted(solve.advance, bindings(effects, plant)))
-    return StoredCode(cache_folder() / source, lambda: _kernel("advance", effects, laws, True, plant))
+    source = compute_fingerprint(interpret_function(solve.advance_flat_state, collect_bindings(effects, plant)))
+    compile_code = partial(_build_kernel, "advance_flat_state", effects, laws, True, plant)
+    return StoredCode(find_cache_folder() / source, compile_code)
 
 
-def bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
+def collect_bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
     """What stands for step, port functions and the packing of the state in a plant with `effects`."""
-    ports = {f"at_{port}": at(port, effects)[0] for port in Ports._fields}
-    kind = plants.find(plant)
-    ports["step"], ports["coefficients"] = kind.step, kind.coefficients
-    ports["pack"], ports["unpack"] = flat.packers(initial(effects))
+    ports = {f"at_{port}": combine_laws(port, effects)[0] for port in Ports._fields}
+    kind = plants.find_plant(plant)
+    ports["step_plant"], ports["compute_coefficients"] = kind.step, kind.coefficients
+    ports["pack_state"], ports["unpack_state"] = flat.make_packers(build_initial_state(effects))
     if any(CATALOGUE[e].port in ("supply", "viscosity") for e in effects):
-        ports["oiled"] = step_module.changing_oil
-    if kind.step is not step_module.step or any(CATALOGUE[e].port in ("valve", "jack_drag") for e in effects):
-        ports["yielding"] = step_module.as_resisted
+        ports["apply_oil"] = step_module.apply_changing_oil
+    if kind.step is not step_module.step_plant or any(CATALOGUE[e].port in ("valve", "jack_drag") for e in effects):
+        ports["compute_compliance"] = step_module.update_compliance
     return ports

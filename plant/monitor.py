@@ -18,21 +18,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import Function, compiled
-from plant.controller import Loop, answer
+from plant.compile import Function, compile_function
+from plant.controller import Loop, compute_current
 from plant.errors import InputError
-from plant.flat import lane_packers
+from plant.flat import make_lane_packers
 from plant.friction import clip, soften
 from plant.model import Model
 from plant.parameters import Controller
-from plant.threads import mapped, threads
+from plant.threads import count_threads, map_in_threads
 
 Array = NDArray[np.float64]
 Reduction = Callable[[Array], Array]
 
 FAULTS = ("filter.clogging", "spool.static_friction")
 WIDTH = 64  # runs side by side
-FEWEST = 1e-300  # stands for no speed at all, where something is divided by it
+LEAST_SPEED = 1e-300  # stands for no speed at all, where something is divided by it
 
 
 class Cell(NamedTuple):
@@ -76,7 +76,7 @@ class Drive(NamedTuple):
     next: float = 0.0
 
 
-def decay(x: float) -> float:
+def compute_decay(x: float) -> float:
     """e^x for -1 <= x <= 0, to 4e-11, and at the usual -0.25 to 1e-15: Taylor's series for a quarter, squared twice."""
     x = 0.25 * x
     y = 1.0 + x * (1.0 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720 + x * (
@@ -85,7 +85,7 @@ def decay(x: float) -> float:
     return y * y
 
 
-def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
+def step_monitor(s: Motion, current: float, h: float, c: Cell) -> Motion:
     """The monitor `h` seconds later, the current held.
 
     Exact, but for the step in which the spool meets its stop or P12 its limit, and for the bend of XS within the lag.
@@ -96,7 +96,7 @@ def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
     begin = clip(asked, c.most)
     wait = abs(asked - begin) * c.wait  # s, the flapper at its stop
     wait = wait if wait < h else h
-    end = begin * decay(c.rate * (wait - h))
+    end = begin * compute_decay(c.rate * (wait - h))
     line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
     spool = clip(s.spool + line + curve, c.spool_travel)
     area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
@@ -113,7 +113,7 @@ def step(s: Motion, current: float, h: float, c: Cell) -> Motion:
     return Motion(spool, clip(x, c.jack_travel), v if abs(x) <= c.jack_travel else 0.0, sliding)
 
 
-def cells(model: Model, names: Sequence[str], values: Array, h: float, sliding: float) -> Array:
+def compute_cells(model: Model, names: Sequence[str], values: Array, h: float, sliding: float) -> Array:
     """Cells of many runs, (fields, m): `values` (m, len(names)) in place of those of the model, steps of `h` s.
 
     A spool that slides has `sliding` times the friction of one that is stuck.
@@ -132,20 +132,20 @@ def cells(model: Model, names: Sequence[str], values: Array, h: float, sliding: 
     lag, back, inertia = mj / (aj * slope + cj), ksf / kf, 1.0 / (mj + h * cj)
     return np.array([  # as the fields of Cell
         of("torque_motor.gain") / kf, back, 1.0 / back, dead, sliding * dead, most, speed, speed * back,
-        1.0 / (speed * back), 1.0 / np.maximum(speed * back * most, FEWEST), of("spool.travel"),
+        1.0 / (speed * back), 1.0 / np.maximum(speed * back * most, LEAST_SPEED), of("spool.travel"),
         gp * aj / (aj * slope + cj), lag, np.exp(-h / lag), h * aj * psr * inertia, mj * inertia, of("jack.travel"),
         gp, slope, psr])
 
 
-def _bound(*arguments: Any) -> Any:
+def _raise_unbound(*arguments: Any) -> Any:
     raise TypeError("no layout is bound")
 
 
 # each of these is put in its place by `kernel`: x_at(buffer, lane), keep_x(x, buffer, lane)
-motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _bound
+motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _raise_unbound
 
 
-def sample(a: Any, lane: int, pulled: float, shown: float) -> float:
+def sample_lane(a: Any, lane: int, pulled: float, shown: float) -> float:
     """What one lane's ram shows; and the ram pulled by a share to the position `shown`."""
     s = motion_at(a, lane)
     keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
@@ -153,14 +153,15 @@ def sample(a: Any, lane: int, pulled: float, shown: float) -> float:
     return position
 
 
-def control(a: Any, lane: int, demand: float, position: float) -> None:
+def control_lane(a: Any, lane: int, demand: float, position: float) -> None:
     """The controller of one lane answers to a demand; that acts in the next cycle."""
-    cor, loop = answer(loop_at(a, lane), demand, position, controller_at(a, lane))
+    cor, loop = compute_current(loop_at(a, lane), demand, position, controller_at(a, lane))
     keep_loop(loop, a, lane)
     keep_drive(Drive(drive_at(a, lane).next, cor), a, lane)
 
 
-def run(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int, out: Any) -> None:
+def run_monitor_block(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
+                      out: Any) -> None:
     """A block of runs; fills out[:, k, lane] = XJ, or XJ, Cor, P12 and XS, at sample k.
 
     Args:
@@ -181,10 +182,10 @@ def run(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period:
         there = len(position) == n and position[k] == position[k]
         pulled, shown = (anchor * period, position[k]) if there else (0.0, 0.0)
         for lane in range(WIDTH):
-            out[0, k, lane] = sample(a, lane, pulled, shown)
+            out[0, k, lane] = sample_lane(a, lane, pulled, shown)
         if closed:
             for lane in range(WIDTH):
-                control(a, lane, driven[k], out[0, k, lane])
+                control_lane(a, lane, driven[k], out[0, k, lane])
         if len(out) > 1:
             for lane in range(WIDTH):
                 s, c = motion_at(a, lane), cell_at(a, lane)
@@ -194,10 +195,10 @@ def run(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period:
         for _ in range(steps):
             if closed:
                 for lane in range(WIDTH):  # the loop that everything is for
-                    keep_motion(step(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
+                    keep_motion(step_monitor(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
             else:
                 for lane in range(WIDTH):
-                    keep_motion(step(motion_at(a, lane), given, h, cell_at(a, lane)), a, lane)
+                    keep_motion(step_monitor(motion_at(a, lane), given, h, cell_at(a, lane)), a, lane)
 
 
 PARTS = {"motion": Motion(), "loop": Loop(), "drive": Drive(), "cell": Cell(*[0.0] * len(Cell._fields)),
@@ -206,12 +207,12 @@ STATES = 9  # numbers of the first three
 
 
 @cache
-def kernel() -> Function:
+def compile_monitor_kernel() -> Function:
     """`run` as machine code; the first time on a machine this takes some seconds."""
     made, place = {}, 0
     for name, shape in PARTS.items():
-        made[f"keep_{name}"], made[f"{name}_at"], place = lane_packers(shape, WIDTH, place)
-    return compiled(run, made)
+        made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, WIDTH, place)
+    return compile_function(run_monitor_block, made)
 
 
 class Monitor:
@@ -224,7 +225,7 @@ class Monitor:
     def __init__(self, model: Model, names: Sequence[str] = FAULTS, steps: int = 1, workers: int | None = None,
                  sliding: float = 1.0) -> None:
         self.model, self.names, self.steps, self.sliding = model, tuple(names), steps, sliding
-        self.workers = workers or threads()
+        self.workers = workers or count_threads()
         for name in self.names:
             if name not in model.values or name == "controller.period" or model.plant != "eha":
                 raise InputError("monitor", name, "a parameter of the reference model other than the period")
@@ -263,23 +264,23 @@ class Monitor:
             raise InputError("monitor", "position", "one a cycle, the first of them known, "
                              f"not {position.shape} beside {driven.shape}")
         period = float(self.model["controller.period"])
-        kv = cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
+        kv = compute_cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
         steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # as far as `decay` goes; one for any usual pilot
         inputs = driven, position, float(anchor), closed, period, steps
-        run = kernel()
+        run = compile_monitor_kernel()
 
         def do(block: tuple[int, Array]) -> Array:
             out = np.empty((4 if whole else 1, len(driven), WIDTH))
             run(block[1], *inputs, out)
             return reduced(out[:, :, :block[0]].transpose(2, 0, 1))
 
-        return np.concatenate(mapped(do, self._blocks(values, period / steps), self.workers))
+        return np.concatenate(map_in_threads(do, self._blocks(values, period / steps), self.workers))
 
     def _blocks(self, values: Array, h: float) -> Iterator[tuple[int, Array]]:
         """The runs WIDTH at a time: how many they are, and the buffer at the start; idle lanes repeat the last run."""
         fixed = [values[:, self.names.index(name)] if name in self.names else np.full(len(values), self.model[name])
                  for name in (f"controller.{field}" for field in Controller._fields)]
-        numbers = np.array([*cells(self.model, self.names, values, h, self.sliding), *fixed])  # (numbers, m)
+        numbers = np.array([*compute_cells(self.model, self.names, values, h, self.sliding), *fixed])  # (numbers, m)
         for first in range(0, len(values), WIDTH):
             lanes = np.minimum(np.arange(first, first + WIDTH), len(values) - 1)
             buffer = np.concatenate([np.zeros((STATES, WIDTH)), numbers[:, lanes]])

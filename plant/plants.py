@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import step as reference
-from plant.compile import Function, called
+from plant.compile import Function, list_called_names
 from plant.effects import Effect
 from plant.errors import InputError
-from plant.parameters import GROUPS, nominal
+from plant.parameters import GROUPS, load_nominal_values
 from plant.quantity import Quantity
 
 Array = NDArray[np.float64]
@@ -82,7 +82,9 @@ class Plant:
     @cached_property
     def ports(self) -> frozenset[str]:
         """Where effects can act: the ports that its step calls, and those of the sampled loop around it."""
-        calls = called(self.step) | (called(reference.changing_oil) if self.step is reference.step else set())
+        calls = list_called_names(self.step)
+        if self.step is reference.step_plant:
+            calls = calls | list_called_names(reference.apply_changing_oil)
         return frozenset({"command", "reading"} | {name[3:] for name in calls if name.startswith("at_")})
 
     def offers(self, e: Effect) -> bool:
@@ -94,25 +96,25 @@ class Plant:
         return e.port in self.ports and (self.unit == "A" or "A" not in {q.unit for q in e.parameters.values()})
 
 
-def find(name: str) -> Plant:
+def find_plant(name: str) -> Plant:
     """The plant of that name.
 
     Raises:
         InputError: there is none.
     """
     if name == "eha":
-        return _reference()
+        return _build_reference_plant()
     if name not in MODULES:
-        raise InputError("plant", name, f"one of {', '.join(names())}")
+        raise InputError("plant", name, f"one of {', '.join(list_plants())}")
     plant: Plant = importlib.import_module(MODULES[name]).PLANT
     return plant
 
 
-def names() -> tuple[str, ...]:
+def list_plants() -> tuple[str, ...]:
     """All plants."""
     return ("eha", *MODULES)
 
 
 @cache
-def _reference() -> Plant:
-    return Plant("eha", "A", reference.step, reference.coefficients, GROUPS, nominal())
+def _build_reference_plant() -> Plant:
+    return Plant("eha", "A", reference.step_plant, reference.compute_coefficients, GROUPS, load_nominal_values())

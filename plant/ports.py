@@ -9,44 +9,44 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from plant.compile import Function, rebind
+from plant.compile import Function, rebind_names
 from plant.state import Input, Memory, State
 
 
-def through(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+def pass_signal(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
     """A port without effects: the signal passes."""
     return x, m
 
 
-at_command = at_current = at_nozzle = at_feedback = at_spool_force = at_metering = through
-at_valve = at_load = at_jack_drag = at_position = at_reading = at_supply = at_viscosity = through
+at_command = at_current = at_nozzle = at_feedback = at_spool_force = at_metering = pass_signal
+at_valve = at_load = at_jack_drag = at_position = at_reading = at_supply = at_viscosity = pass_signal
 
 
-def chain(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:
+def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:
     """Laws with the type of their memory (None: they remember nothing) as one function, and its first memory.
 
     They act in the order given. Memories nest as the functions do: ((first, second), third).
     """
-    whole: Function = through
+    whole: Function = pass_signal
     remembered: Memory = 0.0
     for function, memory in laws:
-        one, own = (rebind(_forgetful, law=function), 0.0) if memory is None else (function, memory())
-        if whole is not through:
-            one, own = rebind(_then, first=whole, second=one), (remembered, own)
+        one, own = (rebind_names(_apply_without_memory, law=function), 0.0) if memory is None else (function, memory())
+        if whole is not pass_signal:
+            one, own = rebind_names(_apply_in_sequence, first=whole, second=one), (remembered, own)
         whole, remembered = one, own
     return whole, remembered
 
 
-law: Function = through
-first: Function = through
-second: Function = through  # these three are bound in each link of a chain
+law: Function = pass_signal
+first: Function = pass_signal
+second: Function = pass_signal  # these three are bound in each link of a chain
 
 
-def _forgetful(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+def _apply_without_memory(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
     return law(x, s, u, p), m
 
 
-def _then(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
+def _apply_in_sequence(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[Any, Memory]:
     x, a = first(x, m[0], s, u, p)
     x, b = second(x, m[1], s, u, p)
     return x, (a, b)

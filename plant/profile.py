@@ -15,7 +15,7 @@ from plant.errors import InputError
 from plant.segments import FARTHEST, LONGEST, RATE, STRONGEST, Array, Segment, require
 
 SLACK = 0.01  # of a cycle: a time within it of a row is that row's
-_SANE = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
+_LARGEST = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
 
 
 class Section(NamedTuple):
@@ -42,12 +42,12 @@ class Command(NamedTuple):
     load: Array | None  # N, None without such a column
 
 
-def names(segments: Sequence[Segment]) -> list[str]:
+def name_sections(segments: Sequence[Segment]) -> list[str]:
     """What the sections of a command are called: their own name, or kind_number with the segment's number from 1."""
     return [segment.name or f"{segment.kind}_{number}" for number, segment in enumerate(segments, 1)]
 
 
-def build(segments: Sequence[Segment], start: float = 0.0) -> Profile:
+def build_profile(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     """Lay segments end to end from the demand `start` (m). No segments: an empty command that ends where it starts.
 
     Raises InputError when two sections have the same name.
@@ -55,7 +55,7 @@ def build(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     pieces: list[Array] = [np.empty(0)]
     sections: list[Section] = []
     last, begin = start, 0
-    for segment, name in zip(segments, names(segments), strict=True):
+    for segment, name in zip(segments, name_sections(segments), strict=True):
         cycles = round(segment.duration * RATE)
         demand = segment.demand(np.arange(cycles + 1) / RATE, last)
         pieces.append(demand[:-1])
@@ -88,18 +88,18 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[
     Rows and cycles need not agree: see `on_cycles`. Other columns are ignored, so a trace is a command too.
     Raises InputError for what is not a number, not finite, or not in order of time.
     """
-    rows = _rows(data, where)
+    rows = _read_rows(data, where)
     _, header = next(rows, (0, [""]))
     titles = [title.strip().lower() for title in header]
     if "t" not in titles:
         raise InputError(where, "line 1", "a header with a column t and commas between columns")
     picked: dict[str, int] = {name: titles.index(name) for name in ("t", "com", "value", "load") if name in titles}
-    table = {name: np.array(values) for name, values in _numbers(rows, picked, where).items()}
+    table = {name: np.array(values) for name, values in _parse_numbers(rows, picked, where).items()}
     t = table.pop("t")
-    return {name: on_cycles(t, values, period) for name, values in table.items()}
+    return {name: resample_on_cycles(t, values, period) for name, values in table.items()}
 
 
-def on_cycles(t: Array, values: Array, period: float) -> Array:
+def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
     """What is asked for at the start of each cycle, when `values` are asked for at the times `t` (s, increasing).
 
     Rows at that period are taken as they are. Else rows up to 1 ms apart, the bench's own cycle, are samples that hold
@@ -117,7 +117,7 @@ def on_cycles(t: Array, values: Array, period: float) -> Array:
     return samples
 
 
-def _rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:
+def _read_rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:
     """(line number, cells) of each row that is not blank."""
     try:
         text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8-sig")
@@ -127,7 +127,8 @@ def _rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:
     return ((rows.line_num, row) for row in rows if row)
 
 
-def _numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int], where: object) -> dict[str, list[float]]:
+def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int],
+                   where: object) -> dict[str, list[float]]:
     """The picked columns as numbers, checked row by row so that a refusal can name the line."""
     table: dict[str, list[float]] = {name: [] for name in picked}
     t = table["t"]
@@ -145,7 +146,7 @@ def _numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int], wher
             raise InputError(where, f"line {line}, t", f"a time after {t[-2]:g} s, not {t[-1]:g}")
         if t[-1] - t[0] > LONGEST:
             raise InputError(where, f"line {line}, t", f"seconds, and at most {LONGEST:g} of them, not {t[-1]:g}")
-        for name, most in _SANE.items():
+        for name, most in _LARGEST.items():
             if name in table and abs(table[name][-1]) > most:
                 raise InputError(where, f"line {line}, {name}", f"at most {most:g} either way, not {table[name][-1]:g}")
     if not t:

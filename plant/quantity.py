@@ -43,15 +43,15 @@ class Quantity(NamedTuple):
         return "a number " + " and ".join(said) if said else f"a finite number in {self.unit}"
 
 
-def quantities(group: type[Any]) -> Mapping[str, Quantity]:
+def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
     """The fields of a parameter group with what they mean, in order."""
-    if group not in _SEEN:  # reading annotations takes longer than everything else about a model
+    if group not in _KNOWN_GROUPS:  # reading annotations takes longer than everything else about a model
         hints = get_type_hints(group, include_extras=True)
-        _SEEN[group] = {name: get_args(hints[name])[1] for name in group._fields}
-    return _SEEN[group]
+        _KNOWN_GROUPS[group] = {name: get_args(hints[name])[1] for name in group._fields}
+    return _KNOWN_GROUPS[group]
 
 
-_SEEN: dict[type[Any], Mapping[str, Quantity]] = {}
+_KNOWN_GROUPS: dict[type[Any], Mapping[str, Quantity]] = {}
 
 
 Metre = Annotated[float, Quantity("m")]

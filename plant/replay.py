@@ -5,14 +5,14 @@ from typing import Any
 
 from plant.compile import Function
 from plant.ports import at_position
-from plant.solve import cycle, sense
+from plant.solve import read_sensors, step_cycle
 from plant.state import Input, Ports, State
 
-SILENCE = (0.0, 0.0, 0.0, 0.0)  # no noise
+NO_NOISE = (0.0, 0.0, 0.0, 0.0)  # no noise
 SETTLING = 40  # cycles, three times, that the transducer rests where the ram starts
 
 
-def _with(*paths: str) -> Function:
+def _make_replacer(*paths: str) -> Function:
     """`(s, ...)`: `s` with the numbers at `paths` replaced. Written out, as compiled code knows no _replace."""
     ports = ", ".join(f"memory_{f}" if f"memory.{f}" in paths else f"s.memory.{f}" for f in Ports._fields)
     fields = [f"Ports({ports})" if f == "memory" else f if f in paths else f"s.{f}" for f in State._fields]
@@ -22,30 +22,31 @@ def _with(*paths: str) -> Function:
     return made["replaced"]
 
 
-moved = _with("jack_position")
-showing = _with("sensed", "memory.position")
-sampled = _with("memory.command", "memory.reading")
+set_jack_position = _make_replacer("jack_position")
+set_sensed_position = _make_replacer("sensed", "memory.position")
+set_sample_memories = _make_replacer("memory.command", "memory.reading")
 
 
-def shown(s: State, p: Any) -> Any:
+def initialise_sensed_position(s: State, p: Any) -> Any:
     """`s` with what its transducer shows before the first step."""
     u = Input(0.0, 0.0, 0.0, 0.0, 0.0, 1e-5)
-    return showing(s, at_position(s.jack_position, s.memory.position, s, u, p)[0], s.memory.position)
+    return set_sensed_position(s, at_position(s.jack_position, s.memory.position, s, u, p)[0], s.memory.position)
 
 
-def rested(s: State, x: float, p: Any, steps: int) -> Any:
+def rest_at_reading(s: State, x: float, p: Any, steps: int) -> Any:
     """`s` at rest where its transducer shows `x` m: a lag has caught up, an offset or a gain is made up for."""
     u = Input(0.0, 0.0, 0.0, 0.0, 0.0, p.controller.period / steps)
     sensed = 0.0
     for _ in range(3):
-        s = moved(s, s.jack_position + (x - sensed))
+        s = set_jack_position(s, s.jack_position + (x - sensed))
         for _ in range(SETTLING * steps):
             sensed, m = at_position(s.jack_position, s.memory.position, s, u, p)
-            s = showing(s, sensed, m)
+            s = set_sensed_position(s, sensed, m)
     return s
 
 
-def replay(s: State, current: Any, load: Any, position: Any, anchor: float, record: Any, steps: int, out: Any) -> None:
+def replay_current(s: State, current: Any, load: Any, position: Any, anchor: float, record: Any, steps: int,
+                   out: Any) -> None:
     """The plant driven by a measured current; fills out[k] = XJ as sensed, P12, XS at sample k, all without noise.
 
     Args:
@@ -59,16 +60,17 @@ def replay(s: State, current: Any, load: Any, position: Any, anchor: float, reco
         out: (n, 3), written.
     """
     p = record[0]
-    s = rested(s, position[0], p, steps) if len(position) else shown(s, p)
+    s = rest_at_reading(s, position[0], p, steps) if len(position) else initialise_sensed_position(s, p)
     for k in range(len(current)):
         t = k * p.controller.period
-        out[k, 0], out[k, 1], out[k, 2], m = sense(s, s.memory.reading, SILENCE, t, p)
-        s = sampled(s, s.memory.command, m)
+        out[k, 0], out[k, 1], out[k, 2], m = read_sensors(s, s.memory.reading, NO_NOISE, t, p)
+        s = set_sample_memories(s, s.memory.command, m)
         if len(position):
-            s = moved(s, s.jack_position + pull(anchor * p.controller.period, position[k], s.sensed))
-        s = cycle(s, current[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
+            moved = compute_pull(anchor * p.controller.period, position[k], s.sensed)
+            s = set_jack_position(s, s.jack_position + moved)
+        s = step_cycle(s, current[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
 
 
-def pull(share: float, measured: float, sensed: float) -> float:
+def compute_pull(share: float, measured: float, sensed: float) -> float:
     """How far the ram is moved to the measured position, m: not at all where none was measured."""
     return share * (measured - sensed) if measured == measured else 0.0

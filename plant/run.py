@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from plant.effects import CATALOGUE
 from plant.errors import InputError
-from plant.flat import packers, values
+from plant.flat import list_state_values, make_packers
 from plant.machine_code import Advance
-from plant.model import STEPS, Model, initial, kernel, stored_advance
+from plant.model import STEPS, Model, build_initial_state, build_kernel, stored_advance
 from plant.solve import NOISES
 from plant.state import State
 
 Array = NDArray[np.float64]
-DRAWN = 64  # cycles of noise at a time: 10 us once in 64 cycles
+NOISE_BLOCK = 64  # cycles of noise at a time: 10 us once in 64 cycles
 SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
 
 
@@ -34,16 +34,16 @@ class Columns(NamedTuple):
     load: Array
 
 
-def noise(seed: int, cycles: int) -> Array:
+def draw_noise(seed: int, cycles: int) -> Array:
     """The random numbers of a run, (cycles, NOISES) standard normal: the same for a bench run and a simulation."""
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
 
 
-def draws(seed: int) -> Iterator[list[float]]:
+def iterate_noise(seed: int) -> Iterator[list[float]]:
     """The rows of `noise`, without end; a few at a time, which costs a tenth of one by one."""
     rng = np.random.default_rng(seed)
     while True:
-        yield from rng.standard_normal((DRAWN, NOISES)).tolist()
+        yield from rng.standard_normal((NOISE_BLOCK, NOISES)).tolist()
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
@@ -68,34 +68,34 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
         raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
     out = np.empty((len(com), 4))
     record = model.record()
-    with laws(model):
-        run = kernel("closed_loop", model.effects, fast, model.plant)
-        run(model.state(), com, force, noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
+    with report_law_errors(model):
+        run = build_kernel("run_closed_loop", model.effects, fast, model.plant)
+        run(model.state(), com, force, draw_noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)
 
 
 @contextmanager
-def laws(model: Model) -> Iterator[None]:
+def report_law_errors(model: Model) -> Iterator[None]:
     """What a user's own law does wrong is told as bad input: numba and Python raise what they like."""
     try:
         yield
     except Exception as error:
         if not model.effects:
             raise
-        where, cause = _in_plain_python(model) or ("effects", error)
+        where, cause = _find_law_error(model) or ("effects", error)
         said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
                          f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
 
 
-def _in_plain_python(model: Model) -> tuple[str, Exception] | None:
+def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
     laws = [CATALOGUE[name].function for name in model.effects]
     files = {law.__code__.co_filename for law in laws if law is not None}
     try:
-        step = kernel("cycle", model.effects, False, model.plant)
+        step = build_kernel("step_cycle", model.effects, False, model.plant)
         step(model.state(), 0.0, 0.0, 0.0, 0.0, model.record(), 1)
     except Exception as error:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
@@ -108,8 +108,8 @@ class Demand:
 
     def __init__(self, model: Model) -> None:
         is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
-        self._law = kernel("demanded", model.effects, fast=False) if is_changed else None
-        self._first = initial(model.effects).memory.command
+        self._law = build_kernel("apply_command_effects", model.effects, fast=False) if is_changed else None
+        self._first = build_initial_state(model.effects).memory.command
         self._record = model.record()[0]
         self._period = model["controller.period"]
         self.restart()
@@ -133,21 +133,21 @@ class Actuator:
     def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
         self.model, self.steps = model, steps
         self.cycle = 0
-        with laws(model):
+        with report_law_errors(model):
             state = model.state()
-        self._flat = np.array(values(state))
-        self._unpack = packers(state)[1]
+        self._flat = np.array(list_state_values(state))
+        self._unpack = make_packers(state)[1]
         self._record = model.record()
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
         self._index = {name: i for i, name in enumerate(model.names())}
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
-        self._draws = draws(seed)
+        self._draws = iterate_noise(seed)
         self._noise = [0.0] * NOISES
         self._code = stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
         # a reading that nothing changes is faster without a call of compiled code
         changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
-        self._read = kernel("read", model.effects, fast) if changed else None
+        self._read = build_kernel("read_flat_sensors", model.effects, fast) if changed else None
         self._period = model["controller.period"]
 
     @property
@@ -161,7 +161,7 @@ class Actuator:
         Raises:
             InputError: an effect's law that cannot be compiled.
         """
-        with laws(self.model):
+        with report_law_errors(self.model):
             if self._code is not None:
                 self._code.warm(self._flat, self._record)
             if self._read:
@@ -187,7 +187,7 @@ class Actuator:
     def _bind_advance(self) -> Advance:
         if self._code is not None:
             return self._code.bind(self._flat, self._record, self.steps)
-        run = kernel("advance", self.model.effects, fast=False, plant=self.model.plant)
+        run = build_kernel("advance_flat_state", self.model.effects, fast=False, plant=self.model.plant)
         return lambda current, load, noise, t: run(self._flat, current, load, noise, t, self._record, self.steps)
 
     def set(self, name: str, value: float) -> None:

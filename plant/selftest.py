@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plant.effects import CATALOGUE, Effect
 from plant.model import Model
 from plant.run import simulate
-from plant.starts import changes, levels, rms, starts_of
+from plant.starts import compute_changes, compute_levels, compute_rms, find_starts
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle where plain Python runs too
@@ -40,7 +40,7 @@ class Report(NamedTuple):
         return any(shown.level >= 1.0 for shown in self.shown)
 
 
-def examine(name: str, command: Array, load: Array | None = None) -> Report:
+def check_effect(name: str, command: Array, load: Array | None = None) -> Report:
     """Try an effect of the catalogue on `command` (n,) m and `load` (n,) N.
 
     Raises:
@@ -49,41 +49,42 @@ def examine(name: str, command: Array, load: Array | None = None) -> Report:
     effect = CATALOGUE[name]
     if effect.base or effect.disturbance:
         return Report(name, (), ())
-    starts = starts_of(effect, command, load)
-    change = changes(effect, starts, command, load) if starts else np.zeros((0, len(command), 3))
+    starts = find_starts(effect, command, load)
+    change = compute_changes(effect, starts, command, load) if starts else np.zeros((0, len(command), 3))
     shown = tuple(Shown(dict(start), xj, p12, xs, most) for start, (xj, p12, xs), most in zip(
-        starts, rms(change).tolist(), levels(change).max(axis=1, initial=0.0).tolist(), strict=True))
-    return Report(name, tuple(_faults(effect, starts, command, load)), shown)
+        starts, compute_rms(change).tolist(), compute_levels(change).max(axis=1, initial=0.0).tolist(), strict=True))
+    return Report(name, tuple(_find_faults(effect, starts, command, load)), shown)
 
 
-def _faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array, load: Array | None) -> list[str]:
+def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array,
+                 load: Array | None) -> list[str]:
     bare, off = Model(), Model().having([effect.name])
     faults = []
-    if not _equal(simulate(bare, command, load), simulate(off, command, load)):
+    if not _are_equal(simulate(bare, command, load), simulate(off, command, load)):
         faults.append("at its off value it changes the plant")
     if not starts:
         faults.append("no size of it changes anything on this command")
-    for start in (*starts, *extremes(effect)):
+    for start in (*starts, *list_extremes(effect)):
         if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all():
-            faults.append(f"with {_said(start)} the plant has no number any more")
+            faults.append(f"with {_format_values(start)} the plant has no number any more")
     if starts and not faults:
-        model, said = off.replace(starts[-1]), _said(starts[-1])
-        if not _equal(*(simulate(model, command, load) for _ in range(2))):
+        model, said = off.replace(starts[-1]), _format_values(starts[-1])
+        if not _are_equal(*(simulate(model, command, load) for _ in range(2))):
             faults.append(f"with {said} two runs of one seed differ")
-        if not _equal(*(simulate(model, SHORT, steps=STEPS, fast=fast) for fast in (True, False))):
+        if not _are_equal(*(simulate(model, SHORT, steps=STEPS, fast=fast) for fast in (True, False))):
             faults.append(f"with {said} compiled code and plain Python differ")
     return faults
 
 
-def extremes(effect: Effect) -> list[dict[str, float]]:
+def list_extremes(effect: Effect) -> list[dict[str, float]]:
     """The ends of the range of each fitted parameter: far out, but a plant that is there must have a number."""
     ranges = {name: effect.parameters[name] for name in effect.fitted}
     return [{name: end} for name, q in ranges.items() for end in (q.low, q.high) if not q.refuses(end)]
 
 
-def _said(start: Mapping[str, float]) -> str:
+def _format_values(start: Mapping[str, float]) -> str:
     return ", ".join(f"{name} = {value:g}" for name, value in start.items())
 
 
-def _equal(one: tuple[Array, ...], other: tuple[Array, ...]) -> bool:
+def _are_equal(one: tuple[Array, ...], other: tuple[Array, ...]) -> bool:
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from plant.controller import Loop, answer
-from plant.flat import pack, unpack
+from plant.controller import Loop, compute_current
+from plant.flat import pack_state, unpack_state
 from plant.ports import at_command, at_reading
 from plant.state import Input, Memory, Ports, State
-from plant.step import coefficients, step
+from plant.step import compute_coefficients, step_plant
 
 NOISES = 4  # standard normal numbers a cycle: position, pressure, spool, and one for effects that are noise
 
 
-def sense(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, float, float, Memory]:
+def read_sensors(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, float, float, Memory]:
     """What the transducers read at time `t`: XJ m, P12 Pa, XS m; and the memory of the reading."""
     g = p.sensors
     u = Input(0.0, 0.0, noise[3], t, 0.0, p.controller.period)
@@ -24,26 +24,26 @@ def sense(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, flo
     return xj, s.pressure + g.pressure_noise * noise[1], s.spool_position + g.spool_noise * noise[2], m
 
 
-def read(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, float]:
+def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, float]:
     """`sense` on a flat state, which keeps the memory."""
-    s = unpack(flat)
-    xj, p12, xs, m_reading = sense(s, s.memory.reading, noise, t, record[0])
+    s = unpack_state(flat)
+    xj, p12, xs, m_reading = read_sensors(s, s.memory.reading, noise, t, record[0])
     m = s.memory
-    pack(State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, s.jack_speed,
-               s.pressure, s.sensed, Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback,
-                                           m.spool_force, m.metering, m.valve, m.load, m.jack_drag, m.position,
-                                           m_reading)), flat)
+    ports = Ports(m.command, m.current, m.supply, m.viscosity, m.nozzle, m.feedback, m.spool_force, m.metering,
+                  m.valve, m.load, m.jack_drag, m.position, m_reading)
+    pack_state(State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position,
+                     s.jack_speed, s.pressure, s.sensed, ports), flat)
     return xj, p12, xs
 
 
-def demanded(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
+def apply_command_effects(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
     """The demand as the firmware takes it, m, and its memory; of the plant it knows the sensed position alone."""
     nothing: Memory = 0.0
     s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, nothing)
     return at_command(com, m, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
 
 
-def firmware(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
+def run_firmware(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
     """The controller alone, on what it was told and what it sensed; fills out[k] = Cor, A.
 
     Args:
@@ -56,26 +56,26 @@ def firmware(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
     p = record[0]
     c = Loop(0.0, 0.0, 0.0)
     for k in range(len(com)):
-        demand, m = demanded(com[k], m, xj[k], k * p.controller.period, p)
-        out[k], c = answer(c, demand, xj[k], p.controller)
+        demand, m = apply_command_effects(com[k], m, xj[k], k * p.controller.period, p)
+        out[k], c = compute_current(c, demand, xj[k], p.controller)
 
 
-def cycle(s: State, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> State:
+def step_cycle(s: State, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> State:
     """The plant one cycle after `t`, current and load held, in `steps` equal steps; `record` is a model's record."""
     p = record[0]
     h = p.controller.period / steps
-    k = coefficients(p, h)
+    k = compute_coefficients(p, h)
     for i in range(steps):
-        s = step(s, Input(current, load, noise, t + i * h, i * h, h), p, k)
+        s = step_plant(s, Input(current, load, noise, t + i * h, i * h, h), p, k)
     return s
 
 
-def advance(flat: Any, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
+def advance_flat_state(flat: Any, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
     """`cycle` in place on a flat state: tuples would cross into Python and back at twice the price of the physics."""
-    pack(cycle(unpack(flat), current, load, noise, t, record, steps), flat)
+    pack_state(step_cycle(unpack_state(flat), current, load, noise, t, record, steps), flat)
 
 
-def closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> State:
+def run_closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> State:
     """The plant with its controller over the command `com`; fills out[k] = XJ, Cor, P12, XS of cycle k.
 
     Args:
@@ -92,10 +92,10 @@ def closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: i
     current, m_reading, m_command = 0.0, s.memory.reading, s.memory.command
     for k in range(len(com)):
         t = k * p.controller.period
-        xj, p12, xs, m_reading = sense(s, m_reading, noise[k], t, p)
-        demand, m_command = demanded(com[k], m_command, xj, t, p)
-        cor, c = answer(c, demand, xj, p.controller)
+        xj, p12, xs, m_reading = read_sensors(s, m_reading, noise[k], t, p)
+        demand, m_command = apply_command_effects(com[k], m_command, xj, t, p)
+        cor, c = compute_current(c, demand, xj, p.controller)
         out[k, 0], out[k, 1], out[k, 2], out[k, 3] = xj, cor, p12, xs
-        s = cycle(s, current, load[k], noise[k, 3], t, record, steps)
+        s = step_cycle(s, current, load[k], noise[k, 3], t, record, steps)
         current = cor
     return s

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
-from plant.model import Model, initial, kernel
+from plant.model import Model, build_initial_state, build_kernel
 from plant.quantity import Quantity
-from plant.run import laws, simulate
+from plant.run import report_law_errors, simulate
 
 Array = NDArray[np.float64]
 VISIBLE = (3.0, 30.0, 300.0)  # noise levels that starts are to show
@@ -25,7 +25,7 @@ _NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^\s,;:]*)")
 
 
-def starts_of(effect: Effect, command: Array, load: Array | None = None) -> tuple[Mapping[str, float], ...]:
+def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tuple[Mapping[str, float], ...]:
     """Values of all fitted parameters to start from: the effect's own, or found from its ranges and its visibility.
 
     A parameter that says in what range it is typical ("0.2-5 kN") starts at both ends and between. Of one that says
@@ -45,12 +45,12 @@ def starts_of(effect: Effect, command: Array, load: Array | None = None) -> tupl
     if effect.starts or effect.base or not effect.fitted:
         return effect.starts
     usual = {name: effect.off[name] for name in effect.fitted}
-    sized = {name: sizes for name in usual if (sizes := _sizes(effect, name, command, load))}
+    sized = {name: sizes for name in usual if (sizes := _find_sizes(effect, name, command, load))}
     found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
-        if name not in sized and (value or hinted(effect.parameters[name])):
-            shapes = hinted(effect.parameters[name]) or [
-                _within(effect.parameters[name], factor * value) for factor in SHAPES]
+        if name not in sized and (value or parse_hint(effect.parameters[name])):
+            shapes = parse_hint(effect.parameters[name]) or [
+                _clip_to_range(effect.parameters[name], factor * value) for factor in SHAPES]
             found = [start | {name: shape} for start in found for shape in dict.fromkeys(shapes)]
     return tuple(found)
 
@@ -59,11 +59,11 @@ def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effec
     """The effect of that name, which from now on has starts in the catalogue; see `starts_of`."""
     effect = CATALOGUE[name]
     if not effect.starts:
-        CATALOGUE[name] = effect = replace(effect, starts=starts_of(effect, command, load))
+        CATALOGUE[name] = effect = replace(effect, starts=find_starts(effect, command, load))
     return effect
 
 
-def changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
+def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
             load: Array | None = None) -> Array:
     """What an effect changes when the nominal plant is driven by the same current, without noise.
 
@@ -84,46 +84,46 @@ def changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Arra
     run = simulate(bare, command, force)
     model = bare if effect.base else bare.having([effect.name])
     if effect.firmware:
-        return _in_firmware(model, values, run.com, run.xj)
+        return _compute_firmware_changes(model, values, run.com, run.xj)
     names = list(dict.fromkeys(name for row in values for name in row))
     rows = [[model[name] for name in names], *([row.get(name, model[name]) for name in names] for row in values)]
-    with laws(model):
+    with report_law_errors(model):
         out = Lanes(model, names).replay(np.array(rows), run.cor, force, run.xj, ANCHOR)
     return out[1:] - out[:1]
 
 
-def rms(change: Array) -> Array:
+def compute_rms(change: Array) -> Array:
     """RMS of each column of `changes` (m, n, 3), SI, (m, 3); infinite where a run has no number any more."""
     with np.errstate(over="ignore", invalid="ignore"):
         square: Array = (change**2).mean(axis=1)
     return np.sqrt(np.nan_to_num(square, nan=np.inf, posinf=np.inf))
 
 
-def levels(change: Array) -> Array:
+def compute_levels(change: Array) -> Array:
     """`rms` of `changes` (m, n, 3) over the noise of each column's sensor, (m, 3)."""
-    noise: Array = rms(change) / np.array([Model()[name] for name in NOISE])
+    noise: Array = compute_rms(change) / np.array([Model()[name] for name in NOISE])
     return noise
 
 
-def _in_firmware(model: Model, values: Sequence[Mapping[str, float]], com: Array, xj: Array) -> Array:
+def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]], com: Array, xj: Array) -> Array:
     out = np.zeros((len(values) + 1, len(com), 3))
     for row, changed in zip(out, ({}, *values), strict=True):
-        with laws(model):
-            kernel("firmware", model.effects)(initial(model.effects).memory.command, com, xj,
+        with report_law_errors(model):
+            build_kernel("run_firmware", model.effects)(build_initial_state(model.effects).memory.command, com, xj,
                                               model.replace(changed).record(), row[:, 0])
     return (out[1:] - out[:1]) / model["controller.proportional_gain"]
 
 
-def _sizes(effect: Effect, name: str, command: Array, load: Array | None) -> list[float]:
+def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None) -> list[float]:
     """Values of one parameter that can be seen with the others as usual; both signs where it may be negative."""
     quantity, off = effect.parameters[name], effect.off[name]
 
     def seen(values: Array) -> Array:
-        change = changes(effect, [{name: float(x)} for x in values], command, load)
-        highest: Array = levels(change).max(axis=1)
+        change = compute_changes(effect, [{name: float(x)} for x in values], command, load)
+        highest: Array = compute_levels(change).max(axis=1)
         return highest
 
-    if hints := hinted(quantity):
+    if hints := parse_hint(quantity):
         return hints if seen(np.array(hints)).max() > 0.0 else []
     found: list[float] = []
     for sign in (1.0, -1.0):
@@ -141,7 +141,7 @@ def _sizes(effect: Effect, name: str, command: Array, load: Array | None) -> lis
     return list(dict.fromkeys(found))
 
 
-def hinted(quantity: Quantity) -> list[float]:
+def parse_hint(quantity: Quantity) -> list[float]:
     """Both ends of the typical range, where that is one ("0.2-5 kN"), and what lies between; in SI.
 
     >>> hinted(Quantity("N", low=0, typical="1-4 kN"))
@@ -157,9 +157,9 @@ def hinted(quantity: Quantity) -> list[float]:
         factor = PREFIXES[unit.removesuffix(quantity.unit)]
     else:
         return []
-    sizes = [_within(quantity, x * factor) for x in (low, (low * high) ** 0.5, high)]
+    sizes = [_clip_to_range(quantity, x * factor) for x in (low, (low * high) ** 0.5, high)]
     return [x for size in sizes for x in ((size, -size) if not quantity.refuses(-size) else (size,))]
 
 
-def _within(quantity: Quantity, x: float) -> float:
+def _clip_to_range(quantity: Quantity, x: float) -> float:
     return min(max(x, quantity.low), quantity.high)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import Any, NamedTuple
 
-from plant.friction import clip, slide
+from plant.friction import clip, solve_velocity
 from plant.ports import (
     at_current,
     at_feedback,
@@ -49,7 +49,7 @@ class Coefficients(NamedTuple):
     jack_coupled: float  # 1/kg
 
 
-def flow_share(left: float, law: float) -> float:
+def compute_flow_share(left: float, law: float) -> float:
     """`left` to the power of `law`, which is 1/2, 1 or 0 (`FILTER_LAWS`).
 
     Exact to rounding. The last bit of `**` depends on the CPU.
@@ -58,12 +58,12 @@ def flow_share(left: float, law: float) -> float:
     return 1.0 if law == 0.0 else share
 
 
-def coefficients(p: Any, h: float) -> Coefficients:
+def compute_coefficients(p: Any, h: float) -> Coefficients:
     """Coefficients for parameters `p` and steps of `h` seconds."""
     f, v, c = p.flapper, p.spool, p.jack
     left = 1.0 - p.filter.clogging  # 1 - Kintas
     gpf1 = p.pilot.pressure_gain * left
-    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * flow_share(left, p.filter.law))
+    slope1 = gpf1 * v.end_area / (p.pilot.flow_gain * compute_flow_share(left, p.filter.law))
     gq, gp = p.valve.flow_gain, p.valve.pressure_gain
     loss = gp * c.leakage / gq
     leak = 1.0 / (1.0 + loss)  # QJ = AJ XJ' + CLK P12, solved for P12
@@ -90,24 +90,24 @@ def coefficients(p: Any, h: float) -> Coefficients:
     )
 
 
-def steady_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
+def apply_steady_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
     """Oil as it should be: the cycle's coefficients hold. And the memory of supply and viscosity."""
     return k, s.memory.supply, s.memory.viscosity
 
 
-def changing_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
+def apply_changing_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
     """Oil with effects: coefficients for the pressure and viscosity it has now, at both nominal bit for bit `k`."""
     ratio, m_supply = at_supply(1.0, s.memory.supply, s, u, p)
     thick, m_viscosity = at_viscosity(1.0, s.memory.viscosity, s, u, p)
-    ratio, thick = max(ratio, LEAST), max(thick, LEAST)
-    return altered(k, ratio, thick, u.h, p), m_supply, m_viscosity
+    ratio, thick = max(ratio, LEAST_RATIO), max(thick, LEAST_RATIO)
+    return scale_coefficients(k, ratio, thick, u.h, p), m_supply, m_viscosity
 
 
-LEAST = 1e-3  # of supply pressure and viscosity: neither quite vanishes
-oiled = steady_oil
+LEAST_RATIO = 1e-3  # of supply pressure and viscosity: neither quite vanishes
+apply_oil = apply_steady_oil
 
 
-def altered(k: Coefficients, ratio: float, thick: float, h: float, p: Any) -> Coefficients:
+def scale_coefficients(k: Coefficients, ratio: float, thick: float, h: float, p: Any) -> Coefficients:
     """`k` for a supply of `ratio` and a viscosity of `thick` times the nominal."""
     f, root = p.flapper, sqrt(ratio)
     damping, drag = f.damping * thick, k.jack_damping * thick
@@ -137,13 +137,13 @@ def altered(k: Coefficients, ratio: float, thick: float, h: float, p: Any) -> Co
     )
 
 
-def travel(x0: float, v0: float, v: float, h: float, limit: float) -> tuple[float, float]:
+def move_between_stops(x0: float, v0: float, v: float, h: float, limit: float) -> tuple[float, float]:
     """Position and velocity after a step at the mean velocity, between inelastic stops at +-`limit`."""
     x = (x0 + 0.5 * h * v0) + 0.5 * h * v
     return clip(x, limit), v if abs(x) <= limit else 0.0
 
 
-def flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory, Memory]:
+def step_flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, Memory, Memory]:
     """Torque motor and flapper (trapezoidal rule): XF, XF', memory of the current and of the feedback."""
     current, m_current = at_current(u.current, s.memory.current, s, u, p)
     ahead = s.spool_position + 0.5 * u.h * s.spool_speed
@@ -151,23 +151,24 @@ def flapper(s: State, u: Input, p: Any, k: Coefficients) -> tuple[float, float, 
     own = p.torque_motor.gain * current - p.flapper.stiffness * s.flapper_position
     torque = own - p.feedback_spring.stiffness * spring  # Tact - KF XF; the spool's part last, it is known last
     v = k.flapper_keep * s.flapper_speed + k.flapper_push * torque
-    x, v = travel(s.flapper_position, s.flapper_speed, v, u.h, p.flapper.travel)
+    x, v = move_between_stops(s.flapper_position, s.flapper_speed, v, u.h, p.flapper.travel)
     return x, v, m_current, m_feedback
 
 
-def spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float, float, Memory, Memory]:
+def step_spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[float, float, Memory, Memory]:
     """Pilot pressure and spool: XS, XS', memory of the nozzle and of the force."""
     xf, m_nozzle = at_nozzle(xf, s.memory.nozzle, s, u, p)
     force, m_force = at_spool_force(0.0, s.memory.spool_force, s, u, p)
     v0, g = s.spool_speed, p.spool
     dry = u.h * g.static_friction if v0 == 0.0 else u.h * g.dynamic_friction
-    v = slide(v0, g.mass * v0 + u.h * force, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry,
-              k.spool_free, k.spool_coupled)
-    x, v = travel(s.spool_position, v0, v, u.h, g.travel)
+    impulse = g.mass * v0 + u.h * force
+    v = solve_velocity(v0, impulse, k.spool_push, k.pilot_gain * xf, k.pilot_slope, k.pilot_limit, dry, k.spool_free,
+                       k.spool_coupled)
+    x, v = move_between_stops(s.spool_position, v0, v, u.h, g.travel)
     return x, v, m_nozzle, m_force
 
 
-def metering(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
+def compute_metering_line(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
     """Metering edges with leakage: P12 against the ram's speed, memory of the metering and of the valve."""
     opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
     drive = k.valve_gain * opening
@@ -175,12 +176,12 @@ def metering(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Li
     return line, m_metering, m_valve
 
 
-def as_ever(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
+def keep_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
     """How the ram yields to an impulse, 1/kg, at the limit of the pressure and on its slope: no effect changes it."""
     return k.jack_free, k.jack_coupled
 
 
-def as_resisted(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
+def update_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
     """The same with effects that may change drag or slope, at two divisions; if they do not, bit for bit `k`."""
     mass = p.jack.mass + h * (k.jack_damping + drag.damping)
     free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
@@ -188,31 +189,31 @@ def as_resisted(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tu
     return free, k.jack_coupled if same else 1.0 / (mass + h * p.jack.area * line.slope)
 
 
-yielding = as_ever
+compute_compliance = keep_compliance
 
 
-def jack(s: State, u: Input, p: Any, k: Coefficients, line: Line,
+def step_jack(s: State, u: Input, p: Any, k: Coefficients, line: Line,
          given: float) -> tuple[float, float, float, Memory, Memory]:
     """The ram against a `given` load, N: XJ, XJ', P12, memory of the load and of the drag."""
     g, h, v0 = p.jack, u.h, s.jack_speed
     load, m_load = at_load(given, s.memory.load, s, u, p)
     drag, m_drag = at_jack_drag(Drag(0.0, 0.0, g.static_friction, g.dynamic_friction), s.memory.jack_drag, s, u, p)
     push = h * g.area
-    free, coupled = yielding(k, drag, line, p, h)
+    free, coupled = compute_compliance(k, drag, line, p, h)
     dry = h * drag.static if v0 == 0.0 else h * drag.dynamic
     impulse = g.mass * v0 - h * (load + drag.force)
-    v = slide(v0, impulse, push, line.offset, line.slope, line.limit, dry, free, coupled)
-    x, v = travel(s.jack_position, v0, v, h, g.travel)
+    v = solve_velocity(v0, impulse, push, line.offset, line.slope, line.limit, dry, free, coupled)
+    x, v = move_between_stops(s.jack_position, v0, v, h, g.travel)
     return x, v, clip(line.offset - line.slope * v, line.limit), m_load, m_drag
 
 
-def step(s: State, u: Input, p: Any, k: Coefficients) -> State:
+def step_plant(s: State, u: Input, p: Any, k: Coefficients) -> State:
     """The plant `u.h` seconds later."""
-    k, m_supply, m_viscosity = oiled(k, s, u, p)
-    xf, vf, m_current, m_feedback = flapper(s, u, p, k)
-    xs, vs, m_nozzle, m_force = spool(s, u, p, k, xf)
-    line, m_metering, m_valve = metering(s, u, p, k, xs)
-    xj, vj, p12, m_load, m_drag = jack(s, u, p, k, line, u.load)
+    k, m_supply, m_viscosity = apply_oil(k, s, u, p)
+    xf, vf, m_current, m_feedback = step_flapper(s, u, p, k)
+    xs, vs, m_nozzle, m_force = step_spool(s, u, p, k, xf)
+    line, m_metering, m_valve = compute_metering_line(s, u, p, k, xs)
+    xj, vj, p12, m_load, m_drag = step_jack(s, u, p, k, line, u.load)
     m = s.memory
     now = State(xf, vf, xs, vs, xj, vj, p12, s.sensed, m)  # the transducer feels the end of the step
     sensed, m_position = at_position(xj, m.position, now, u, p)

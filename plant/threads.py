@@ -10,13 +10,13 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def threads() -> int:
+def count_threads() -> int:
     """One a core, or as many as OMP_NUM_THREADS says: how a cluster tells its workers to share a machine."""
     said = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
 
 
-def mapped(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
+def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """`do` of each item, in their order, by so many threads; a single item, or one worker, stays in this thread."""
     work = list(items)
     if min(workers, len(work)) < 2:

@@ -179,9 +179,9 @@ def examine_tools() -> Iterator[Finding]:
 
 def examine_storage() -> Iterator[Finding]:
     """Folders the software writes to."""
-    from plant.compile import cache_folder  # here: it loads numba, which takes a second
+    from plant.compile import find_cache_folder  # here: it loads numba, which takes a second
 
-    folder = cache_folder()
+    folder = find_cache_folder()
     kept = not folder.is_relative_to(tempfile.gettempdir())
     status: Status = "ok" if kept else "limited"
     remedy = "" if kept else "a writable home folder, or EHA_RIG_CACHE=FOLDER"

@@ -21,7 +21,7 @@ from short_runs import HIDDEN, measured, words
 from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, effect, load_effects
 from plant.parameters import GROUPS
-from plant.quantity import quantities
+from plant.quantity import list_quantities
 from plant.state import Input, Ports, State
 from rig.cli import main
 from rig.cli.command_list import HELP_OF_COMMAND
@@ -182,7 +182,7 @@ SYMBOLS = re.findall(r"^\|\s*(\S*?)\s*\| `([a-z_]+\.[a-z_]+)`[^|]*\| ([^|]+) \|"
 
 
 def test_the_table_of_symbols_has_every_parameter_and_its_symbol() -> None:
-    known = {name: quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol for name in Model().names()}
+    known = {name: list_quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol for name in Model().names()}
     assert {name: symbol for symbol, name, _ in SYMBOLS} == known
 
 

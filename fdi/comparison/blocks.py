@@ -35,9 +35,9 @@ from fdi.thresholds import (
 )
 from fdi.trace.columns import bridge_gaps, hold_last, rms, shift_rows
 from fdi.trace.trace import Trace
-from plant.effects import at
-from plant.forced import flow_balance, force_balance
-from plant.model import Model, kernel
+from plant.effects import combine_laws
+from plant.forced import compute_flow_balance, compute_force_balance
+from plant.model import Model, build_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,7 +87,7 @@ def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
         error = _force(trace, model, p12, xj, seen)
         p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
     bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
-    sensed, speed = flow_balance(model, xs, p12, float(xj[0]))
+    sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
     lag = rows_in_span(trace.period)
     way = difference_over(trace.xj - sensed, lag)
     way[_any_within(bad, lag)] = np.nan
@@ -121,7 +121,7 @@ def _any_within(bad: Flags, rows: int) -> Flags:
 
 
 def _force(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
-    takes, _, dynamic = force_balance(model, xj, speed, p12, trace.load)
+    takes, _, dynamic = compute_force_balance(model, xj, speed, p12, trace.load)
     size = max(1, round(MEAN / trace.period)) | 1
     kernel = np.ones(size) / size
     mean = np.convolve(speed, kernel, "same")
@@ -334,8 +334,8 @@ def _compared(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
 def run_firmware(model: Model, com: Floats, xj: Floats) -> Floats:
     """What the model's controller answers, (n,) A, to a demand (n,) m and a sensed position (n,) m."""
     out = np.empty(len(com))
-    memory = at("command", model.effects)[1]
-    kernel("firmware", model.effects)(memory, com, xj, model.record(), out)
+    memory = combine_laws("command", model.effects)[1]
+    build_kernel("run_firmware", model.effects)(memory, com, xj, model.record(), out)
     return out
 
 

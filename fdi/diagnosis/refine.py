@@ -39,7 +39,7 @@ from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model
-from plant.threads import mapped
+from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
 
@@ -245,7 +245,7 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
     healthy = make_start(free, CLOGGING.healthy, FRICTION.healthy, estimate_offsets(problem))
     if _blames_a_fault(free, begin[0]):
         begin.append(healthy)
-    fits = mapped(lambda x: _fit_in_stages(alone, free, x), begin, problem.workers)
+    fits = map_in_threads(lambda x: _fit_in_stages(alone, free, x), begin, problem.workers)
     if len(fits) == 1 and (not _is_explained(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
         fits.append(_fit_in_stages(problem, free, healthy))
     best = min(fits, key=lambda f: f.cost)
@@ -289,7 +289,7 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
         flat = find_flat_directions(alone, free, begun.x)
         return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat)
 
-    return min(found, *mapped(fit_from, parts, problem.workers), key=lambda f: f.cost)
+    return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
 
 def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Fit:
@@ -355,7 +355,7 @@ def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
         return cost, x
 
     # dynamic friction goes with the static one, or has stayed what it was
-    return min(mapped(search, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
+    return min(map_in_threads(search, (math.inf, usual), problem.workers), key=lambda each: each[0])[1]
 
 
 def estimate_offsets(problem: Problem) -> dict[str, float]:

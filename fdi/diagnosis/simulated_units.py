@@ -18,7 +18,7 @@ from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
 from plant.lanes import Lanes
 from plant.model import Model
-from plant.threads import threads
+from plant.threads import count_threads
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
         out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
 
     starts = range(0, count, NARROW)
-    with ThreadPoolExecutor(threads()) as pool:
+    with ThreadPoolExecutor(count_threads()) as pool:
         for done, _ in enumerate(pool.map(simulate_block, starts)):
             progress(f"simulating units, {kind.name}", (done + 1) / len(starts))
     return out

@@ -24,7 +24,7 @@ from fdi.thresholds import (
     SUSPICIOUS_TOLERANCES,
 )
 from plant.effects import CATALOGUE
-from plant.model import Model, meaning, offered
+from plant.model import Model, find_quantity, list_offered_effects
 
 SMALLEST_CHANCE = 1e-300
 
@@ -123,7 +123,7 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
     blind = tuple(_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
-    noiseless = tuple(c.name for c in offered(model.plant) if c.port in UNREPLAYED and c.fitted)
+    noiseless = tuple(c.name for c in list_offered_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     return Answer(e, tuple(_candidates(e, seed)), baseline, blind, noiseless, tuple(list_suspicious(best, model.plant)),
                   tuple(_ledger(e, hand)), pattern, separate or {})
 
@@ -147,7 +147,7 @@ def fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
 
 def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
     """Parameters that are more than `SUSPICIOUS_TOLERANCES` tolerances from where a healthy unit has them."""
-    return [Suspicious(f.name, f.value(float(x)), meaning(f.name, plant=plant).unit, float(x))
+    return [Suspicious(f.name, f.value(float(x)), find_quantity(f.name, plant=plant).unit, float(x))
             for f, x in zip(fit.free, fit.x, strict=True)
             if np.isfinite(f.prior) and abs(x) > SUSPICIOUS_TOLERANCES * f.prior]
 

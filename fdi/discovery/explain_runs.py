@@ -14,9 +14,9 @@ from fdi.discovery.runs import Runs
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from plant.effects import CATALOGUE
-from plant.lanes import Lanes, warm
-from plant.model import Model, offered
-from plant.run import laws
+from plant.lanes import Lanes, compile_kernels
+from plant.model import Model, list_offered_effects
+from plant.run import report_law_errors
 from plant.starts import ensure_starts
 
 if TYPE_CHECKING:
@@ -55,18 +55,18 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     Raises:
         InputError: a user's effect that cannot be compiled and run.
     """
-    for name in [e.name for e in offered(runs.model.plant)] if effects is None else effects:
+    for name in [e.name for e in list_offered_effects(runs.model.plant)] if effects is None else effects:
         if not CATALOGUE[name].starts and CATALOGUE[name].fitted:
             progress(f"looking for sizes of {name}", 0.0)
             ensure_starts(name, runs.est.com, runs.est.load)
     if effects is None:
         whole_model = complete_model(runs.model)
-        with laws(whole_model):
-            warm(whole_model, lambda stage, share: progress(stage, 0.0))
+        with report_law_errors(whole_model):
+            compile_kernels(whole_model, lambda stage, share: progress(stage, 0.0))
         return
     replayed = [name for name in effects if CATALOGUE[name].port not in UNREPLAYED]
     model = lean_model(runs.model, replayed)
-    with laws(model):
+    with report_law_errors(model):
         progress("compiling the plant with it, once", 0.0)
         _compile_kernels(model, replayed)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fdi.trace.columns import hold_last
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
-from plant.model import Model, kernel
+from plant.model import Model, build_kernel
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     own = replace(model, effects=firmware)
     out = np.empty(len(trace))
     position = hold_last(trace.position)
-    kernel("firmware", firmware)(own.state().memory.command, trace.com, position, own.record(), out)
+    build_kernel("run_firmware", firmware)(own.state().memory.command, trace.com, position, own.record(), out)
     measured: Floats = np.where(trace.incomplete, np.nan, trace.cor)
     return out - measured
 

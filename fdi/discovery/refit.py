@@ -29,8 +29,8 @@ from fdi.thresholds import GAIN_SEEN, WHITE_SQUARE_POOR
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
-from plant.lanes import ladder
-from plant.model import Model, offered
+from plant.lanes import list_kernel_variants
+from plant.model import Model, list_offered_effects
 
 Floats = NDArray[np.float64]
 
@@ -149,7 +149,7 @@ def _nearer(search: Search, fit: Fit, other: Fit) -> Fit:
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
     every, own = complete_model(model), silence_readings(model.having(effects))
-    quick = {e for rung in ladder(every)[:-1] for e in rung.model.effects}
+    quick = {e for rung in list_kernel_variants(every)[:-1] for e in rung.model.effects}
     return every if set(own.effects) <= quick else own
 
 
@@ -171,7 +171,7 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
     present = list(active_effects(model))
     for name in effects:
         entry = CATALOGUE[name]
-        if name not in [e.name for e in offered(model.plant)]:
+        if name not in [e.name for e in list_offered_effects(model.plant)]:
             raise InputError("effect", name, f"an effect that the plant {model.plant} can have")
         if name in present:
             raise InputError("effect", name, f"one that is not in the model already (rig remove {name} takes it out)")

@@ -13,7 +13,7 @@ from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
 from fdi.estimation.unidentifiable import list_powers, scale_together
 from fdi.estimation.unknowns import Free, effect_unknowns, scaled_bounds
 from plant.effects import CATALOGUE
-from plant.threads import mapped
+from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
 Start = Mapping[str, float]
@@ -171,7 +171,7 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
         return found
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
-    return [trial for several in mapped(trials, parts, workers) for trial in several]
+    return [trial for several in map_in_threads(trials, parts, workers) for trial in several]
 
 
 def _moved(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:

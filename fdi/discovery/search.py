@@ -20,7 +20,7 @@ from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model
-from plant.threads import R, T, mapped, threads
+from plant.threads import R, T, count_threads, map_in_threads
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class Search:
 
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None) -> None:
-        self.workers = workers or threads()
+        self.workers = workers or count_threads()
         self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
@@ -146,7 +146,7 @@ class Search:
 
     def each(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""
-        return mapped(do, items, self.workers)
+        return map_in_threads(do, items, self.workers)
 
     def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else continue_fit(self.problem, each[1], rounds)

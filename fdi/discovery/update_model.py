@@ -17,7 +17,7 @@ from fdi.progress import Progress, ignore_progress
 from fdi.sources import software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
-from plant.model import Model, meaning
+from plant.model import Model, find_quantity
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ def _finish(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], row
             notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
     model, fit = fitted_model(r), r.last.hypothesis.fit
     parameters = {name: v for e in effects for name, v in fitted_parameters(e, fit, runs.model).items()}
-    parameters |= {name: Value(*of, meaning(name, plant=model.plant).unit) for name, of in r.marks.items()}
+    parameters |= {name: Value(*of, find_quantity(name, plant=model.plant).unit) for name, of in r.marks.items()}
     before = {name: runs.model[name] for name in fit.values if name in runs.model.values}
     known_floor = known.floor or {}
     floor = dict(r.floor)

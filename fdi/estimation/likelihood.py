@@ -19,7 +19,7 @@ from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model
-from plant.threads import mapped
+from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
 
@@ -47,8 +47,8 @@ class Problem:
 
     def predict(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
-        runs = mapped(lambda r: self.all_signals(names, values, r)[:, r.output_columns], (self.trace, *self.also),
-                      self.workers)
+        runs = map_in_threads(lambda r: self.all_signals(names, values, r)[:, r.output_columns],
+                              (self.trace, *self.also), self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
     def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:

@@ -28,7 +28,7 @@ from fdi.thresholds import (
 from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
-from plant.effects import CATALOGUE, at
+from plant.effects import CATALOGUE, combine_laws
 from plant.model import Model
 from plant.state import Input
 
@@ -115,7 +115,7 @@ def simulate_reading_noise(model: Model, xj: Floats) -> float:
     A sweep through it, as neither is in a replay.
     """
     level = model["sensors.position_noise"]
-    law, memory = at("reading", model.effects)
+    law, memory = combine_laws("reading", model.effects)
     if not any(CATALOGUE[name].port == "reading" for name in model.effects):
         return level
     noise = level * np.random.default_rng(0).standard_normal(SWEEP)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fdi.thresholds import HEALTHY_TOLERANCES
 from plant.effects import CATALOGUE, Effect
-from plant.model import Model, meaning, offered
+from plant.model import Model, find_quantity, list_offered_effects
 
 Floats = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def scaled_bounds(free: Sequence[Free]) -> tuple[Floats, Floats]:
 
 def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
     """Of the named parameters those that differ from one healthy unit to the next, with one tolerance as a fraction."""
-    found = {name: model.kind.tolerance(name, meaning(name, plant=model.plant)) for name in names}
+    found = {name: model.kind.tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
     return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
 
 
@@ -60,7 +60,7 @@ def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
     usual = model.kind.nominal
     free = []
     for name, tolerance in relative_tolerances(model, model.values).items():
-        value, q = model.values[name], meaning(name, plant=model.plant)
+        value, q = model.values[name], find_quantity(name, plant=model.plant)
         scale = tolerance * (abs(usual.get(name, value)) or 1.0)
         low, high = value - HEALTHY_TOLERANCES * scale, value + HEALTHY_TOLERANCES * scale
         free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
@@ -84,7 +84,7 @@ def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tupl
 
 def active_effects(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
-    return tuple(e.name for e in offered(model.plant)
+    return tuple(e.name for e in list_offered_effects(model.plant)
                  if (_off_nominal(e, model) if e.base else e.name in model.effects and e.acts(model.values)))
 
 
@@ -127,7 +127,7 @@ def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
 
 def complete_model(model: Model) -> Model:
     """The model without sensor noise and with all effects that its plant may have, at their off values."""
-    return silence_readings(model.having(e.name for e in offered(model.plant) if not e.disturbance))
+    return silence_readings(model.having(e.name for e in list_offered_effects(model.plant) if not e.disturbance))
 
 
 def silence_readings(model: Model) -> Model:

@@ -13,7 +13,7 @@ from fdi.prognosis.dates import AXES, TABLE, Row, find_date_in_name, find_row, p
 from fdi.progress import Progress
 from fdi.sources import hash_sources
 from fdi.trace.trace import Trace
-from plant.compile import cache_folder
+from plant.compile import find_cache_folder
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model
@@ -165,4 +165,4 @@ def _find_answer_file(file: Path, model: Model) -> Path:
     theirs = {f for e in model.effects if (f := CATALOGUE[e].file)}
     own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
     text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi")])
-    return cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
+    return find_cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
-from plant.plants import Plant, Table, Term, find, names
+from plant.plants import Plant, Table, Term, find_plant, list_plants
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
 
 def _find_recorder(header: str) -> Plant | None:
     """The plant whose rig writes a CSV with this first line; None for a trace of this software or any other."""
-    for plant in map(find, names()):
+    for plant in map(find_plant, list_plants()):
         if plant.table and plant.table.sources <= set(_split_header(header, plant.table)):
             return plant
     return None

@@ -26,11 +26,11 @@ from typing import Any
 from plant.compile import Function
 from plant.errors import InputError
 from plant.parameters import GROUPS
-from plant.ports import chain
-from plant.quantity import Quantity, quantities
+from plant.ports import chain_laws
+from plant.quantity import Quantity, list_quantities
 from plant.state import Memory, Ports
 
-__all__ = ["CATALOGUE", "Effect", "Law", "at", "base", "effect", "load_effects"]
+__all__ = ["CATALOGUE", "Effect", "Law", "base", "combine_laws", "effect", "load_effects"]
 
 Law = Function
 
@@ -133,25 +133,25 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
             raise ValueError(f"{name}: the name is taken")
         if set(group._fields) - set(group._field_defaults):
             raise ValueError(f"{name}: every parameter needs a default, its off value")
-        meaning = {f"{name}.{field}": q for field, q in quantities(group).items()}
+        meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
         off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
         names = tuple(f"{name}.{field}" for field in free)
         CATALOGUE.enter(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
-                               names, _starts(names, starts), **more))
+                               names, _name_starts(names, starts), **more))
         return function
 
     return register
 
 
-def _starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mapping[str, float], ...]:
+def _name_starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mapping[str, float], ...]:
     return tuple(dict(zip(names, start if isinstance(start, tuple) else (start,), strict=True)) for start in values)
 
 
 def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start],
          groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> None:
     """Register an effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
-    meaning = {field: quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
-    CATALOGUE.enter(Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_starts(fields, starts),
+    meaning = {field: list_quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
+    CATALOGUE.enter(Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts),
                            **more))
 
 
@@ -177,10 +177,10 @@ def load_effects(path: Path) -> list[str]:
     return new
 
 
-def at(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
+def combine_laws(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
     """All of the named effects that act at `port` as one function, with their initial memory."""
     acting = [entry for entry in (CATALOGUE[name] for name in names) if entry.port == port]
-    return chain((entry.function, entry.memory) for entry in acting)
+    return chain_laws((entry.function, entry.memory) for entry in acting)
 
 
 for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",

@@ -58,9 +58,9 @@ def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[li
         InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
     """
     from plant import InputError
-    from plant.model import offered
+    from plant.model import list_offered_effects
 
-    effects, known = [], [e.name for e in offered(plant)]
+    effects, known = [], [e.name for e in list_offered_effects(plant)]
     for word in words:
         is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
         if word in known:

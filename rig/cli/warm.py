@@ -2,15 +2,15 @@
 from __future__ import annotations
 
 from plant import Model
-from plant.lanes import warm
-from plant.model import offered
+from plant.lanes import compile_kernels
+from plant.model import list_offered_effects
 from rig.cli.progress_bar import show_progress
 
 
 def main() -> None:
     """Compile the kernels of the reference plant with the whole catalogue into the user's cache."""
     with show_progress(is_silent=False) as progress:
-        warm(Model().having(effect.name for effect in offered()), progress)
+        compile_kernels(Model().having(effect.name for effect in list_offered_effects()), progress)
 
 
 if __name__ == "__main__":

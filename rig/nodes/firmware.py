@@ -10,7 +10,7 @@ from math import isfinite
 from typing import NamedTuple, cast
 
 from dbc import EDS
-from plant.controller import Loop, answer
+from plant.controller import Loop, compute_current
 from plant.model import Model
 from plant.run import Demand
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
@@ -102,7 +102,7 @@ class Firmware:
         if status & _LOOP_CLOSED:
             demand = codec.position(cast(int, self._od[0x2100, 0]))
             position = codec.position(cast(int, self._od[0x2102, 0]))
-            current, self._loop = answer(self._loop, self._taken(demand, position), position, self._gains)
+            current, self._loop = compute_current(self._loop, self._taken(demand, position), position, self._gains)
         else:
             current, self._loop = 0.0, Loop()
             self._taken.restart()

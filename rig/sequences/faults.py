@@ -15,8 +15,8 @@ import numpy as np
 
 from plant.effects import CATALOGUE
 from plant.errors import InputError
-from plant.model import meaning
-from plant.parameters import accept
+from plant.model import find_quantity
+from plant.parameters import parse_value
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
 from rig.sequences import tables
@@ -86,7 +86,7 @@ class Parameter(_Ramped):
 
     def target(self, quantity: Quantity) -> float:
         """The number that `value` stands for; raises InputError at the key that cannot be for such a parameter."""
-        value = accept("fault", "value", quantity, self.value)
+        value = parse_value("fault", "value", quantity, self.value)
         _require(not (quantity.words and self.ramp), "ramp",
                  f"none: {self.parameter} is {quantity.expected}, with nothing between them")
         return value
@@ -241,7 +241,7 @@ class Schedule:
                 if fault.parameter not in self._base:
                     raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
                 self._parameters.setdefault(fault.parameter, []).append(
-                    (first, last, fault.target(meaning(fault.parameter, "faults")), fault))
+                    (first, last, fault.target(find_quantity(fault.parameter, "faults")), fault))
             case Offset():  # or noise
                 shape = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
                 values = [fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]

@@ -7,7 +7,7 @@ from typing import Any
 
 from plant.errors import InputError
 from plant.model import Model
-from plant.parameters import accept, sensible
+from plant.parameters import check_combinations, parse_value
 from plant.quantity import Quantity
 from plant.segments import RATE
 from rig.sequences.faults import LATEST_START, Parameter, Plan, Schedule
@@ -26,7 +26,7 @@ def check_overrides(overrides: Mapping[str, float | str], place: Place, known: K
         whole &= quantity is not None
         if quantity is not None:
             try:
-                accept("", "", quantity, value)
+                parse_value("", "", quantity, value)
             except InputError as error:
                 raise here.refuse(error.expected) from error
     return whole
@@ -65,7 +65,7 @@ class Contradiction(InputError):
 
 
 def require_sensible(plan: Plan, model: Model) -> None:
-    """Refuse faults whose parameters contradict each other or the model's own (plant.parameters.sensible).
+    """Refuse faults whose parameters contradict each other or the model's own (plant.parameters.check_combinations).
 
     Raises:
         Contradiction: it names the fault.
@@ -77,7 +77,7 @@ def require_sensible(plan: Plan, model: Model) -> None:
     for i, fault in changing:
         for cycle in _list_extreme_cycles(plan, fault):
             try:
-                sensible("faults", schedule.parameters(cycle))
+                check_combinations("faults", schedule.parameters(cycle))
             except InputError as error:
                 raise Contradiction(i, fault.label, (cycle - plan.start) / RATE, error) from error
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from plant import segments
 from plant.errors import InputError
-from plant.model import Model, meaning
-from plant.profile import Profile, build, names, parse_columns
+from plant.model import Model, find_quantity
+from plant.profile import Profile, build_profile, name_sections, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
 from rig.sequences.checks import Check, ResponseWithin
@@ -71,15 +71,15 @@ class Sequence:
 
     def setup_profile(self) -> Profile:
         """The command before main, from 0 m."""
-        return build(self.setup)
+        return build_profile(self.setup)
 
     def main_profile(self) -> Profile:
         """The command that is judged, from where set-up ended."""
-        return build(self.main, self.setup_profile().end)
+        return build_profile(self.main, self.setup_profile().end)
 
     def cleanup_profile(self, start: float) -> Profile:
         """The command after main, or after it was broken off at the demand `start` (m)."""
-        return build(self.cleanup, start)
+        return build_profile(self.cleanup, start)
 
     def sections(self) -> dict[str, slice]:
         """Rows of main by section name, as checks see them."""
@@ -87,7 +87,7 @@ class Sequence:
 
     def load_profile(self) -> Array:
         """Force on the ram in N for every cycle of main."""
-        force, _, end = build(self.load)
+        force, _, end = build_profile(self.load)
         cycles = round(self.duration * RATE)
         return np.concatenate((force, np.full(cycles - len(force), end)))
 
@@ -110,7 +110,7 @@ class Sequence:
         return {self.name: self.source.encode(), **self.files}
 
     @classmethod
-    def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = meaning) -> Sequence:
+    def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = find_quantity) -> Sequence:
         """The sequence of a bundle; raises InputError if a file is not in it or does not make one."""
         sources = [name for name in bundle if name.endswith(".toml")]
         if len(sources) != 1:
@@ -124,7 +124,7 @@ class Sequence:
         return parse_sequence(bundle[sources[0]].decode(), sources[0], read_file, known)
 
 
-def load_sequence(name_or_path: str | Path, known: Known = meaning) -> Sequence:
+def load_sequence(name_or_path: str | Path, known: Known = find_quantity) -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
@@ -160,7 +160,7 @@ def _read_beside(folder: Path) -> ReadFile:
     return read_file
 
 
-def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = meaning) -> Sequence:
+def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = find_quantity) -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV files that it names."""
     table, place = tables.parse_table(text, name)
     sequence = tables.build_dataclass(Sequence, table, place, _KINDS)
@@ -197,7 +197,7 @@ def _with_csv(sequence: Sequence, phase: str, place: Place, read_file: ReadFile)
 
 def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in ("setup", "main", "cleanup", "load"):
-        called = names(getattr(sequence, phase))
+        called = name_sections(getattr(sequence, phase))
         for i, name in enumerate(called):
             if name in called[:i]:
                 raise place.at(phase, i, "name").refuse(f"a name used once, not a second {name!r}")
@@ -217,7 +217,7 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
     for phase, most, unit in (("setup", FARTHEST, "m"), ("main", FARTHEST, "m"), ("cleanup", FARTHEST, "m"),
                               ("load", STRONGEST, "N")):
         with np.errstate(all="ignore"):  # what overflows is refused below
-            values, sections, end = build(getattr(sequence, phase), 0.0 if phase == "load" else start)
+            values, sections, end = build_profile(getattr(sequence, phase), 0.0 if phase == "load" else start)
         for i, section in enumerate(sections):
             last = end if i == len(sections) - 1 else 0.0
             largest = np.abs((*values[section.start:section.stop], last)).max()
@@ -242,7 +242,7 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
 
 
 def _check_parameters(sequence: Sequence, place: Place, known: Known) -> None:
-    """Names must exist. If `known` says what a name means (plant.model.meaning does), values are tried as well."""
+    """Names must exist. If `known` says what a name means (plant.model.find_quantity), values are tried as well."""
     chosen, plan = sequence.model, sequence.plan(0)
     whole = check_overrides(chosen.overrides, place.at("model", "overrides"), known)
     whole &= check_faults(plan, place.at("faults"), known)

@@ -12,11 +12,11 @@ import pytest
 from effect_files import MEMORY, STIFF, restored_catalogue
 
 from plant import Actuator, InputError, Model, compile, flat, simulate
-from plant.compile import cache_folder, compiled, fingerprint, interpreted, rebind
-from plant.controller import Loop, answer
+from plant.compile import compile_function, compute_fingerprint, find_cache_folder, interpret_function, rebind_names
+from plant.controller import Loop, compute_current
 from plant.effects import load_effects
-from plant.model import initial
-from plant.run import draws, noise
+from plant.model import build_initial_state
+from plant.run import draw_noise, iterate_noise
 
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
 
@@ -43,7 +43,7 @@ def by_actuator(model: Model, seed: int, fast: bool = True, steps: int = 100, cy
     loop, current, out = Loop(), 0.0, np.empty((cycles, 4))
     for k in range(cycles):
         xj, p12, xs = plant.sample()
-        cor, loop = answer(loop, COMMAND[k], xj, p)
+        cor, loop = compute_current(loop, COMMAND[k], xj, p)
         out[k] = xj, cor, p12, xs
         plant.advance(current)
         current = float(cor)
@@ -68,17 +68,17 @@ def test_actuator_interpreted_equals_compiled() -> None:
 def test_seeds() -> None:
     one, same, other = (simulate(Model(), COMMAND, seed=seed).xj for seed in (1, 1, 2))
     assert (one == same).all() and (one != other).any()
-    rows = draws(5)
-    assert (np.array([next(rows) for _ in range(200)]) == noise(5, 200)).all()
+    rows = iterate_noise(5)
+    assert (np.array([next(rows) for _ in range(200)]) == draw_noise(5, 200)).all()
 
 
 def test_flat_state_and_back(tmp_path: Path) -> None:
     with restored_catalogue():
         (tmp_path / "m.py").write_text(MEMORY)
         load_effects(tmp_path / "m.py")
-        state = initial(("constant_load", "sensor_offset", "sensor_lag", "wear"))
-        pack, unpack = flat.packers(state)
-        numbers = flat.values(state)
+        state = build_initial_state(("constant_load", "sensor_offset", "sensor_lag", "wear"))
+        pack, unpack = flat.make_packers(state)
+        numbers = flat.list_state_values(state)
         assert len(numbers) == 8 + 4  # two memories of two
         filled = unpack([float(i) for i in range(12)])
         assert filled.memory.load[1]._fields == ("travelled", "last")
@@ -123,7 +123,7 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
     def made(source: str, **names) -> str:
         scope = dict(names)
         exec(source, scope)
-        return fingerprint(scope["f"])
+        return compute_fingerprint(scope["f"])
 
     base = "def f(x):\n    return x * K + g(x)\ndef g(x):\n    return x"
     assert made(base, K=1.0) == made(base, K=1.0)
@@ -138,17 +138,17 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
     def factor(k: float):
         return lambda x: x * k
 
-    assert fingerprint(factor(1.0)) != fingerprint(factor(2.0))
+    assert compute_fingerprint(factor(1.0)) != compute_fingerprint(factor(2.0))
 
 
 def test_linking_leaves_the_original_alone() -> None:
     def twice(x: float) -> float:
         return inner(x)
 
-    outer = rebind(twice, inner=lambda x: 2.0 * x)
-    assert interpreted(outer, {"inner": lambda x: 5.0 * x})(1.0) == 5.0
+    outer = rebind_names(twice, inner=lambda x: 2.0 * x)
+    assert interpret_function(outer, {"inner": lambda x: 5.0 * x})(1.0) == 5.0
     assert outer(1.0) == 2.0
-    assert compiled(outer)(1.5) == 3.0
+    assert compile_function(outer)(1.5) == 3.0
 
 
 def inner(x: float) -> float:
@@ -157,14 +157,14 @@ def inner(x: float) -> float:
 
 def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "a"))
-    assert cache_folder() == tmp_path / "a"
+    assert find_cache_folder() == tmp_path / "a"
     monkeypatch.delenv("EHA_RIG_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
-    assert cache_folder() == tmp_path / "b/eha-rig"
+    assert find_cache_folder() == tmp_path / "b/eha-rig"
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "file"))  # cannot be made: fall back
     monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
-    assert cache_folder() == tmp_path / f"eha-rig-{os.getuid()}"
+    assert find_cache_folder() == tmp_path / f"eha-rig-{os.getuid()}"
 
 
 def test_a_live_change_names_what_is_missing() -> None:

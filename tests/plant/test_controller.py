@@ -9,10 +9,10 @@ import pytest
 from effect_files import HEAD, restored_catalogue
 
 from plant import Actuator, Model
-from plant.controller import Loop, answer
+from plant.controller import Loop, compute_current
 from plant.effects import load_effects
 from plant.parameters import Controller
-from plant.run import noise
+from plant.run import draw_noise
 
 PID = Controller(proportional_gain=4.0, integral_gain=50.0, derivative_gain=0.002, current_limit=8e-3, period=1e-3)
 PI, PD = PID._replace(derivative_gain=0.0), PID._replace(integral_gain=0.0)
@@ -23,7 +23,7 @@ def answers(law: Controller, *rows: tuple[float, float]) -> list[float]:
     """Currents, A, for rows of demand and position, m."""
     loop, out = Loop(), []
     for demand, position in rows:
-        current, loop = answer(loop, demand, position, law)
+        current, loop = compute_current(loop, demand, position, law)
         out.append(current)
     return out
 
@@ -61,9 +61,9 @@ def test_no_wind_up_at_the_limit_and_the_way_back_is_free() -> None:
 def test_the_limit_does_not_stop_an_integral_that_comes_back() -> None:
     """A full integral (7.95 mA) and a falling error: over the limit by the derivative alone, it still unwinds."""
     full = Loop(integral=7.95e-3, error=-2e-3, cycles=1.0)  # the error goes from -2 to -1 mm: +1 m/s, +2 mA
-    current, loop = answer(full, -1e-3, 0.0, PID._replace(derivative_gain=0.008))  # -4 + 7.9 + 8 mA
+    current, loop = compute_current(full, -1e-3, 0.0, PID._replace(derivative_gain=0.008))  # -4 + 7.9 + 8 mA
     assert current == 8e-3 and loop.integral == pytest.approx(7.9e-3, abs=1e-15)
-    again = answer(full._replace(error=1e-3), 1e-3, 0.0, PID)[1]  # with the error the other way it waits
+    again = compute_current(full._replace(error=1e-3), 1e-3, 0.0, PID)[1]  # with the error the other way it waits
     assert again.integral == 7.95e-3
 
 
@@ -112,4 +112,4 @@ def test_white_noise_has_its_rms_and_is_new_every_cycle(coil: None) -> None:
     seen = in_the_coil({"current_noise.white": 0.1e-3}, 20_000) - 1e-3
     assert seen.std() == pytest.approx(0.1e-3, rel=0.02) and abs(seen.mean()) < 3e-6
     assert np.corrcoef(seen[1:], seen[:-1])[0, 1] == pytest.approx(0.0, abs=0.03)
-    np.testing.assert_allclose(seen, 0.1e-3 * noise(3, 20_000)[:, 3], atol=1e-15)  # the fourth number of the cycle
+    np.testing.assert_allclose(seen, 0.1e-3 * draw_noise(3, 20_000)[:, 3], atol=1e-15)  # the fourth number of the cycle

@@ -12,10 +12,10 @@ from physics_cases import PREFLIGHT, SILENT
 
 from plant import Actuator, InputError, Model, simulate
 from plant.effects import CATALOGUE
-from plant.model import meaning
-from plant.parameters import nominal
-from plant.selftest import extremes
-from plant.starts import changes, hinted, levels
+from plant.model import find_quantity
+from plant.parameters import load_nominal_values
+from plant.selftest import list_extremes
+from plant.starts import compute_changes, compute_levels, parse_hint
 
 CANONICAL = (
     "filter_clogging", "spool_friction", "jack_friction", "viscous_drag", "moving_mass", "internal_leakage",
@@ -59,7 +59,7 @@ def test_it_says_what_it_is(name: str) -> None:
     assert e.base or e.function.__doc__
     assert set(e.fitted) <= set(e.parameters) and bool(e.fitted) == (not e.disturbance)
     for other in e.confused_with:
-        assert other in CATALOGUE or meaning(other)
+        assert other in CATALOGUE or find_quantity(other)
         assert other not in CATALOGUE or name in CATALOGUE[other].confused_with
     assert all(name in CATALOGUE[other].excludes for other in e.excludes)
     assert e.firmware == (name == "command_rate_limit")
@@ -67,7 +67,7 @@ def test_it_says_what_it_is(name: str) -> None:
 
 @pytest.mark.parametrize("name", CANONICAL)
 def test_its_starts_are_values_that_it_allows(name: str) -> None:
-    e, usual = CATALOGUE[name], nominal() | dict(CATALOGUE[name].off)
+    e, usual = CATALOGUE[name], load_nominal_values() | dict(CATALOGUE[name].off)
     assert len(e.starts) >= 2
     for start in e.starts:
         assert tuple(start) == e.fitted
@@ -75,7 +75,7 @@ def test_its_starts_are_values_that_it_allows(name: str) -> None:
         assert start != {parameter: usual[parameter] for parameter in start}
         assert e.acts(start) or e.base
     for parameter, quantity in e.parameters.items():  # what is said to be typical is what a fit tries
-        for value in hinted(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
+        for value in parse_hint(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
             sizes = [abs(start[parameter]) for start in e.starts]
             assert min(sizes) / 4 <= abs(value) <= 4 * max(sizes)
 
@@ -134,7 +134,7 @@ def test_finite_and_deterministic_over_the_preflight(name: str, i: int) -> None:
 
 @pytest.mark.parametrize("name", LAWS)
 def test_finite_at_the_ends_of_its_range(name: str) -> None:
-    for values in extremes(CATALOGUE[name]):
+    for values in list_extremes(CATALOGUE[name]):
         assert np.isfinite(columns(WHOLE.replace(values), steps=FEW)).all(), values
 
 
@@ -142,7 +142,7 @@ def test_finite_at_the_ends_of_its_range(name: str) -> None:
 def nominal_change(name: str) -> np.ndarray:
     """Levels over the sensors' noise of all starts of an effect, (starts, 3), driven by the nominal plant's current."""
     load = np.full(len(PREFLIGHT), LOADED.get(name, 0.0))
-    return levels(changes(CATALOGUE[name], CATALOGUE[name].starts, PREFLIGHT, load))
+    return compute_levels(compute_changes(CATALOGUE[name], CATALOGUE[name].starts, PREFLIGHT, load))
 
 
 @pytest.mark.parametrize("name", ["command_rate_limit", "spool_overlap", "internal_leakage", "orifice_root"])
@@ -194,7 +194,7 @@ def test_what_excludes_each_other_may_stand_side_by_side_but_not_act() -> None:
 
 
 def test_the_hint_of_a_range_is_read_with_its_unit() -> None:
-    typical = {name: hinted(q) for e in CATALOGUE.values() for name, q in e.parameters.items()}
+    typical = {name: parse_hint(q) for e in CATALOGUE.values() for name, q in e.parameters.items()}
     assert typical["constant_load.force"] == pytest.approx([200, -200, 1000, -1000, 5000, -5000])
     assert typical["spool_overlap.overlap"] == pytest.approx([5e-6, 17.3e-6, 60e-6], rel=1e-2)
     assert typical["compressibility.coefficient"] == pytest.approx([0.7e-9, 1.18e-9, 2e-9], rel=1e-2)

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from node_bench import FirmwareDesk
 
 from plant import Actuator, Model, simulate
-from plant.compile import interpreted
+from plant.compile import interpret_function
 from plant.effects import CATALOGUE
 from plant.effects.sensors import Lag, sensor_lag
-from plant.model import bindings, initial, kernel
+from plant.model import build_initial_state, build_kernel, collect_bindings
 from plant.state import Input, State
-from plant.step import coefficients, step
+from plant.step import compute_coefficients, step_plant
 from rig.network.codec import Control
 
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
@@ -180,16 +180,22 @@ def test_readings_are_whole_steps_and_their_error_is_evenly_spread() -> None:
     assert np.var(reads - was) == pytest.approx(5e-6**2 / 12, rel=0.06)
 
 
+def run_firmware_alone(model: Model, com: np.ndarray, xj: np.ndarray, out: np.ndarray) -> None:
+    """The controller of a model on a demand and a sensed position, m; fills `out`, A; all (n,)."""
+    memory = build_initial_state(model.effects).memory.command
+    build_kernel("run_firmware", model.effects)(memory, com, xj, model.record(), out)
+
+
 def test_the_firmware_follows_a_step_as_a_ramp() -> None:
     model = Model().replace({"command_rate_limit.rate": 0.1})
     com, out = np.r_[np.zeros(5), np.full(60, 5e-3), np.full(60, -1e-3)], np.empty(125)
-    kernel("firmware", model.effects)(initial(model.effects).memory.command, com, np.zeros(125), model.record(), out)
+    run_firmware_alone(model, com, np.zeros(125), out)
     taken = out / model["controller.proportional_gain"]
     assert np.diff(taken)[4:20] == pytest.approx(np.full(16, 0.1e-3))
     assert abs(np.diff(taken)).max() <= 0.1e-3 * (1 + 1e-9)
     assert taken[60] == pytest.approx(min(5e-3, 8e-3 / 3.8)) and taken[-1] == pytest.approx(-1e-3)
     slow = np.cumsum(np.full(125, 0.09e-3))
-    kernel("firmware", model.effects)(initial(model.effects).memory.command, slow, slow, model.record(), out)
+    run_firmware_alone(model, slow, slow, out)
     assert not out.any()  # slower commands are as they were, the first one too
 
 
@@ -208,7 +214,7 @@ def test_the_firmware_alone_answers_as_in_the_loop() -> None:
     for changes in ({}, {"command_rate_limit.rate": 0.1}):
         model, out = Model().replace(changes), np.empty(len(COMMAND))
         run = simulate(model, COMMAND, seed=2)
-        kernel("firmware", model.effects)(initial(model.effects).memory.command, COMMAND, run.xj, model.record(), out)
+        run_firmware_alone(model, COMMAND, run.xj, out)
         assert (out == run.cor).all()
 
 
@@ -221,8 +227,8 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
     p = WHOLE.having(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
                                      "friction_asymmetry.asymmetry": 0.0 if deflection else asymmetry,
                                      "presliding.deflection": deflection}).record()[0]
-    k, u, s = coefficients(p, H), Input(h=H), initial(names)._replace(jack_speed=v)
-    moved = interpreted(step, bindings(names))
+    k, u, s = compute_coefficients(p, H), Input(h=H), build_initial_state(names)._replace(jack_speed=v)
+    moved = interpret_function(step_plant, collect_bindings(names))
     stiffness = 800.0 / deflection if deflection else 0.0
     last = np.inf
     for _ in range(60):

@@ -15,8 +15,8 @@ from rig_command import rig
 
 from plant import Actuator, InputError, Model, simulate
 from plant.effects import CATALOGUE, load_effects
-from plant.selftest import examine
-from plant.starts import changes, ensure_starts, levels, starts_of
+from plant.selftest import check_effect
+from plant.starts import compute_changes, compute_levels, ensure_starts, find_starts
 
 COMMAND = np.r_[np.zeros(10), np.full(150, 2e-3), 2e-3 + 1e-3 * np.sin(np.arange(250) * 0.02)]
 FEW = 20  # steps a cycle where plain Python runs too
@@ -141,10 +141,10 @@ def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, n
     """Nothing is said about how large it is: sizes are found that show 3, 30 and 300 times the noise."""
     file.write_text(text)
     load_effects(file)
-    starts = starts_of(CATALOGUE[name], PREFLIGHT)
+    starts = find_starts(CATALOGUE[name], PREFLIGHT)
     assert all(tuple(start) == CATALOGUE[name].fitted for start in starts)
     upwards = [start for start in starts if start[sized] > 0.0 and start.get("cogging.length", 1e-3) == 1e-3]
-    shown = levels(changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
+    shown = compute_levels(compute_changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
     assert shown == pytest.approx([3.0, 30.0, 300.0], rel=0.5)
     assert {start["cogging.length"] for start in starts} == {1e-3, 4e-4, 2.5e-3} if name == "cogging" else True
 
@@ -178,7 +178,7 @@ def test_the_trial_of_an_unsound_one(file: Path, old: str, new: str, said: str) 
     text = COGGING.replace(old, new).replace('Quantity("N")', 'Quantity("N", low=0, high=1e3)')
     file.write_text(text.replace('"load"', '"position"'))
     load_effects(file)
-    assert any(said in fault for fault in examine("cogging", COMMAND).faults)
+    assert any(said in fault for fault in check_effect("cogging", COMMAND).faults)
 
 
 def test_the_catalogue_is_told_for_machines() -> None:

@@ -8,13 +8,13 @@ from effects_reference import jack
 from physics_cases import SILENT
 
 from plant import simulate
-from plant.compile import compiled
+from plant.compile import compile_function
 from plant.effects.current import Behind, coil_lag
 from plant.effects.supply import Drawn, supply_droop
-from plant.model import bindings, initial
+from plant.model import build_initial_state, collect_bindings
 from plant.state import Input, Ports, State
-from plant.step import coefficients, metering
-from plant.step import jack as ram
+from plant.step import compute_coefficients, compute_metering_line
+from plant.step import step_jack as ram
 
 MILLI = 1e-3
 FRICTIONLESS = {"jack.static_friction": 0.0, "jack.dynamic_friction": 0.0}
@@ -156,10 +156,10 @@ def test_viscosity_moves_three_parameters_together() -> None:
 def _moved(s, spool, load, record, h, out):
     """Metering edges and ram alone, the spool on a given path; rows XJ, P12."""
     p = record[0]
-    k = coefficients(p, h)
+    k = compute_coefficients(p, h)
     for i in range(len(spool)):
         u = Input(0.0, load[i], 0.0, i * h, 0.0, h)
-        line, a, b = metering(s, u, p, k, spool[i])
+        line, a, b = compute_metering_line(s, u, p, k, spool[i])
         x, v, p12, c, d = ram(s, u, p, k, line, load[i])
         m = s.memory
         s = State(0.0, 0.0, spool[i], 0.0, x, v, p12, x, Ports(
@@ -190,7 +190,8 @@ def test_implicit_effects_against_an_explicit_integration(changes: dict[str, flo
                        22e3 * np.sin(6 * np.pi * t))
     every = round(h / fine)
     ours = np.empty((2, len(paths[h][0])))
-    compiled(_moved, bindings(model.effects))(initial(model.effects), *paths[h], model.record(), h, ours)
+    run = compile_function(_moved, collect_bindings(model.effects))
+    run(build_initial_state(model.effects), *paths[h], model.record(), h, ours)
     error = ours - jack(model.values, *paths[fine], fine)[:, every - 1::every]
     assert np.sqrt((error[0] ** 2).mean()) * 1e6 < um
     assert np.sqrt((error[1] ** 2).mean()) * 1e-5 < bar
@@ -202,8 +203,9 @@ def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h:
     model = EASY.replace({"compressibility.coefficient": 1e-9})
     v, stored = model.values, 0.25 * 1.5e-4 * 1e-9
     out = np.empty((2, round(0.05 / h)))
-    start = initial(model.effects)._replace(jack_speed=0.01)
-    compiled(_moved, bindings(model.effects))(start, *np.zeros((2, out.shape[1])), model.record(), h, out)
+    start = build_initial_state(model.effects)._replace(jack_speed=0.01)
+    run = compile_function(_moved, collect_bindings(model.effects))
+    run(start, *np.zeros((2, out.shape[1])), model.record(), h, out)
     matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
                        [-v["jack.area"] / stored, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
                                                     + v["jack.leakage"]) / stored]])

@@ -11,7 +11,7 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 
 from plant import functions
-from plant.compile import INLINED, _link, compiled, interpreted
+from plant.compile import INLINE_OPTIONS, _link_calls, compile_function, interpret_function
 
 RNG = np.random.default_rng(1)
 NEAR, TINY = RNG.uniform(-1.0, 1.0, 20000), RNG.normal(size=5000) * 1e-5
@@ -30,7 +30,7 @@ CASES = {
 
 def many(f: Callable[[float], float]) -> Callable[[np.ndarray, np.ndarray], None]:
     """`f` over an array, compiled as laws are: inlined in a loop."""
-    inner = _link(f, {}, lambda g: numba.njit(g, **INLINED))
+    inner = _link_calls(f, {}, lambda g: numba.njit(g, **INLINE_OPTIONS))
 
     @numba.njit(error_model="numpy")
     def run(x, y):
@@ -87,8 +87,8 @@ def by_library(x: float) -> float:
 
 def test_they_stand_in_however_a_law_calls_them() -> None:
     """And the library's own stay where they are in code that is not linked."""
+    own = functions.sin(1.3) + functions.exp(-1.3) + functions.hypot(1.3, 3.0)
     for f in (by_name, by_library):
-        assert compiled(f)(1.3) == interpreted(f)(1.3) == functions.sin(1.3) + functions.exp(-1.3) + functions.hypot(
-            1.3, 3.0)
-    assert interpreted(by_name).__globals__["sin"] is not sin is math.sin
-    assert interpreted(by_library).__globals__["math"].sqrt is math.sqrt
+        assert compile_function(f)(1.3) == interpret_function(f)(1.3) == own
+    assert interpret_function(by_name).__globals__["sin"] is not sin is math.sin
+    assert interpret_function(by_library).__globals__["math"].sqrt is math.sqrt

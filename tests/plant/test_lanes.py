@@ -11,11 +11,11 @@ from llvmlite.binding import get_host_cpu_features
 
 from plant import Actuator, InputError, Model, block, simulate
 from plant import lanes as lanes_module
-from plant.compile import interpreted
+from plant.compile import interpret_function
 from plant.effects import CATALOGUE, load_effects
-from plant.lanes import Lanes, ladder, warm
-from plant.model import bindings
-from plant.replay import replay
+from plant.lanes import Lanes, compile_kernels, list_kernel_variants
+from plant.model import collect_bindings
+from plant.replay import replay_current
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
@@ -29,7 +29,7 @@ def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.nd
             anchor: float = 0.0, steps: int = 10) -> np.ndarray:
     """The same in plain Python, one run, (n, 3)."""
     out = np.empty((len(current), 3))
-    run = interpreted(replay, bindings(model.effects))
+    run = interpret_function(replay_current, collect_bindings(model.effects))
     run(model.state(), current, load, np.empty(0) if position is None else position, anchor, model.record(), steps, out)
     return out
 
@@ -83,9 +83,9 @@ def test_each_effect_alone_among_all_that_are_off(catalogue: Lanes) -> None:
 
 def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
     """And get the bits that the kernel with all effects would give them."""
-    none, cheap, every = (len(rung.model.effects) for rung in ladder(catalogue.model))
+    none, cheap, every = (len(rung.model.effects) for rung in list_kernel_variants(catalogue.model))
     assert none == 0 and 10 < cheap < 20 and every == len(EFFECTS)
-    assert len(ladder(QUIET.having(EFFECTS[:3]))) == 1
+    assert len(list_kernel_variants(QUIET.having(EFFECTS[:3]))) == 1
     at_work = [{}, *(start(effect, 0) for effect in ("null_bias", "stribeck", "rod_backlash", "orifice_root")), {}]
     values = np.vstack([with_effects(catalogue, changes) for changes in at_work])
     shared = catalogue.replay(values, CURRENT, FORCE)
@@ -150,7 +150,7 @@ def test_threads_do_not_matter() -> None:
 
 def test_warming_tells_how_far_it_is() -> None:
     calls: list[tuple[str, float]] = []
-    warm(QUIET.having(EFFECTS), lambda *call: calls.append(call))
+    compile_kernels(QUIET.having(EFFECTS), lambda *call: calls.append(call))
     assert [share for _, share in calls] == [0, 1 / 3, 2 / 3, 1] and "0 effects" in calls[0][0]
 
 
@@ -176,8 +176,8 @@ def test_no_runs_and_no_cycles() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = block.layout((), "eha")
-    run = block.kernel(plan)
+    plan = block.plan_layout((), "eha")
+    run = block.compile_block_kernel(plan)
     run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
         np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()

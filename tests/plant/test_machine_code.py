@@ -8,7 +8,7 @@ from pathlib import Path
 from plant import Actuator, Model
 from plant.effects import CATALOGUE
 from plant.machine_code import StoredCode
-from plant.model import kernel
+from plant.model import build_kernel
 
 RUN = """
 import sys
@@ -52,7 +52,7 @@ def test_a_damaged_file_is_compiled_anew(tmp_path: Path) -> None:
 
 def test_stored_code_equals_numba(tmp_path: Path) -> None:
     plant, other = Actuator(Model()), Actuator(Model())
-    run = kernel("advance", ())
+    run = build_kernel("advance_flat_state", ())
     StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
     stored = StoredCode(tmp_path, lambda: None)  # nothing to fall back to
     advance = stored.bind(other._flat, other._record, other.steps)

@@ -9,7 +9,7 @@ import pytest
 
 from plant import InputError, Model, simulate
 from plant.lanes import Lanes
-from plant.monitor import FAULTS, Cell, Monitor, Motion, cells, decay, step
+from plant.monitor import FAULTS, Cell, Monitor, Motion, compute_cells, compute_decay, step_monitor
 from rig.sequences import load_sequence
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
@@ -21,7 +21,7 @@ KV = 0.069 * 14.5 / (301.6 * 1.35e-5)  # 1/s
 
 def cell(clogging: float = 0.0, friction: float = 5.0, sliding: float = 1.0, h: float = H, **more: float) -> Cell:
     changed = QUIET.replace({name.replace("__", "."): value for name, value in more.items()})
-    return Cell(*cells(changed, FAULTS, np.array([[clogging, friction]]), h, sliding)[:, 0].tolist())
+    return Cell(*compute_cells(changed, FAULTS, np.array([[clogging, friction]]), h, sliding)[:, 0].tolist())
 
 
 def one(com: np.ndarray, clogging: float, friction: float, model: Model = QUIET) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_step_is_exact(sliding: float) -> None:
         at = rng.uniform(-3e-4, 3e-4)
         s = Motion(at, 1e-3, c.follow * at, float(rng.integers(-1, 2)))
         current = (c.back * at + rng.uniform(-1.5, 1.5) * c.dead + rng.choice([0.0, 4e-5]) * rng.normal()) / c.tilt
-        exact, small = step(s, current, H, c), explicit(s, current, H, c, QUIET)
+        exact, small = step_monitor(s, current, H, c), explicit(s, current, H, c, QUIET)
         assert exact.spool == pytest.approx(small.spool, abs=2e-9 + 1e-3 * abs(small.spool - s.spool))
         assert exact.position == pytest.approx(small.position, abs=1e-9 + 2e-3 * abs(small.position - s.position))
         assert exact.speed == pytest.approx(small.speed, abs=1e-5 + 2e-3 * abs(small.speed))
@@ -66,7 +66,7 @@ def test_step_is_exact(sliding: float) -> None:
 def test_pressure_is_limited() -> None:
     """A heavy ram gains no more speed than PSR gives it."""
     c = cell(jack__mass=5e4)
-    s = step(Motion(1e-3, 0.0, 0.0, 0.0), 8e-3, H, c)
+    s = step_monitor(Motion(1e-3, 0.0, 0.0, 0.0), 8e-3, H, c)
     assert s.speed == pytest.approx(QUIET["supply.pressure"] * QUIET["jack.area"] / 5e4 * H, rel=1e-3)
     assert s.position == pytest.approx(0.5 * s.speed * H, rel=1e-3)
 
@@ -140,7 +140,7 @@ def test_is_the_reference_model_without_what_it_leaves_out(clogging: float, fric
 
 def test_decay_is_the_exponential() -> None:
     for x in np.linspace(-1.0, 0.0, 41):
-        assert decay(x) == pytest.approx(exp(x), rel=1e-10 if x < -0.25 else 1e-15)
+        assert compute_decay(x) == pytest.approx(exp(x), rel=1e-10 if x < -0.25 else 1e-15)
 
 
 def test_a_fast_pilot_takes_more_steps() -> None:
@@ -161,10 +161,10 @@ def test_side_by_side_is_alone() -> None:
 def test_compiled_is_interpreted() -> None:
     c, s, current = cell(0.25, 30.0), Motion(0.0, 0.0, 0.0, 0.0), 4e-4
     runs = Monitor(QUIET).replay(np.array([[0.25, 30.0]]), np.full(30, current), whole=True)[0]
-    s = step(s, 0.0, H, c)
+    s = step_monitor(s, 0.0, H, c)
     for k in range(1, 30):
         assert runs[0, k] == pytest.approx(s.position, abs=1e-18) and runs[3, k] == pytest.approx(s.spool, rel=1e-13)
-        s = step(s, current, H, c)
+        s = step_monitor(s, current, H, c)
 
 
 def test_replay_follows_the_measured_ram() -> None:

@@ -12,11 +12,11 @@ from places import SHARED
 
 import plant
 from plant import Actuator, InputError, Model, load_model, simulate
-from plant.model import known_groups, meaning
-from plant.parameters import GROUPS, nominal
-from plant.quantity import Quantity, quantities
+from plant.model import find_parameter_groups, find_quantity
+from plant.parameters import GROUPS, load_nominal_values
+from plant.quantity import Quantity, list_quantities
 
-NAMES = list(nominal())
+NAMES = list(load_nominal_values())
 
 
 def refusal(changes: dict[str, object]) -> str:
@@ -78,10 +78,10 @@ def test_whatever_is_set_is_taken_or_refused_in_one_line(name: str, value: objec
         assert name in str(error)
     else:
         assert np.isfinite(model[name])
-        assert not meaning(name).refuses(model[name])
+        assert not find_quantity(name).refuses(model[name])
 
 
-ENDS = {name: (meaning(name).low, meaning(name).high) for name in NAMES
+ENDS = {name: (find_quantity(name).low, find_quantity(name).high) for name in NAMES
         if not name.startswith("filter") and name != "controller.period"}
 ALONE = [{name: end} for name, ends in ENDS.items() for end in ends]
 TOGETHER = [{name: ends[pick] for (name, ends), pick in zip(ENDS.items(), picks, strict=True)}
@@ -95,7 +95,7 @@ def test_every_corner_of_the_ranges_has_a_number(corners: list[dict[str, float]]
     for values in corners:
         for body in ("spool", "jack"):  # no contradiction
             static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
-            both = {name: values.get(name, nominal()[name]) for name in (static, dynamic)}
+            both = {name: values.get(name, load_nominal_values()[name]) for name in (static, dynamic)}
             values |= {static: max(both.values()), dynamic: min(both.values())}
         run = simulate(Model().replace(values), command, load)
         assert all(np.isfinite(column).all() for column in run), values
@@ -107,14 +107,14 @@ def test_words_numbers_and_texts_are_accepted() -> None:
 
 
 def test_every_parameter_says_what_it_is() -> None:
-    for group, cls in known_groups().items():
+    for group, cls in find_parameter_groups().items():
         assert cls.__doc__, group
-        for name, quantity in quantities(cls).items():
+        for name, quantity in list_quantities(cls).items():
             assert isinstance(quantity, Quantity) and quantity.unit, f"{group}.{name}"
 
 
 def test_the_nominal_file_is_complete_and_is_that_of_the_issue() -> None:
-    assert list(nominal()) == [f"{group}.{field}" for group, cls in GROUPS.items() for field in cls._fields]
+    assert list(load_nominal_values()) == [f"{group}.{field}" for group, cls in GROUPS.items() for field in cls._fields]
     given_ = SHARED / "nominal.toml"
     if not given_.exists():
         pytest.skip("no ../shared to compare with")

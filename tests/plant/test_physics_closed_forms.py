@@ -6,10 +6,10 @@ import pytest
 from physics_cases import PREFLIGHT, SILENT, SMOOTH
 
 from plant import Actuator, Model, simulate
-from plant.compile import compiled
+from plant.compile import compile_function
 from plant.friction import clip
 from plant.state import Input, State
-from plant.step import coefficients, step
+from plant.step import compute_coefficients, step_plant
 
 V = Model().values
 GAP, GM, KF = V["controller.proportional_gain"], V["torque_motor.gain"], V["flapper.stiffness"]
@@ -129,11 +129,11 @@ def test_filter_laws(law: str, change: float, tolerance: float) -> None:
 def overshoot(record, gain, target, steps, h):
     """Largest position on a step to `target` with a controller that answers at once."""
     p = record[0]
-    k = coefficients(p, h)
+    k = compute_coefficients(p, h)
     s, top = REST, 0.0
     for i in range(steps):
         current = clip(gain * (target - s.jack_position), p.controller.current_limit)
-        s = step(s, Input(current, 0.0, 0.0, i * h, 0.0, h), p, k)
+        s = step_plant(s, Input(current, 0.0, 0.0, i * h, 0.0, h), p, k)
         top = max(top, s.jack_position)
     return top
 
@@ -144,5 +144,5 @@ REST = State()
 @pytest.mark.parametrize(("clogging", "percent"), [(0.0, 2.4), (0.1, 3.5), (0.25, 5.5), (0.35, 7.2)])
 def test_overshoot_of_the_continuous_loop(clogging: float, percent: float) -> None:
     model = SILENT.replace({"filter.clogging": clogging, "controller.proportional_gain": GAP * 100 / KPOS})
-    top = compiled(overshoot)(model.record(), model["controller.proportional_gain"], 1e-3, 100_000, 2e-6)
+    top = compile_function(overshoot)(model.record(), model["controller.proportional_gain"], 1e-3, 100_000, 2e-6)
     assert (top / 1e-3 - 1) * 100 == pytest.approx(percent, abs=0.1)

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from physics_cases import SILENT, SMOOTH
 
 from plant import Actuator, simulate
-from plant.friction import clip, slide, soften
+from plant.friction import clip, soften, solve_velocity
 from plant.state import Input, State
-from plant.step import coefficients, step
+from plant.step import compute_coefficients, step_plant
 
 H = 1e-5
 speeds = st.one_of(st.just(0.0), st.floats(-1.0, 1.0))
@@ -23,7 +23,8 @@ def slid(v0: float, force: float, line: float, dry: float, body: tuple[float, ..
     """Speed after a step and the pressure then."""
     mass, damping, area, slope, limit = body
     free, push = mass + H * damping, H * area
-    v = slide(v0, mass * v0 + H * force, push, line, slope, limit, H * dry, 1 / free, 1 / (free + push * slope))
+    impulse = mass * v0 + H * force
+    v = solve_velocity(v0, impulse, push, line, slope, limit, H * dry, 1 / free, 1 / (free + push * slope))
     return v, clip(line - slope * v, limit)
 
 
@@ -79,7 +80,7 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
     """Spool centred, air stiffness as spring: kinetic and elastic energy together never grow over a millisecond."""
     model = (SILENT if dry else SMOOTH).replace({"aero_stiffness.stiffness": stiffness})
     p = model.record()[0]
-    k = coefficients(p, H)
+    k = compute_coefficients(p, H)
     s, u = State(jack_position=x, jack_speed=v), Input(h=H)
 
     def energy(s: State) -> float:
@@ -88,7 +89,7 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
     before = energy(s)
     for _ in range(100):
         u = Input(load=stiffness * (s.jack_position + 0.5 * H * s.jack_speed), h=H)
-        s = step(s, u, p, k)
+        s = step_plant(s, u, p, k)
     assert energy(s) <= before * (1 + 1e-9)
 
 
@@ -96,10 +97,10 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
 @settings(max_examples=30, deadline=None)
 def test_a_flapper_left_alone_loses_energy(x: float, v: float) -> None:
     p = SILENT.record()[0]
-    k, s, f = coefficients(p, H), State(flapper_position=x, flapper_speed=v), p.flapper
+    k, s, f = compute_coefficients(p, H), State(flapper_position=x, flapper_speed=v), p.flapper
     last = np.inf
     for _ in range(50):
-        s = step(s._replace(spool_position=0.0, spool_speed=0.0), Input(h=H), p, k)
+        s = step_plant(s._replace(spool_position=0.0, spool_speed=0.0), Input(h=H), p, k)
         now = 0.5 * float(f.inertia) * s.flapper_speed**2 + 0.5 * float(f.stiffness) * s.flapper_position**2
         assert now <= last * (1 + 1e-12)
         last = now

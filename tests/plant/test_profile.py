@@ -10,7 +10,7 @@ import pytest
 from places import SHARED
 
 from plant.errors import InputError
-from plant.profile import build, on_cycles, parse_columns, read_command
+from plant.profile import build_profile, parse_columns, read_command, resample_on_cycles
 from plant.segments import KINDS, Chirp, Csv, Hold, Multisine, Points, Ramp, Segment, Sine, Step
 
 PRACTICE = SHARED / "practice/00/est.csv.gz"
@@ -30,13 +30,13 @@ ONE_OF_EACH: tuple[Segment, ...] = (
 @pytest.mark.skipif(not PRACTICE.exists(), reason="no ../shared: no independent preflight to compare with")
 def test_preflight_is_the_command_of_the_practice_traces() -> None:
     expected = read_command(PRACTICE).com
-    command = build(PREFLIGHT).command
+    command = build_profile(PREFLIGHT).command
     assert command.shape == expected.shape == (13_500,)
     np.testing.assert_allclose(command, expected, rtol=5e-9, atol=1e-17)  # the file has nine digits
 
 
 def test_preflight_follows_the_formulas_of_physics_section_4() -> None:
-    command, sections, end = build(PREFLIGHT)
+    command, sections, end = build_profile(PREFLIGHT)
     t = np.arange(2000) / 1000
     chirp = 1e-3 * np.sin(2 * np.pi * (t + 4.75 * t**2)) * (1 - np.exp(-20 * t))
     np.testing.assert_allclose(command[11_000:13_000], chirp, atol=1e-16)
@@ -49,7 +49,7 @@ def test_preflight_follows_the_formulas_of_physics_section_4() -> None:
 
 @pytest.mark.parametrize("segment", ONE_OF_EACH, ids=lambda s: s.kind)
 def test_every_kind_has_its_length_and_its_section(segment: Segment) -> None:
-    profile = build([replace(segment, name="it")], start=2e-3)
+    profile = build_profile([replace(segment, name="it")], start=2e-3)
     assert profile.sections == (("it", segment.kind, 0, round(segment.duration * 1000)),)
     assert len(profile.command) == profile.sections[0].stop
     assert np.isfinite(profile.command).all()
@@ -62,8 +62,8 @@ def test_every_kind_is_tested() -> None:
 @pytest.mark.parametrize("kind", ["hold", "ramp", "sine", "chirp", "multisine", "points"])
 def test_a_segment_starts_from_the_last_demand(kind: str) -> None:
     segment = next(s for s in ONE_OF_EACH if s.kind == kind)
-    assert build([segment], start=7e-3).command[0] == 7e-3
-    after_ramp = build([Ramp(to=2e-3, time=0.01), replace(segment, name="it")])
+    assert build_profile([segment], start=7e-3).command[0] == 7e-3
+    after_ramp = build_profile([Ramp(to=2e-3, time=0.01), replace(segment, name="it")])
     assert after_ramp.command[10] == 2e-3  # not 1.8e-3, the ramp's last sample
 
 
@@ -73,7 +73,7 @@ def test_schroeder_phases_keep_the_crest_low() -> None:
     aligned = replace(schroeder, phases=(np.pi / 2,) * len(lines))
 
     def crest(segment: Segment) -> float:
-        wave = build([segment]).command
+        wave = build_profile([segment]).command
         return float(np.abs(wave).max() / np.sqrt(np.mean(wave**2)))
 
     assert crest(schroeder) < 2.0 < 7.0 < crest(aligned)
@@ -93,7 +93,7 @@ STEP = np.r_[np.zeros(21), np.ones(19)]
 @pytest.mark.parametrize(("period", "cycles"), [(0.0005, 80), (0.001, 40), (0.0015, 27), (0.002, 20), (0.004, 10)])
 def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycles: int) -> None:
     t = 3.0 + np.arange(40) / 1000
-    ramp, step = on_cycles(t, RAMP, period), on_cycles(t, STEP, period)
+    ramp, step = resample_on_cycles(t, RAMP, period), resample_on_cycles(t, STEP, period)
     at = np.arange(cycles) * period
     np.testing.assert_allclose(ramp, 0.5 * np.floor(at * 1000 + 1e-6) / 1000, atol=1e-15)
     assert step.tolist() == [float(x > 0.0209) for x in at]  # nothing between 0 and 1
@@ -102,13 +102,14 @@ def test_samples_hold_on_another_period_and_the_seconds_stay(period: float, cycl
 @pytest.mark.parametrize("period", [0.0005, 0.002, 0.01])
 def test_rows_at_the_models_period_are_taken_as_they_are(period: float) -> None:
     values = np.random.default_rng(0).standard_normal(1001)
-    assert (on_cycles(np.round(7.0 + np.arange(1001) * period, 6), values, period) == values).all()
+    assert (resample_on_cycles(np.round(7.0 + np.arange(1001) * period, 6), values, period) == values).all()
 
 
 def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle() -> None:
-    assert on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.002).tolist() == [0, 2, 4]
-    assert on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.001).tolist() == [0, 1, 2, 3, 4, 9]
-    assert on_cycles(np.array([5.0]), np.array([3.0]), 0.002).tolist() == [3.0]
+    assert resample_on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.002).tolist() == [0, 2, 4]
+    t, values = np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0])
+    assert resample_on_cycles(t, values, 0.001).tolist() == [0, 1, 2, 3, 4, 9]
+    assert resample_on_cycles(np.array([5.0]), np.array([3.0]), 0.002).tolist() == [3.0]
 
 
 def test_read_command_gives_the_load_only_if_there_is_one(tmp_path: Path) -> None:
@@ -159,7 +160,7 @@ def test_what_is_no_csv_at_all_is_refused(tmp_path: Path) -> None:
     (lambda: Multisine(amplitude=1.0, frequencies=(1.0, 2.0), phases=(0.0,), time=1.0), "phases", "2 phases"),
     (lambda: Points(points=((1.0, 0.0), (0.5, 0.0))), "points", "increasing"),
     (lambda: Points(points=()), "points", "pairs"),
-    (lambda: build([Hold(time=1.0, name="a"), Hold(time=1.0, name="a")]), "name", "used once"),
+    (lambda: build_profile([Hold(time=1.0, name="a"), Hold(time=1.0, name="a")]), "name", "used once"),
 ])
 def test_an_impossible_segment_is_refused_by_key(make, key: str, expected: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InputError, match=expected) as refusal:

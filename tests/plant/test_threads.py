@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from plant.threads import mapped, threads
+from plant.threads import count_threads, map_in_threads
 
 
 def test_answers_come_in_the_order_of_the_questions() -> None:
@@ -14,24 +14,24 @@ def test_answers_come_in_the_order_of_the_questions() -> None:
         time.sleep(0.02 if i == 0 else 0.0)
         return i * i
 
-    assert mapped(slow_first, range(7), 3) == [i * i for i in range(7)]
-    assert mapped(slow_first, [], 3) == []
+    assert map_in_threads(slow_first, range(7), 3) == [i * i for i in range(7)]
+    assert map_in_threads(slow_first, [], 3) == []
 
 
 def test_one_worker_or_one_item_stays_in_this_thread() -> None:
     here = threading.get_ident()
-    assert mapped(lambda _: threading.get_ident(), range(3), 1) == [here] * 3
-    assert mapped(lambda _: threading.get_ident(), range(1), 4) == [here]
-    assert here not in mapped(lambda _: threading.get_ident(), range(3), 2)
+    assert map_in_threads(lambda _: threading.get_ident(), range(3), 1) == [here] * 3
+    assert map_in_threads(lambda _: threading.get_ident(), range(1), 4) == [here]
+    assert here not in map_in_threads(lambda _: threading.get_ident(), range(3), 2)
 
 
 def test_an_error_reaches_who_asked() -> None:
     with pytest.raises(ZeroDivisionError):
-        mapped(lambda i: 1 / i, [1, 0, 2], 2)
+        map_in_threads(lambda i: 1 / i, [1, 0, 2], 2)
 
 
 def test_a_cluster_tells_its_workers_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert threads() == 3
+    assert count_threads() == 3
     monkeypatch.setenv("OMP_NUM_THREADS", "many")
-    assert threads() >= 1
+    assert count_threads() >= 1

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from plant.errors import InputError
-from plant.threads import threads
+from plant.threads import count_threads
 
 
 def square(job: int) -> int:
@@ -37,9 +37,9 @@ def refuse(job: int) -> int:
     return job
 
 
-def count_threads(job: int) -> int:
+def count_usable_threads(job: int) -> int:
     """The number of threads that a computation may use here."""
-    return threads()
+    return count_threads()
 
 
 def run_sleeping_process(folder: str) -> None:

@@ -10,7 +10,7 @@ from physics_cases import PREFLIGHT
 from plant import Actuator, Model, functions, simulate
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from plant.profile import build
+from plant.profile import build_profile
 from plant.segments import Chirp, Multisine, Points, Ramp, Sine
 
 SHORT = PREFLIGHT[3800:4400]  # a ramp: the ram sticks and slips
@@ -53,7 +53,7 @@ def command() -> np.ndarray:
                 Chirp(amplitude=1e-3, f0=1.0, f1=31.0, fade=20.0, time=3.0),
                 Multisine(amplitude=1e-4, frequencies=tuple(map(float, range(1, 40))), time=3.0),
                 Points(points=((0.3, 1e-3), (0.7, -1e-3)))]
-    return build(segments).command
+    return build_profile(segments).command
 
 
 def actuator(model: Model, fast: bool) -> np.ndarray:

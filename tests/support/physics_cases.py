@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from plant import Model
-from plant.profile import build
+from plant.profile import build_profile
 from rig.sequences.sequence import load_sequence
 from rig.studies.benchmarks.plant_step import FRICTIONLESS, QUIET
 
@@ -10,4 +10,4 @@ PREFLIGHT = load_sequence("preflight").main_profile().command
 SILENT = Model().replace(QUIET)
 SMOOTH = SILENT.replace(FRICTIONLESS)  # no dry friction
 
-__all__ = ["FRICTIONLESS", "PREFLIGHT", "QUIET", "SILENT", "SMOOTH", "build"]
+__all__ = ["FRICTIONLESS", "PREFLIGHT", "QUIET", "SILENT", "SMOOTH", "build_profile"]

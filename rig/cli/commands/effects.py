@@ -36,12 +36,12 @@ def _path(text: str) -> Path:
 def run_command(args: argparse.Namespace) -> int:
     """List the catalogue of effects, or show one in detail."""
     from fdi.report.json import to_plain
-    from plant.model import entry, load_model, offered
+    from plant.model import find_effect, list_offered_effects, load_model
     from rig.cli.answer import show_answer
 
     options.load_user_effects(args.effects)
     plant = load_model(args.model).plant
-    chosen = [entry(args.name, plant)] if args.name else offered(plant)
+    chosen = [find_effect(args.name, plant)] if args.name else list_offered_effects(plant)
     own = {file.absolute() for file in args.effects}
     tested = chosen if args.test or (args.name and chosen[0].file in own) else []
     tests = {e.name: test_effect(e) for e in tested}
@@ -56,10 +56,10 @@ def run_command(args: argparse.Namespace) -> int:
 
 def test_effect(e: Effect) -> SelfTest:
     """Test an effect on the preflight command."""
-    from plant.selftest import examine
+    from plant.selftest import check_effect
     from rig.sequences import load_sequence
 
-    return examine(e.name, load_sequence("preflight").main_profile().command)
+    return check_effect(e.name, load_sequence("preflight").main_profile().command)
 
 
 def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,
@@ -93,9 +93,9 @@ def _describe_law(e: Effect) -> str:
 
 def describe_effect(e: Effect, plant: str = "eha") -> dict[str, Any]:
     """An effect as JSON values: its law, and its parameters with unit, off value and allowed range."""
-    from plant.plants import find
+    from plant.plants import find_plant
 
-    base = find(plant).nominal
+    base = find_plant(plant).nominal
     parameters = {name: {"unit": q.unit, "off": e.off.get(name, base.get(name)), "expected": q.expected,
                          "typical": q.typical, "fitted": name in e.fitted} for name, q in e.parameters.items()}
     return {"effect": e.name, "port": e.port, "in_reference_model": e.base, "in_firmware": e.firmware, "law": e.law,

@@ -61,7 +61,7 @@ def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
     """
     import numpy as np
 
-    from plant.profile import on_cycles, read_command
+    from plant.profile import read_command, resample_on_cycles
     from plant.segments import RATE
 
     if file is not None:
@@ -72,4 +72,4 @@ def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
     sequence = load_sequence("preflight")
     command, force = sequence.main_profile().command, sequence.load_profile()
     t = np.arange(len(command)) / RATE  # the bench's cycles
-    return on_cycles(t, command, period), on_cycles(t, force, period), "preflight"
+    return resample_on_cycles(t, command, period), resample_on_cycles(t, force, period), "preflight"

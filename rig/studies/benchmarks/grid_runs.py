@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi.progress import Progress, ignore_progress
 from plant import Model, simulate
 from plant.lanes import Lanes
-from plant.monitor import FAULTS, Cell, Monitor, cells
+from plant.monitor import FAULTS, Cell, Monitor, compute_cells
 from rig.studies.benchmarks.rivals import (
     FLAGS,
     Race,
@@ -52,7 +52,7 @@ class Work:
 
     def cells(self, width: int = 1) -> Array:
         """(fields, m) cells; the last one is repeated up to a multiple of `width`."""
-        columns = cells(self.model, FAULTS, self.values, self.h, SLIDING)
+        columns = compute_cells(self.model, FAULTS, self.values, self.h, SLIDING)
         return np.ascontiguousarray(np.pad(columns, ((0, 0), (0, -len(self.values) % width)), "edge"))
 
 
@@ -205,7 +205,7 @@ def _define_progpy_plant(work: Work) -> Any:
 
 
 def step_monitor(xp: Any, s: Any, current: Any, h: float, c: Any) -> tuple[Any, ...]:
-    """`plant.monitor.step` on arrays of the library `xp`: XS, XJ, XJ', which way the spool slides."""
+    """`plant.monitor.step_monitor` on arrays of the library `xp`: XS, XJ, XJ', which way the spool slides."""
     xs, xj, v0, sliding = s
     tilt = c.tilt * current - c.back * xs
     asked = tilt - _clip(xp, tilt, c.slide)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Model
-from plant.step import coefficients
+from plant.step import compute_coefficients
 from rig.studies.benchmarks.rivals import Replay, build_library
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def make_jax_replay(task: Task) -> Replay:
 
     def replay_run(parameters: Any, current: Any, load: Any) -> Any:
         p = _make_namespaces(parameters)
-        k = coefficients(p, h)
+        k = compute_coefficients(p, h)
 
         def cycle(s: Any, held: Any) -> Any:
             def forward(s: Any, _: None) -> tuple[Any, None]:
@@ -114,7 +114,7 @@ def _define_progpy_plant(task: Task) -> Any:
     from progpy import PrognosticsModel
 
     p, h, names = _make_namespaces(task.parameters), task.h, ["xf", "vf", "xs", "vs", "xj", "vj", "p12"]
-    k = coefficients(p, h)
+    k = compute_coefficients(p, h)
 
     class Plant(PrognosticsModel):  # type: ignore[misc]
         """The reference model without its controller."""
@@ -142,7 +142,7 @@ def _make_namespaces(groups: Mapping[str, Mapping[str, Any]]) -> Any:
 
 
 def step_bare_model(xp: Any, s: Any, current: Any, load: Any, p: Any, k: Any, h: float) -> tuple[Any, ...]:
-    """`plant.step.step` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
+    """`plant.step.step_plant` of the bare model on arrays of the library `xp`: XF, XF', XS, XS', XJ, XJ', P12."""
     xf, vf, xs, vs, xj, vj, _ = s
     torque = p.torque_motor.gain * current - p.flapper.stiffness * xf - p.feedback_spring.stiffness * (
         xs + 0.5 * h * vs)

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Model, simulate
-from plant.model import STEPS, kernel
-from plant.run import noise
+from plant.model import STEPS, build_kernel
+from plant.run import draw_noise
 from rig.studies.benchmarks.rivals import FLAGS, SAME_ROUNDING, build_library, find_gcc
 from rig.studies.benchmarks.stopwatch import Work, measure_durations
 
@@ -52,7 +52,7 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
     """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
     if not find_gcc():
         return None
-    model, draws = Model(), noise(0, len(command))
+    model, draws = Model(), draw_noise(0, len(command))
     with tempfile.TemporaryDirectory() as folder:
         runs, outs = {}, {}
         runs["python"], outs["python"] = _make_python_run(model, command, draws, steps)
@@ -70,7 +70,7 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
 
 def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
-    run, state, record = kernel("closed_loop", model.effects), model.state(), model.record()
+    run, state, record = build_kernel("run_closed_loop", model.effects), model.state(), model.record()
     return lambda: run(state, command, load, draws, record, steps, out), out
 
 

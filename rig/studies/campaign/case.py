@@ -14,7 +14,7 @@ from fdi.sources import hash_sources, import_function
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 from plant.errors import InputError, RigError
-from plant.model import entry, parse_model
+from plant.model import find_effect, parse_model
 from plant.solve import NOISES
 from rig.network.clock import WallClock
 from rig.studies.campaign.matrix import Case
@@ -111,7 +111,7 @@ def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:
     friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
     """
     for name, size in sizes.items():
-        effect = entry(name, model.plant)
+        effect = find_effect(name, model.plant)
         first, *others = effect.fitted
         if effect.base:
             changes = {other: model[other] * size / model[first] for other in others}

@@ -7,7 +7,7 @@ from typing import Any
 from fdi.diagnosis.faults import FAULTS, Level
 from fdi.trace.trace import Trace
 from plant import Model
-from plant.threads import threads
+from plant.threads import count_threads
 
 WORKS: Mapping[str, str] = {"fdi": "rig.studies.campaign.judge:judge_by_fdi"}
 """Judgements by the short name that --work accepts."""
@@ -22,7 +22,7 @@ def judge_by_fdi(trace: Trace, model: Model) -> dict[str, Any]:
     """
     from fdi.diagnosis.diagnosis import diagnose
 
-    found = diagnose(trace, model, workers=threads())
+    found = diagnose(trace, model, workers=count_threads())
     row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
     for fault in FAULTS:
         size = found.sizes[fault.name]

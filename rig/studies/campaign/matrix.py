@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 from fdi.prognosis.gather import list_traces
 from plant.effects import Effect
 from plant.errors import InputError
-from plant.model import Model, entry
-from plant.parameters import accept, parse_toml, read_toml
+from plant.model import Model, find_effect
+from plant.parameters import parse_toml, parse_value, read_toml
 
 SIMULATORS = ("plant", "independent")
 SIGNALS = ("xj,p12,xs", "xj,p12", "xj")
@@ -129,7 +129,7 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
             continue
         effect = _find_sized_effect(name, model, where)
         quantity = effect.parameters[effect.fitted[0]]
-        sizes[name] = [accept(where, name, quantity, value) for value in _as_list(values)]
+        sizes[name] = [parse_value(where, name, quantity, value) for value in _as_list(values)]
         if not sizes[name]:
             raise InputError(where, name, "at least one size")
     return {"seeds": _check_count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes,
@@ -137,7 +137,7 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
 
 
 def _find_sized_effect(name: str, model: Model, where: object) -> Effect:
-    found = entry(name, model.plant)
+    found = find_effect(name, model.plant)
     if not found.fitted:
         raise InputError(where, name, "an effect with a size; this one is noise of the bench")
     return found

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
-from plant.parameters import nominal
+from plant.parameters import load_nominal_values
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class Run(NamedTuple):
 
 def nominal_symbols() -> dict[str, float]:
     """The nominal numbers by symbol, SI."""
-    values = nominal()
+    values = load_nominal_values()
     return {symbol: values[name] for symbol, name in SYMBOLS.items()}
 
 

@@ -27,7 +27,7 @@ from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
-from plant.profile import build as profile
+from plant.profile import build_profile as profile
 from plant.segments import Hold, Ramp, Step
 from rig.sequences import load_sequence
 

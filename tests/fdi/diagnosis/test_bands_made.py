@@ -14,7 +14,7 @@ from fdi.diagnosis.learn_bands import learn_bands
 from fdi.diagnosis.simulated_units import UnitKind, draw_sensor_noise, simulate_units
 from fdi.trace.trace import Trace
 from plant import InputError, load_model
-from plant.profile import build as profile
+from plant.profile import build_profile as profile
 from plant.segments import Hold, Ramp, Step
 from rig.cli.main import main
 from rig.sequences import load_sequence

@@ -22,7 +22,7 @@ from fdi.diagnosis.rms_grid import (
 from fdi.estimation.preparation import read_cycles
 from plant import InputError, Model, simulate
 from plant.monitor import Monitor
-from plant.profile import build
+from plant.profile import build_profile
 from plant.segments import Chirp, Hold, Ramp, Step
 from rig.sequences import load_sequence
 
@@ -115,7 +115,7 @@ def test_closed_loop_misleads() -> None:
 @pytest.mark.parametrize("which", ["step", "ramp"])
 def test_a_command_with_one_kind_of_section(which: str) -> None:
     piece = Step(to=2e-3, time=0.8) if which == "step" else Ramp(to=1e-3, time=1.5)
-    com = build([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    com = build_profile([Hold(time=0.3), piece, Hold(time=0.2), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     model = Model().replace({"spool.static_friction": 40.0, "spool.dynamic_friction": 80.0 / 3.0})
     grid = search_grid(of(simulate(model, com)))
     there, absent = (grid.step, grid.ramp) if which == "step" else (grid.ramp, grid.step)
@@ -149,7 +149,7 @@ def test_gaps_are_left_out() -> None:
 
 
 def test_refusals() -> None:
-    com = build([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    com = build_profile([Hold(time=0.3), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     with pytest.raises(InputError, match="steps or ramps"):
         search_grid(of(simulate(Model(), com)))
     with pytest.raises(InputError, match="drive"):

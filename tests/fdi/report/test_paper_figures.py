@@ -12,7 +12,7 @@ from fdi.diagnosis.bands import choose_bands, find_excursions
 from fdi.diagnosis.rms_grid import search_grid
 from fdi.report import paper_figures as figures
 from plant import Model, simulate
-from plant.profile import build
+from plant.profile import build_profile
 from plant.segments import Chirp, Hold, Step
 from rig.sequences import load_sequence
 
@@ -62,7 +62,7 @@ def test_the_maps() -> None:
 
 @pytest.mark.parametrize("cells", [1, 2, 5])
 def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
-    com = build([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
+    com = build_profile([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     measured = Trace.of(simulate(Model(), com)._asdict(), 1e-3, {})
     grid = search_grid(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
     said = texts(figures.draw_maps(grid))

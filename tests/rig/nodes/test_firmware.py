@@ -8,7 +8,7 @@ import struct
 import pytest
 from node_bench import FirmwareDesk
 
-from plant.controller import Loop, answer
+from plant.controller import Loop, compute_current
 from rig.device import Abort, NmtState
 from rig.network import codec
 from rig.network.codec import Control, Status
@@ -69,7 +69,7 @@ def test_the_law_is_the_models() -> None:
         demand, position = 5e-3 * (k >= 10), 1e-4 * k
         drive = desk.cycle(ACTIVE, demand, position)
         heard = codec.position(codec.raw_position(demand)), codec.position(codec.raw_position(position))
-        current, loop = answer(loop, *heard, GIVEN)
+        current, loop = compute_current(loop, *heard, GIVEN)
         assert drive is not None and drive.current == codec.current(codec.raw_current(current))
 
 

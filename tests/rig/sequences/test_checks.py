@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError
-from plant.profile import build
+from plant.profile import build_profile
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, evaluate_checks
@@ -43,7 +43,7 @@ def noise(n: int, seed: int = 0) -> Array:
 
 def second_order(damping: float, omega: float, size: float = 5e-3) -> tuple[Run, dict[str, slice]]:
     """The textbook answer of a second-order system to a step at 0.1 s, noise added."""
-    command, sections, _ = build([Hold(time=0.1, name="rest"), Step(to=size, time=1.0, name="step")])
+    command, sections, _ = build_profile([Hold(time=0.1, name="rest"), Step(to=size, time=1.0, name="step")])
     t = np.arange(len(command)) / 1000
     after = np.maximum(t - 0.1, 0)
     wd = omega * sqrt(1 - damping**2)
@@ -54,7 +54,7 @@ def second_order(damping: float, omega: float, size: float = 5e-3) -> tuple[Run,
 
 def follower(*segments: Segment, tau: float = LAG) -> tuple[Run, dict[str, slice]]:
     """A first-order lag with unit gain, sampled exactly for a command held over each cycle, noise added."""
-    command, sections, _ = build(segments)
+    command, sections, _ = build_profile(segments)
     x, out = 0.0, np.empty(len(command))
     for k, demand in enumerate(command):
         out[k] = x
@@ -113,7 +113,7 @@ def test_ramp_error_is_rate_times_lag_in_either_direction() -> None:
 
 
 def test_break_away_is_half_the_band_of_a_triangle() -> None:
-    command, sections, _ = build([Ramp(to=1e-3, time=2.0, name="ramp")])
+    command, sections, _ = build_profile([Ramp(to=1e-3, time=2.0, name="ramp")])
     t = np.arange(len(command)) / 1000
     triangle = 20e-6 * (2 * np.abs(2 * (t / 0.16 % 1) - 1) - 1)
     run = Run(t, command, command - 7e-6 - triangle + noise(len(t)))

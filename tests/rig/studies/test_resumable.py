@@ -60,7 +60,7 @@ def test_workers_are_limited_to_one_thread_on_demand(single_threaded: bool, thre
                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     workers = Workers(2, single_threaded=single_threaded)
-    results = dict(run_jobs(batch_work.count_threads, [1, 2], workers, fail_test))
+    results = dict(run_jobs(batch_work.count_usable_threads, [1, 2], workers, fail_test))
     assert results == {1: threads, 2: threads} and os.environ["OMP_NUM_THREADS"] == "5"
 
 
