@@ -35,10 +35,12 @@ _ENTRY = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *_A
 
 
 class StoredCode:
-    """`plant.solve.advance_flat_state` of one kind of plant: from the file `folder`/..., else from numba, which then fills it."""
+    """`plant.solve.advance_flat_state` of one kind of plant: from a file in `folder`, else from numba, which then fills
+    the file.
+    """
 
     def __init__(self, folder: Path, compile_code: Callable[[], Any]) -> None:
-        """`compile_code` returns numba's dispatcher of `advance_flat_state`; `folder` belongs to this source code alone."""
+        """`compile_code` returns numba's dispatcher of `advance_flat_state`; `folder` is for this source code alone."""
         self._path = folder / f"{_SYMBOL}.{_name_environment()}.o"
         self._compile = compile_code
         self._engine: Any = None  # owns the code
