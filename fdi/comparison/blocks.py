@@ -84,25 +84,27 @@ def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     seen = differentiate(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
     bad = lost | missing | ~trace.usable
     if "p12" not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
-        error = _force(trace, model, p12, xj, seen)
+        error = _compute_force_residual(trace, model, p12, xj, seen)
         p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
     bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
     sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
-    lag = rows_in_span(trace.period)
+    lag = count_span_rows(trace.period)
     way = difference_over(trace.xj - sensed, lag)
-    way[_any_within(bad, lag)] = np.nan
+    way[_flag_within(bad, lag)] = np.nan
     dx = difference_over(xj, lag)
     there = ~np.isnan(way) & ~np.isnan(dx)
     power = float(np.sum(dx[there] ** 2))
     gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
     # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
     known = speed * (1 + max(-0.2, min(gain, 0.2))) if "xs" in trace.outputs else seen
-    force = _force(trace, model, p12, xj, known) if "p12" in trace.outputs else np.full(len(trace), np.nan)
+    force = np.full(len(trace), np.nan)
+    if "p12" in trace.outputs:
+        force = _compute_force_residual(trace, model, p12, xj, known)
     force[bad] = np.nan
     return Balance(way, force, gain, speed, sensed)
 
 
-def rows_in_span(period: float) -> int:
+def count_span_rows(period: float) -> int:
     """SPAN in rows."""
     return max(1, round(SPAN / period))
 
@@ -114,13 +116,13 @@ def difference_over(x: Floats, rows: int) -> Floats:
     return out
 
 
-def _any_within(bad: Flags, rows: int) -> Flags:
+def _flag_within(bad: Flags, rows: int) -> Flags:
     total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(bad)])
     out: Flags = total[rows + 1:] > total[:-rows - 1]
     return out
 
 
-def _force(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
+def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
     takes, _, dynamic = compute_force_balance(model, xj, speed, p12, trace.load)
     size = max(1, round(MEAN / trace.period)) | 1
     kernel = np.ones(size) / size
@@ -129,13 +131,13 @@ def _force(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -
     seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
     direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
     direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
-    turned = _any_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
-    turned |= np.roll(turned, -size) | ~_resolved(speed, trace.period)
+    turned = _flag_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
+    turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
     out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
     return np.where((direction == 0.0) | turned, np.nan, out)
 
 
-def _resolved(speed: Floats, period: float) -> Flags:
+def _find_resolved(speed: Floats, period: float) -> Flags:
     """Where the change of speed is the same over two and over four samples: there is no jerk between them."""
     near, wide = np.gradient(speed, period), np.zeros(len(speed))
     wide[2:-2] = (speed[4:] - speed[:-4]) / (4 * period)
@@ -153,12 +155,12 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
     The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
     whose noise is in the residual itself.
     """
-    lag, x = rows_in_span(trace.period), b.position
-    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _rates(xs, p12)]
+    lag, x = count_span_rows(trace.period), b.position
+    rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _list_rate_shapes(xs, p12)]
     places = [x, b.speed, p12, *(apply_play(x, width) for width in PLAYS)]
     there = ~np.isnan(b.way)
     columns = [difference_over(s, lag)[there] for s in (*rates, *places)]
-    error, (rate, place, gain, both) = _left(b.way[there], columns, len(rates))
+    error, (rate, place, gain, both) = _measure_remainders(b.way[there], columns, len(rates))
     effective = int(there.sum()) / lag
 
     def worse(one: float, other: float) -> float:
@@ -166,11 +168,15 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
         return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
 
     tie = worse(gain, both) < SHAPE_TIE_GAIN + len(columns) or abs(worse(rate, place)) < SHAPE_TIE_GAIN
-    winner = "either" if tie else "flow" if rate < place else "sensor"
-    return Split(error, rate, place, both, "sensor" if tie and noisy else winner)
+    if tie:
+        winner = "sensor" if noisy else "either"
+    else:
+        winner = "flow" if rate < place else "sensor"
+    return Split(error, rate, place, both, winner)
 
 
-def _left(y: Floats, columns: list[Floats], first: int) -> tuple[float, tuple[float, float, float, float]]:
+def _measure_remainders(y: Floats, columns: list[Floats], first: int
+                        ) -> tuple[float, tuple[float, float, float, float]]:
     """RMS of y, and of what the `first` columns, the others, the first of the others, and all of them leave of it."""
     z = np.column_stack([*columns, y])
     size = np.sqrt((z**2).mean(axis=0))
@@ -187,7 +193,7 @@ def _left(y: Floats, columns: list[Floats], first: int) -> tuple[float, tuple[fl
     return float(size[-1]), tuple(left(part) for part in parts)  # type: ignore[return-value]
 
 
-def _rates(xs: Floats, p12: Floats) -> list[Floats]:
+def _list_rate_shapes(xs: Floats, p12: Floats) -> list[Floats]:
     """Errors of speed that a valve or a jack can make, as functions of opening and pressure, each of order one."""
     x, p = xs / 1e-4, p12 / 1e6
     edge, narrow, held = np.tanh(xs / 2e-5), np.tanh(xs / 5e-6), np.tanh(p / 0.3)
@@ -263,7 +269,7 @@ def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
     return replace(trace, **noisy)  # type: ignore[arg-type]
 
 
-def block_ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
+def collect_block_ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
            controller: float | None, spool: bool = True) -> dict[str, float | None]:
     """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
 
@@ -301,18 +307,18 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     """Compare; where it does not fit, look for the cycles that Com and XJ are late. NaN where firmware is unknown."""
     if not model.kind.controller:
         return ControllerBlock(np.full(len(trace), np.nan), math.nan, math.nan, limit=model["controller.current_limit"])
-    found = _compared(trace, model, 0, 0)
+    found = _compare_at_lags(trace, model, 0, 0)
     if found.ratio <= CONTROLLER_ERROR_RATIO:
         return found
     com, xj, gain = find_lags(trace, model["controller.current_limit"])
     found = found._replace(gain=gain)
     if (com, xj) == (0, 0):
         return found
-    late = _compared(trace, model, com, xj)
+    late = _compare_at_lags(trace, model, com, xj)
     return late._replace(gain=gain) if late.error < CONTROLLER_LAG_RATIO * found.error else found
 
 
-def _compared(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
+def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
     limit = model["controller.current_limit"]
     sensed = shift_rows(trace.xj, xj)
     answers = run_firmware(model, shift_rows(trace.com, com), hold_last(sensed))

@@ -63,7 +63,9 @@ class SignalError:
     @property
     def ratio(self) -> float:
         """Error over floor; 1 for a perfect model."""
-        return self.error / self.floor.value if self.floor.value > 0.0 else math.inf if self.error else 1.0
+        if self.floor.value > 0.0:
+            return self.error / self.floor.value
+        return math.inf if self.error else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, signals, source)
     model = match_period(model, trace)
-    trace, found = _in_step(trace, model, blocks.compare_controller(trace, model))
+    trace, found = _align_delays(trace, model, blocks.compare_controller(trace, model))
     others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
     noise = sensor_floors(trace, model)
@@ -111,51 +113,51 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("repeats", 2 / STAGES)
     runs = [(other, replay_current(other.trace, model, replay.steps)) for other in others]
     theirs = [align_columns(compute_residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
-    floor = _blinder(noise, replay) | find_floors(replay.residual, theirs, trace.period)
-    judged = {name: np.where(_left_out(replay), np.nan, r) for name, r in replay.residual.items()}
+    floor = _widen_by_guess(noise, replay) | find_floors(replay.residual, theirs, trace.period)
+    judged = {name: np.where(_find_undecided(replay), np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
     closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
-    table = {name: _signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
+    table = {name: _measure_signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
     progress("blocks", 4 / STAGES)
-    ratios, parts = _blocks(trace, model, replay.model, runs, table, found, noise)
+    ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, found, noise)
     progress("where", 5 / STAGES)
     m = describe_motion(trace, replay.model)
     z2 = combine_residuals(judged, {name: f.value for name, f in floor.items()})
     sections, when = locate_error(trace, z2, m, found.limit), find_condition(z2, m, found.limit)
-    verdict, reason = _verdict(table, sections, ratios, replay, trace.period)
+    verdict, reason = _decide_verdict(table, sections, ratios, replay, trace.period)
     diagnoses = examine_residuals(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
     plant = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
     scattered = fit_scatter(trace, model, {name: s.floor.value for name, s in table.items()}) if plant else None
     progress("done", 1.0)
-    return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, _named(ratios),
+    return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, _list_blocks_above(ratios),
                       tuple(sections), when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
-                      (*trace.notes, *_notes(floor, replay, trace)))
+                      (*trace.notes, *_list_notes(floor, replay, trace)))
 
 
-def _blinder(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
+def _widen_by_guess(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
     """The floor with what a current that was not recorded leaves open."""
     return {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
 
 
-def _left_out(replay: Replay) -> NDArray[np.bool_]:
+def _find_undecided(replay: Replay) -> NDArray[np.bool_]:
     """Rows that hang on a knife's edge, unless that is half the trace."""
     out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     return out
 
 
-def _signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> SignalError:
-    limit = SIGNAL_ERROR_RATIO + 3 * _spread(floor, int((~np.isnan(residual)).sum()))
+def _measure_signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> SignalError:
+    limit = SIGNAL_ERROR_RATIO + 3 * _ratio_spread(floor, int((~np.isnan(residual)).sum()))
     return SignalError(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
 
 
-def _spread(floor: Floor, samples: int) -> float:
+def _ratio_spread(floor: Floor, samples: int) -> float:
     """Standard deviation of a ratio of two RMS values of so many samples each."""
     return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
 
 
-def _in_step(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace, ControllerBlock]:
+def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace, ControllerBlock]:
     """Columns that are cycles late in the file, set right; a firmware that answers late stays as it is."""
     com, xj = found.com_lag, found.xj_lag
     notes = []
@@ -163,20 +165,23 @@ def _in_step(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace,
         moved = trace.with_delays(cor=-xj)
         if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAG_MISFIT_RATIO):
             trace, com = moved, com - xj
-            notes.append(f"Cor stands {_cycles(xj)} than the other columns: moved into step")
+            notes.append(f"Cor stands {_describe_cycles(xj)} than the other columns: moved into step")
         else:
-            notes.append(f"Cor fits the XJ {_cycles(-xj)}: the firmware answers late, or XJ is delayed on its way")
+            notes.append(f"Cor fits the XJ {_describe_cycles(-xj)}: the firmware answers late, "
+                         "or XJ is delayed on its way")
     if com:
         trace = trace.with_delays(com=com)
-        notes.append(f"Com stands {_cycles(-com)} than the rest of the trace: moved into step")
+        notes.append(f"Com stands {_describe_cycles(-com)} than the rest of the trace: moved into step")
     return trace.with_notes(*notes), found
 
 
-def _cycles(n: int) -> str:
-    return f"{abs(n)} cycle{'s' if abs(n) > 1 else ''} {'later' if n > 0 else 'earlier'}"
+def _describe_cycles(n: int) -> str:
+    cycles = "cycle" if abs(n) == 1 else "cycles"
+    direction = "later" if n > 0 else "earlier"
+    return f"{abs(n)} {cycles} {direction}"
 
 
-def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
+def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
             table: Mapping[str, SignalError], found: ControllerBlock,
             noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, and the parts of the jack's."""
@@ -187,12 +192,13 @@ def _blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Re
     j = blocks.judge_jack(trace, model, run, pairs, level) if told else None
     answered = found.ratio if model.kind.controller else None
     if j is None:
-        return blocks.block_ratios(signal, None, None, None, answered), {"flow": None, "force": None, "gain": None}
-    ratios = blocks.block_ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
+        ratios = blocks.collect_block_ratios(signal, None, None, None, answered)
+        return ratios, {"flow": None, "force": None, "gain": None}
+    ratios = blocks.collect_block_ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
     return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
 
 
-def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
+def _list_blocks_above(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
     def limit(name: str) -> float:
         return CONTROLLER_ERROR_RATIO if name == "controller" else BLOCK_ERROR_RATIO
 
@@ -200,7 +206,7 @@ def _named(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
     return tuple(name for _, name in sorted(over, reverse=True))
 
 
-def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
+def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
              replay: Replay, period: float) -> tuple[str, str]:
     """The verdict, and why it cannot tell."""
     coarse = [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]
@@ -214,14 +220,14 @@ def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios
         return p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(samples)
 
     local = [p for p in sections if is_above(p)]
-    if not (above or local or _named(ratios)):
+    if not (above or local or _list_blocks_above(ratios)):
         return "WITHIN_FLOOR", ""
     edgy = float(replay.undecided.mean())
     doubt = ""
     if any(s.floor.lower_bound for s in table.values()):
         doubt = "without a repeat the floor is only a lower bound, and the error is not far above it"
     elif edgy > UNDECIDED_SHARE:
-        doubt = f"{100 * edgy:.0f} % of the trace {_hangs(replay)}"
+        doubt = f"{100 * edgy:.0f} % of the trace {_describe_cause(replay)}"
     sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or not (edgy > UNDECIDED_SHARE or s.floor.lower_bound)
                for s in above)
     if doubt and not sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO:
@@ -229,7 +235,7 @@ def _verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios
     return "MODEL_INCOMPLETE", ""
 
 
-def _notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:
+def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:
     """What a reader must know about the floor and about rows left out."""
     said = []
     apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
@@ -238,11 +244,11 @@ def _notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str
         said.append(f"the error itself differs between the repeats, as stick-slip does, in floors: {', '.join(apart)}")
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
-        said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_hangs(replay)}")
+        said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_describe_cause(replay)}")
     return said
 
 
-def _hangs(replay: Replay) -> str:
+def _describe_cause(replay: Replay) -> str:
     guessed = " or on current that was not recorded" if any(replay.blind.values()) else ""
     return f"hangs there on less than 0.1 % of a friction level{guessed}"
 

@@ -106,7 +106,7 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
     if rows == 0 or total < CONDITION_EXCESS_LEAST * rows:
         return ""
     best, said = 0.0, ""
-    for words, flags in _conditions(m, limit):
+    for words, flags in _list_conditions(m, limit):
         time = float((flags & there).sum()) / rows
         part = float(excess[flags].sum()) / total
         # the gain over spreading it evenly; a condition that holds nearly always or hardly ever gains little
@@ -116,10 +116,10 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
     return said
 
 
-def _conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
+def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
     speed, far, hard = np.abs(m.v), np.abs(m.x), np.abs(m.a)
-    out = [(f"ram faster than {_speed(s)}", speed > s) for s in SPEEDS]
-    out += [(f"ram slower than {_speed(s)}", speed < s) for s in SPEEDS[:4]]
+    out = [(f"ram faster than {_format_speed(s)}", speed > s) for s in SPEEDS]
+    out += [(f"ram slower than {_format_speed(s)}", speed < s) for s in SPEEDS[:4]]
     out += [(f"ram further than {1e3 * x:g} mm from the middle", far > x) for x in PLACES]
     out += [(f"within {1e3 * x:g} mm of the middle", far < x) for x in PLACES[:3]]
     out += [(f"ram accelerates by more than {a:g} m/s2", hard > a) for a in RATES]
@@ -134,5 +134,5 @@ def _conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
     return out
 
 
-def _speed(s: float) -> str:
+def _format_speed(s: float) -> str:
     return f"{s:g} m/s" if s >= 0.1 else f"{1e3 * s:g} mm/s"

@@ -81,7 +81,7 @@ def examine_residuals(trace: Trace, residual: Columns, repeats: Mapping[str, Flo
     for name, r in residual.items():
         foreign = {u: (inputs[u], by) for u, by in colours.items() if (name, u) not in OWN}
         others = {q: x for q, x in quantities.items() if (name, q) not in OWN}
-        found[name] = _one(trace, r, repeats.get(name), foreign, others)
+        found[name] = _examine_signal(trace, r, repeats.get(name), foreign, others)
     return found
 
 
@@ -108,8 +108,8 @@ def apply_whitener(x: Floats, by: Floats) -> Floats:
     return out
 
 
-def _one(trace: Trace, residual: Floats, difference: Floats | None, inputs: Mapping[str, tuple[Floats, Floats]],
-         quantities: Mapping[str, Floats]) -> ResidualTests:
+def _examine_signal(trace: Trace, residual: Floats, difference: Floats | None,
+                    inputs: Mapping[str, tuple[Floats, Floats]], quantities: Mapping[str, Floats]) -> ResidualTests:
     r = np.nan_to_num(residual)
     e = apply_whitener(r, fit_whitener(difference) if difference is not None else WHITE)
     own = autocorrelate(e)
@@ -121,8 +121,9 @@ def _one(trace: Trace, residual: Floats, difference: Floats | None, inputs: Mapp
     follows = tuple(correlate_with_input(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
     found = [bin_residual(name, q, residual) for name, q in quantities.items()]
     depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
-    return ResidualTests(_memory(autocorrelate(r)) * trace.period, _memory(quiet) * trace.period, own, band,
-                         frequencies, power, departs, allowed, half, follows, tuple(depends))
+    memory, noise_memory = (_measure_memory(x) * trace.period for x in (autocorrelate(r), quiet))
+    return ResidualTests(memory, noise_memory, own, band, frequencies, power, departs, allowed, half, follows,
+                         tuple(depends))
 
 
 def autocorrelate(x: Floats) -> Floats:
@@ -143,7 +144,7 @@ def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
     return out
 
 
-def _memory(correlation: Floats) -> int:
+def _measure_memory(correlation: Floats) -> int:
     """The lag at which it first is below 1/e."""
     below = np.flatnonzero(correlation < 1 / math.e)
     return int(below[0]) if len(below) else len(correlation)

@@ -71,7 +71,7 @@ class Objective:
         x = np.array([make_start(self.free, k, math.exp(f)) for k, f, _ in points])
         sliding = self.free[self._sliding]
         x[:, self._sliding] = (points[:, 1] + np.log(points[:, 2]) - sliding.centre) / sliding.scale
-        return self.problem.whitened(self.problem.residuals(self.free, x))
+        return self.problem.compute_white_residuals(self.free, x)
 
 
 def search_by_least_squares(model: Model, trace: Trace, start: tuple[float, float], floor: Mapping[str, float],

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
-from fdi.estimation.final_rounds import descend_valley, first_covariance
+from fdi.estimation.final_rounds import descend_valley, guess_covariance
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms
 from fdi.estimation.unidentifiable import find_flat_directions
@@ -203,12 +203,12 @@ class CountedProblem(Problem):
 
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
 
-    def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
-        return self.left(self.predict([f.name for f in free], np.array([compute_values(free, row) for row in x])))
+    def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        return np.array([compute_values(free, row) for row in x])
 
-    def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
+    def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
-        return super().all_signals(names, values, trace)
+        return super().predict_signals(names, values, trace)
 
 
 def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None = None, workers: int = 2
@@ -301,7 +301,7 @@ def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> 
 
 
 def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
-    start = replace(found, covariance=first_covariance(found.free))
+    start = replace(found, covariance=guess_covariance(found.free))
     flat = find_flat_directions(problem, found.free, found.x)
     return descend_valley(_scale_noise(problem, factor), start, rounds, flat)
 
@@ -331,7 +331,7 @@ def _scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
 def start_fit(free: Sequence[Free], x: Floats) -> Fit:
     """A fit at `x` (p,) before its first round."""
     none = np.empty((0, 0))
-    return Fit(tuple(free), x, np.inf, np.inf, first_covariance(free), none, none, none)
+    return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
 
 
 def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
@@ -342,7 +342,7 @@ def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
 
     def try_starts(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
         x = np.array([make_start(free, *s, offsets, sliding) for s in tried])
-        costs = compute_misfit(loud.whitened(loud.residuals(free, x)))
+        costs = compute_misfit(loud.compute_white_residuals(free, x))
         k = int(np.argmin(costs))
         return float(costs[k]), tried[k], x[k]
 

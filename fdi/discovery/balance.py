@@ -53,37 +53,37 @@ def compute_balances(search: Search, h: Hypothesis) -> tuple[list[Balance], Stat
     problem, trace = search.problem, search.problem.trace
     names = [f.name for f in h.fit.free]
     values = {**problem.model.values, **h.fit.values}
-    replay = problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    replay = problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     measured = replay.copy()
     for row, signal in enumerate(trace.outputs):
         there = ~np.isnan(trace.measurements[row])
         measured[OUTPUTS.index(signal), there] = trace.measurements[row, there]
     before = np.concatenate([[0.0], trace.cor[:-1]])
-    own = _terms(replay, before, trace.load, values, problem.model.values["controller.period"])
-    seen = _terms(measured, before, trace.load, values, problem.model.values["controller.period"])
-    level = [search.floor(h).get(s, 0.0) for s in OUTPUTS]
+    period = problem.model.values["controller.period"]
+    own = _compute_terms(replay, before, trace.load, values, period)
+    seen = _compute_terms(measured, before, trace.load, values, period)
+    level = [search.estimate_floor(h).get(s, 0.0) for s in OUTPUTS]
     rng = np.random.default_rng(0)
-    noisy = [_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load, values,
-                    problem.model.values["controller.period"]) for _ in range(DRAWS)]
+    noisy = [_compute_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load,
+                            values, period) for _ in range(DRAWS)]
     found = []
     for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
         missing = seen[place] - own[place]
-        noise = float(np.sqrt(np.mean([_square(n[place] - own[place]) for n in noisy])))
-        rms = float(np.sqrt(_square(missing)))
+        noise = float(np.sqrt(np.mean([_mean_square(n[place] - own[place]) for n in noisy])))
+        rms = float(np.sqrt(_mean_square(missing)))
         found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0))
     states = States(replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW),
-                    _speed(measured[0], problem.model.values["controller.period"]), measured[1], measured[2], before,
-                    trace.t)
+                    _measure_speed(measured[0], period), measured[1], measured[2], before, trace.t)
     return sorted(found, key=lambda b: -b.ratio), states
 
 
-def _square(x: Floats) -> float:
+def _mean_square(x: Floats) -> float:
     """Mean square of what counts: neither the ends nor the few samples in which something stops or breaks away."""
     inner = x[EDGE:-EDGE] ** 2
     return float(np.nanmean(np.minimum(inner, np.nanpercentile(inner, 99.5))))
 
 
-def _speed(x: Floats, period: float) -> Floats:
+def _measure_speed(x: Floats, period: float) -> Floats:
     return _smooth(x, SPEED_WINDOW, deriv=1, delta=period)
 
 
@@ -95,25 +95,26 @@ def _smooth(x: Floats, window: int, **derivative: float) -> Floats:
     return smooth
 
 
-def _terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float) -> dict[str, Floats]:
+def _compute_terms(signals: Floats, current: Floats, load: Floats, p: Mapping[str, float], period: float
+                   ) -> dict[str, Floats]:
     """Left side minus right side of the equations of motion (of the reference model, or of a pump), from (3, n)."""
     x, p12, xs = signals
-    v = _speed(x, period)
+    v = _measure_speed(x, period)
     a = _smooth(x, ACCELERATION_WINDOW, deriv=2, delta=period)
     smooth = _smooth(p12, ACCELERATION_WINDOW)
     sliding = np.clip(v / 2e-4, -1.0, 1.0) * p["jack.dynamic_friction"]
     force = p["jack.area"] * smooth - p["jack.damping"] * v - load - sliding - p["jack.mass"] * a
     if "pump.displacement" in p:
-        return {"force": force, "flow": _pumped(current, v, _smooth(p12, SPEED_WINDOW), p)}
+        return {"force": force, "flow": _compute_pump_flow(current, v, _smooth(p12, SPEED_WINDOW), p)}
     spool = _smooth(xs, SPEED_WINDOW)
     conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
     flow = p["valve.flow_gain"] * spool - conductance * _smooth(p12, SPEED_WINDOW) - p["jack.area"] * v
-    flapper = p["spool.end_area"] * _speed(xs, period) / p["pilot.flow_gain"]
+    flapper = p["spool.end_area"] * _measure_speed(xs, period) / p["pilot.flow_gain"]
     torque = p["flapper.stiffness"] * flapper + p["feedback_spring.stiffness"] * spool
     return {"force": force, "flow": flow, "current": current - torque / p["torque_motor.gain"]}
 
 
-def _pumped(speed: Floats, v: Floats, p12: Floats, p: Mapping[str, float]) -> Floats:
+def _compute_pump_flow(speed: Floats, v: Floats, p12: Floats, p: Mapping[str, float]) -> Floats:
     """Flow that a pump at motor `speed` (n,) delivers and the jack does not take, m3/s."""
     area = p["jack.area"] * np.where(speed < 0.0, p["pump.area_ratio"], 1.0)
     left: Floats = p["pump.displacement"] * speed - area * v - p["jack.leakage"] * p12

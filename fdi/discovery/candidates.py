@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.discovery.explain import Explanation, measure_gain
-from fdi.discovery.fingerprints import Fingerprint, firmware_resolution
+from fdi.discovery.fingerprints import Fingerprint, measure_firmware_resolution
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.significance import compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit
@@ -115,20 +115,21 @@ class Answer:
 def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None
                        ) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
-    hand = _firmware(e)
+    hand = _list_firmware_marks(e)
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
-        unit = firmware_resolution(e.search.problem.model)
+        unit = measure_firmware_resolution(e.search.problem.model)
         baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
-    blind = tuple(_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
+    blind = tuple(_describe_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
     noiseless = tuple(c.name for c in list_offered_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
-    return Answer(e, tuple(_candidates(e, seed)), baseline, blind, noiseless, tuple(list_suspicious(best, model.plant)),
-                  tuple(_ledger(e, hand)), pattern, separate or {})
+    suspicious = tuple(list_suspicious(best, model.plant))
+    return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,
+                  tuple(_list_ledger(e, hand)), pattern, separate or {})
 
 
-def fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
+def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
     found = {}
     values, entry = limit_friction_values(fit.values), CATALOGUE[effect]
@@ -152,32 +153,32 @@ def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
             if np.isfinite(f.prior) and abs(x) > SUSPICIOUS_TOLERANCES * f.prior]
 
 
-def _candidates(e: Explanation, seed: int) -> list[Candidate]:
+def _list_candidates(e: Explanation, seed: int) -> list[Candidate]:
     """Each effect once, in the order of the explanations it is part of."""
-    found = {p.effect: _printed(e, p) for p in e.prints}
+    found = {p.effect: _describe_mark(e, p) for p in e.prints}
     for rank, h in enumerate(e.ranked):
         for effect in h.effects if rank == 0 else h.effects[-1:]:
             if effect not in found:
-                found[effect] = _candidate(e, h, effect, seed)
+                found[effect] = _describe_candidate(e, h, effect, seed)
     return list(found.values())
 
 
-def _candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
-    won, extra = measure_gain(e.base, h), _unknown(h.fit) - _unknown(e.base.fit)
+def _describe_candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
+    won, extra = measure_gain(e.base, h), _count_unknown(h.fit) - _count_unknown(e.base.fit)
     samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
     charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
-    values = fitted_parameters(effect, h.fit, e.search.problem.model)
+    values = list_fitted_parameters(effect, h.fit, e.search.problem.model)
     return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
                      dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * won - charge,
-                     compute_p_value(e.blind, won, max(extra, 1), seed), _word(e, h, effect))
+                     compute_p_value(e.blind, won, max(extra, 1), seed), _choose_word(e, h, effect))
 
 
-def _unknown(fit: Fit) -> int:
+def _count_unknown(fit: Fit) -> int:
     """How many parameters of which nothing was known."""
     return sum(not np.isfinite(f.prior) for f in fit.free)
 
 
-def _word(e: Explanation, h: Hypothesis, effect: str) -> str:
+def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
     """What to think of an effect, in a word or two."""
     words = {"EXPLAINED": "explains", "AMBIGUOUS": "equal", "PARTLY": "part", "NOT_RESOLVABLE": "too small to be sure"}
     if effect in e.effects and e.verdict in words:
@@ -190,16 +191,16 @@ def _word(e: Explanation, h: Hypothesis, effect: str) -> str:
     return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.reached else "no"
 
 
-def _firmware(e: Explanation) -> list[Fingerprint]:
+def _list_firmware_marks(e: Explanation) -> list[Fingerprint]:
     return [p for p in e.prints if CATALOGUE[p.effect].firmware]
 
 
-def _printed(e: Explanation, p: Fingerprint) -> Candidate:
+def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     """An effect that was found by a mark without noise."""
     values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
     error, ratios = dict(e.base.errors), dict(e.base.ratio)
     if CATALOGUE[p.effect].firmware:
-        error["cor"] = p.after * firmware_resolution(e.search.problem.model)
+        error["cor"] = p.after * measure_firmware_resolution(e.search.problem.model)
         ratios = {"cor": p.after}
     n = len(e.search.problem.trace)
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
@@ -209,16 +210,16 @@ def _printed(e: Explanation, p: Fingerprint) -> Candidate:
                      "explains" if p.effect in e.effects else "no")
 
 
-def _blind(name: str, size: float, model: Model) -> Blind:
+def _describe_blind(name: str, size: float, model: Model) -> Blind:
     entry = CATALOGUE[name]
     first = entry.fitted[0]
     off = entry.off.get(first, model.kind.nominal.get(first, 0.0))
     return Blind(name, first, size, max(abs(s[first] - off) for s in entry.starts), entry.parameters[first].unit)
 
 
-def _ledger(e: Explanation, hand: Sequence[Fingerprint]
+def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]
             ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
-    unit = firmware_resolution(e.search.problem.model)
+    unit = measure_firmware_resolution(e.search.problem.model)
     cor = {"cor": e.controller * unit} if hand else {}
     rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
         (None, e.base.errors | cor, e.holdout.get((), {}))]

@@ -73,50 +73,51 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     if tooth:
         search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
     progress("fitting the tolerances", 0.05)
-    base = search.base()
+    base = search.fit_base()
     if base.reached:
         search.learn_noise(base)
-        base = search.again(base)
-    levels = _levels(search, base, holdout, progress)
+        base = search.refit_hypothesis(base)
+    levels = _search_levels(search, base, holdout, progress)
     progress("last fits, with finer steps", 0.8)
-    return _concluded(search, levels, found, controller, holdout)
+    return _conclude(search, levels, found, controller, holdout)
 
 
-def _levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress) -> list[list[Hypothesis]]:
+def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress
+                   ) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
     for count in range(1, MOST_EFFECTS + 1):
         progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
         tried: list[Hypothesis] = []
         for parent in beam:
-            tried = _distinct([*tried, *search.add_one(parent, 8 if count == 1 else 4)])
+            tried = _drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
             if tried and tried[0].reached:
                 break  # the other ways would have to get there as well, from further off
         if not tried:
             break
         if count == 1 and not base.reached:
             search.learn_noise(tried[0])
-            base, *best = search.each(search.again, [base, *tried[:4]])
+            base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
-            levels[0] = [search.without(base, tried[:1])]
+            levels[0] = [search.refit_base(base, tried[:1])]
         levels.append(tried)
-        if tried[0].reached or not _significant(levels[-2][0], tried[0]):
+        if tried[0].reached or not _is_significant(levels[-2][0], tried[0]):
             break
-        if count > 1 and not _way(search, levels, holdout):  # two large effects each help little alone
+        if count > 1 and not _is_way_on(search, levels, holdout):  # two large effects each help little alone
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
 
 
-def _way(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace | None) -> bool:
+def _is_way_on(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace | None) -> bool:
     """Whether the last effect is a way to go on: it takes a fair part of what was left, on the held-out run as well."""
     before, after = levels[-2][0], levels[-1][0]
-    if not _fair(search, before, after):
+    if not _takes_fair_share(search, before, after):
         return False
     return holdout is None or _improves(search, before, after, holdout)
 
 
-def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
+def _takes_fair_share(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
     """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
     noise = float(np.isfinite(search.problem.trace.measurements).sum())
     return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
@@ -124,14 +125,14 @@ def _fair(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
 
 def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Trace) -> bool:
     """Whether a hypothesis leaves less of a held-out run than another, in the typical block, all signals together."""
-    floor = search.floor(after)
+    floor = search.estimate_floor(after)
     noise = np.array([floor[s] for s in holdout.outputs])
-    left = [compute_typical_rms(_unseen(search, h, holdout)) / noise for h in (before, after)]
+    left = [compute_typical_rms(_compute_unseen_residuals(search, h, holdout)) / noise for h in (before, after)]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
     return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
 
-def _distinct(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
     best: dict[frozenset[str], Hypothesis] = {}
     for h in sorted(tried, key=lambda h: h.cost):
         best.setdefault(frozenset(h.effects), h)
@@ -144,59 +145,61 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
     return min(own, 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
-def _significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN) -> bool:
+def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN) -> bool:
     return measure_gain(parent, h) > least
 
 
-def _concluded(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
+def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
                holdout: Trace | None) -> Explanation:
     firsts = [level[0] for level in levels]
-    depth = max((i for i in range(1, len(levels)) if _significant(firsts[i - 1], firsts[i])
-                 and (i == 1 or _fair(search, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and levels[1][0].reached and not _significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
+    depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
+                 and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
+    if depth > 1 and levels[1][0].reached and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
         depth = 1
-    depth = _pruned(search, levels, depth)
-    search.refine(FINE, TRUEST)
-    base = search.settle(levels[0][0], 2 if depth or levels[0][0].reached else LONG)  # nothing helps: beyond doubt
+    depth = _prune_level(search, levels, depth)
+    search.refine_steps(FINE, TRUEST)
+    # where no effect helps, the base is fitted until that is beyond doubt
+    base = search.finish_hypothesis(levels[0][0], 2 if depth or levels[0][0].reached else LONG)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
-    close = sorted(search.each(search.settle, close), key=lambda h: h.cost + h.repeat_cost)
+    close = sorted(search.map_parallel(search.finish_hypothesis, close), key=lambda h: h.cost + h.repeat_cost)
     if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
-        base = search.settle(search.without(base, close[:1]), LONG)
-        if depth == 1 and not _significant(base, close[0]):
+        base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
+        if depth == 1 and not _is_significant(base, close[0]):
             close, depth = [], 0
-    others = [h for h in (levels[depth] if depth else levels[-1] if len(levels) > 1 else [])
-              if h.effects not in [c.effects for c in close]]
-    ledger = [base, *(_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
-    floor = search.floor(close[0] if close else base)
-    if search.solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
-        search.refine(FINEST_FIT_STEPS, TRUEST)
-        base, close = search.settle(base, 2), [search.settle(h, n) for h, n in zip(close, (6, 2), strict=False)]
+    tried = [] if len(levels) == 1 else levels[depth or -1]
+    others = [h for h in tried if h.effects not in [c.effects for c in close]]
+    ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
+    floor = search.estimate_floor(close[0] if close else base)
+    if search.measure_solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
+        search.refine_steps(FINEST_FIT_STEPS, TRUEST)
+        base = search.finish_hypothesis(base, 2)
+        close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
-    holding = [h for h in close if not holdout or _holds(search, h, holdout, floor)]
+    holding = [h for h in close if not holdout or _holds_on_unseen_run(search, h, holdout, floor)]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
-    verdict, named = _verdict(base, close, holding, part, found, controller, floor)
+    verdict, named = _decide_verdict(base, close, holding, part, found, controller, floor)
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
                        blind, search)
 
 
-def _pruned(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:
+def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:
     """The depth, after what was added first and is no longer wanted has gone: a later effect may do alone."""
     while depth > 1:
-        best = search.lighter(levels[depth][0])[0]
-        if _significant(best, levels[depth][0], GAIN_CONVINCES):
+        best = search.drop_each_effect(levels[depth][0])[0]
+        if _is_significant(best, levels[depth][0], GAIN_CONVINCES):
             break
         depth -= 1
-        levels[depth] = _distinct([best, *levels[depth]])
+        levels[depth] = _drop_duplicates([best, *levels[depth]])
     return depth
 
 
-def _parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypothesis:
+def _find_parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypothesis:
     return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
 
 
-def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
+def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
              found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
              ) -> tuple[str, tuple[str, ...]]:
     """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run,
@@ -220,27 +223,29 @@ def _verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hy
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))
         return "EXPLAINED", (*prints, *there[0].effects)
-    better = min(_error(best, floor), 1e9) < ERROR_PARTLY_EXPLAINED * _error(base, floor)
-    return ("PARTLY", (*prints, *best.effects)) if better and part else ("PARTLY" if prints else "UNEXPLAINED", prints)
+    better = min(_measure_excess(best, floor), 1e9) < ERROR_PARTLY_EXPLAINED * _measure_excess(base, floor)
+    if better and part:
+        return "PARTLY", (*prints, *best.effects)
+    return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
 
-def _error(h: Hypothesis, floor: Mapping[str, float]) -> float:
+def _measure_excess(h: Hypothesis, floor: Mapping[str, float]) -> float:
     """How far above the floor what is left is, in all signals together."""
     return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
 
 
-def _holds(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
-    left = compute_typical_rms(_unseen(search, h, trace))
+def _holds_on_unseen_run(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
+    left = compute_typical_rms(_compute_unseen_residuals(search, h, trace))
     return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
 
 
 def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
     """RMS residual on a run that the fit never saw, SI units."""
-    residuals = _unseen(search, h, trace)
+    residuals = _compute_unseen_residuals(search, h, trace)
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(trace.outputs, residuals, strict=True)}
 
 
-def _unseen(search: Search, h: Hypothesis, trace: Trace) -> Floats:
+def _compute_unseen_residuals(search: Search, h: Hypothesis, trace: Trace) -> Floats:
     problem: Problem = replace(search.problem, trace=trace, steps=TRUEST, also=(), _lanes={})
-    left: Floats = problem.residuals(h.fit.free, h.fit.x[None])[0]
+    left: Floats = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
     return left

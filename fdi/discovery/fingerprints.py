@@ -30,7 +30,7 @@ class Fingerprint(NamedTuple):
     after: float  # with it
 
 
-def firmware_resolution(model: Model) -> float:
+def measure_firmware_resolution(model: Model) -> float:
     """How exactly the firmware's answer follows from what a trace holds, A rms: counts of com, XJ, Cor on the bus."""
     counts = np.array([BUS_CURRENT, *(2 * [model["controller.proportional_gain"] * BUS_POSITION])])
     return float(np.sqrt((counts**2).sum() / 12.0))
@@ -54,30 +54,30 @@ def find_firmware_marks(model: Model, traces: Sequence[Trace]) -> tuple[float, l
     """
     if not model.kind.controller:
         return 0.0, []
-    unit = firmware_resolution(model)
-    before = _rms(model, traces) / unit
+    unit = measure_firmware_resolution(model)
+    before = _measure_rms(model, traces) / unit
     found = []
     if before > 3.0:
         for name, entry in CATALOGUE.items():
             if entry.firmware and name not in model.effects and len(entry.fitted) == 1:
-                found.append(_sized(model, traces, name, before))
+                found.append(_fit_size(model, traces, name, before))
     return before, sorted((f for f in found if f.after < 0.7 * before), key=lambda f: f.after)
 
 
-def _rms(model: Model, traces: Sequence[Trace]) -> float:
+def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
     return float(np.sqrt(np.mean([np.nanmean(compute_firmware_residual(model, r) ** 2) for r in traces])))
 
 
-def _sized(model: Model, traces: Sequence[Trace], name: str, before: float) -> Fingerprint:
+def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float) -> Fingerprint:
     """The size of a firmware effect: a logarithmic search over all sizes, then closer and closer."""
     entry = CATALOGUE[name]
     parameter = entry.fitted[0]
     usual = [abs(s[parameter]) for s in entry.starts]
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
-    unit, ready = firmware_resolution(model), model.having([name])
+    unit, ready = measure_firmware_resolution(model), model.having([name])
 
     def left(size: float) -> float:
-        return _rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
+        return _measure_rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
 
     for _ in range(ZOOMS):
         sizes = np.linspace(low, high, SIZES)

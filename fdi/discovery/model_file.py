@@ -70,13 +70,14 @@ def read_provenance(path: Path) -> Provenance:
                 for r in said.get("ledger", [])]
         history, effects, files, signals = (tuple(said.get(name, ())) for name in
                                             ("history", "effects", "effect_files", "signals"))
-        return Provenance(said.get("software", ""), history, effects, files, signals, _source(said, "trace"),
-                          tuple(runs), _source(said, "holdout"), said.get("floor"), said.get("before"), tuple(rows))
+        trace, holdout = _read_source(said, "trace"), _read_source(said, "holdout")
+        return Provenance(said.get("software", ""), history, effects, files, signals, trace, tuple(runs), holdout,
+                          said.get("floor"), said.get("before"), tuple(rows))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(path, "provenance", f"what rig add writes there ({error})") from error
 
 
-def _source(said: Mapping[str, Any], name: str) -> Source | None:
+def _read_source(said: Mapping[str, Any], name: str) -> Source | None:
     return Source(said[name], said[f"{name}_sha256"]) if name in said else None
 
 
@@ -125,7 +126,7 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
 
 def format_model_file(model: Model, intervals: Mapping[str, Value], p: Provenance) -> str:
     """The model file's text, 95 % intervals beside what was fitted."""
-    return "\n".join([*_with_intervals(model.to_toml().splitlines(), intervals), "", *_table(p)]) + "\n"
+    return "\n".join([*_with_intervals(model.to_toml().splitlines(), intervals), "", *_format_provenance(p)]) + "\n"
 
 
 def _with_intervals(lines: Iterable[str], intervals: Mapping[str, Value]) -> Iterable[str]:
@@ -140,33 +141,33 @@ def _with_intervals(lines: Iterable[str], intervals: Mapping[str, Value]) -> Ite
         yield line
 
 
-def _table(p: Provenance) -> list[str]:
+def _format_provenance(p: Provenance) -> list[str]:
     """The lines of [provenance]."""
-    lines = ["[provenance]", f"software = {_text(p.software)}", f"history = {_list(p.history)}",
-             f"effects = {_list(p.effects)}"]
-    lines += [f"effect_files = {_list(p.effect_files)}"] if p.effect_files else []
-    lines += [f"signals = {_list(p.signals)}"] if p.signals else []
+    lines = ["[provenance]", f"software = {_quote_text(p.software)}", f"history = {_format_list(p.history)}",
+             f"effects = {_format_list(p.effects)}"]
+    lines += [f"effect_files = {_format_list(p.effect_files)}"] if p.effect_files else []
+    lines += [f"signals = {_format_list(p.signals)}"] if p.signals else []
     for name, run in (("trace", p.trace), ("holdout", p.holdout)):
-        lines += [f"{name} = {_text(run.file)}", f"{name}_sha256 = {_text(run.sha256)}"] if run else []
-    lines += [f"repeats = {_list(r.file for r in p.repeats)}",
-              f"repeats_sha256 = {_list(r.sha256 for r in p.repeats)}"] if p.repeats else []
-    lines += [f"floor = {_inline(p.floor)}"] if p.floor else []
+        lines += [f"{name} = {_quote_text(run.file)}", f"{name}_sha256 = {_quote_text(run.sha256)}"] if run else []
+    lines += [f"repeats = {_format_list(r.file for r in p.repeats)}",
+              f"repeats_sha256 = {_format_list(r.sha256 for r in p.repeats)}"] if p.repeats else []
+    lines += [f"floor = {_format_inline_table(p.floor)}"] if p.floor else []
     if p.before:
-        lines += ["", "[provenance.before]", *(f"{_text(name)} = {value!r}" for name, value in p.before.items())]
+        lines += ["", "[provenance.before]", *(f"{_quote_text(name)} = {value!r}" for name, value in p.before.items())]
     for row in p.ledger:
-        lines += ["", "[[provenance.ledger]]", *([f"effect = {_text(row.effect)}"] if row.effect else []),
-                  *(["removed = true"] if row.removed else []), f"error = {_inline(row.error)}",
-                  *([f"holdout = {_inline(row.holdout)}"] if row.holdout else [])]
+        lines += ["", "[[provenance.ledger]]", *([f"effect = {_quote_text(row.effect)}"] if row.effect else []),
+                  *(["removed = true"] if row.removed else []), f"error = {_format_inline_table(row.error)}",
+                  *([f"holdout = {_format_inline_table(row.holdout)}"] if row.holdout else [])]
     return lines
 
 
-def _text(word: str) -> str:
+def _quote_text(word: str) -> str:
     return json.dumps(word, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
 
 
-def _list(words: Iterable[str]) -> str:
-    return "[" + ", ".join(map(_text, words)) + "]"
+def _format_list(words: Iterable[str]) -> str:
+    return "[" + ", ".join(map(_quote_text, words)) + "]"
 
 
-def _inline(numbers: Mapping[str, float]) -> str:
+def _format_inline_table(numbers: Mapping[str, float]) -> str:
     return "{ " + ", ".join(f"{name} = {float(f'{x:.6g}')!r}" for name, x in numbers.items()) + " }"

@@ -97,7 +97,7 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
         InputError: an effect that cannot be added to this model or be fitted to these runs.
     """
     check_addable(original, effects)
-    marks = _marks(original, effects, [est, *repeats])
+    marks = _read_marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
@@ -106,33 +106,34 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
     progress("fitting the model as it is", 0.1)
-    chain = [search.judged(tuple(first), _started(search, first, begin or {}))]
+    chain = [search.judge_fit(tuple(first), _start_fit(search, first, begin or {}))]
     for number, name in enumerate(replayed[len(first):]):
         progress(f"adding {name}", 0.25 + 0.4 * number / (len(replayed) - len(first)))
-        chain.append(_with(search, chain[-1], name))
+        chain.append(_add_effect(search, chain[-1], name))
     progress("last fits, with finer steps", 0.65)
-    chain = _last_fits(search, chain)
-    return Refit(original, _steps(search, effects, done, chain, holdout), marks, search.floor(chain[-1]), search)
+    chain = _finish_chain(search, chain)
+    steps = _list_steps(search, effects, done, chain, holdout)
+    return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search)
 
 
-def _last_fits(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
     """All of them with the noise that the last one leaves, with the repeats and with finer steps."""
     search.learn_noise(chain[-1])
     coarse = search.problem.steps
-    search.refine(LAST_FIT_STEPS, LAST_FIT_STEPS)
+    search.refine_steps(LAST_FIT_STEPS, LAST_FIT_STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
     last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes)
     if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):
-        again = replace(last, x=np.where(_healthy(last.free), 0.0, last.x))
+        again = replace(last, x=np.where(_have_priors(last.free), 0.0, last.x))
         last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes), key=lambda fit: fit.cost)
-    done = [search.judged(chain[-1].effects, last)]
+    done = [search.judge_fit(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
-        begun = _nearer(search, h.fit, done[0].fit)
-        done.insert(0, search.judged(h.effects, finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes)))
+        begun = _choose_nearer_start(search, h.fit, done[0].fit)
+        done.insert(0, search.judge_fit(h.effects, finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes)))
     return done
 
 
-def _nearer(search: Search, fit: Fit, other: Fit) -> Fit:
+def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
     """The fit, or where a fit with a further effect has left its tolerances, whichever is better.
 
     What the effect gains is then not what the fit without it had left lying about.
@@ -142,7 +143,7 @@ def _nearer(search: Search, fit: Fit, other: Fit) -> Fit:
     moved = np.array([there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own])
     prior = np.array([f.prior**-2 for f in fit.free])
     trials = np.array([fit.x, moved])
-    costs = compute_misfit(search.problem.whitened(search.problem.residuals(fit.free, trials))) + trials**2 @ prior
+    costs = compute_misfit(search.problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
     return replace(fit, x=trials[int(np.argmin(costs))])
 
 
@@ -153,7 +154,7 @@ def lean_model(model: Model, effects: Sequence[str]) -> Model:
     return every if set(own.effects) <= quick else own
 
 
-def _started(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
+def _start_fit(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
     own = [u for name in effects for u in effect_unknowns(CATALOGUE[name], search.model)]
     taken = {u.name for u in own}
@@ -183,47 +184,48 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
         present.append(name)
 
 
-def _with(search: Search, before: Hypothesis, name: str) -> Hypothesis:
+def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     """The best fit with one more effect, from the starts that a scan finds; all else is free as well.
 
     If these do not reach the floor, from the effect's own sizes too: a scan believes what a bad fit tells it.
     """
     fit = before.fit
-    healthy = linearise(search.problem, fit.free, np.where(_healthy(fit.free), 0.0, fit.x))
+    healthy = linearise(search.problem, fit.free, np.where(_have_priors(fit.free), 0.0, fit.x))
     found = [*scan_effects(search.problem, fit, [name]), *scan_effects(search.problem, healthy, [name])]
-    best = search.judged((*before.effects, name), _fitted(search, _begun(search, found)))
+    best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
     if best.reached:
         return best
     free, sizes = best.fit.free, CATALOGUE[name].starts
     x = np.array([[(size[f.name] - f.centre) / f.scale if f.name in size else float(v)
-                   for f, v in zip(free, np.where(_healthy(free), 0.0, best.fit.x), strict=True)] for size in sizes])
-    other = _fitted(search, [linearise(search.problem, free, row) for row in x])
-    return search.judged(best.effects, other) if other.cost < best.cost else best
+                   for f, v in zip(free, np.where(_have_priors(free), 0.0, best.fit.x), strict=True)]
+                  for size in sizes])
+    other = _fit_best(search, [linearise(search.problem, free, row) for row in x])
+    return search.judge_fit(best.effects, other) if other.cost < best.cost else best
 
 
-def _fitted(search: Search, begun: Sequence[Fit]) -> Fit:
+def _fit_best(search: Search, begun: Sequence[Fit]) -> Fit:
     """The best of some fits, taken on side by side."""
     alone = replace(search.problem, workers=1, _lanes={})
-    fits = search.each(lambda fit: finish_fit(alone, continue_fit(alone, fit, FIRST), THEN), begun)
+    fits = search.map_parallel(lambda fit: finish_fit(alone, continue_fit(alone, fit, FIRST), THEN), begun)
     return min(fits, key=lambda fit: fit.cost)
 
 
-def _begun(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
+def _begin_fits(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
     """Where a scan points to, and the effects of these sizes in a healthy unit.
 
     A fit that had to do without a large effect has put it into the tolerances: that may be a wrong basin.
     """
-    starts = [x for p in prospects for x in (p.x, np.where(_healthy(p.free), 0.0, p.x))]
+    starts = [x for p in prospects for x in (p.x, np.where(_have_priors(p.free), 0.0, p.x))]
     fits = [linearise(search.problem, prospects[0].free, x) for x in starts]
     return sorted(fits, key=lambda f: f.cost)[:2]
 
 
-def _healthy(free: Sequence[Free]) -> NDArray[np.bool_]:
+def _have_priors(free: Sequence[Free]) -> NDArray[np.bool_]:
     """Of which unknowns it is known where a healthy unit has them."""
     return np.array([np.isfinite(f.prior) for f in free])
 
 
-def _marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dict[str, tuple[float, float, float]]:
+def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dict[str, tuple[float, float, float]]:
     """Parameters of effects that a replay does not show: they are read off the firmware's answers and the positions."""
     found: dict[str, tuple[float, float, float]] = {}
     for name in effects:
@@ -239,7 +241,7 @@ def _marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dic
     return found
 
 
-def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Trace | None
+def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Trace | None
            ) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
     held = [measure_holdout(search, h, holdout) if holdout else {} for h in chain]
@@ -250,12 +252,12 @@ def _steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hy
     return tuple(steps)
 
 
-def fitted_values(r: Refit) -> dict[str, float]:
+def list_fitted_values(r: Refit) -> dict[str, float]:
     """What was fitted, "group.field" to SI value, to six digits."""
     values = {name: float(f"{v:.6g}") for name, v in r.last.hypothesis.fit.values.items()}
     return limit_friction_values(values | {name: float(f"{v[0]:.6g}") for name, v in r.marks.items()})
 
 
-def fitted_model(r: Refit) -> Model:
+def build_fitted_model(r: Refit) -> Model:
     """The model with what was fitted."""
-    return r.original.replace(fitted_values(r), "fit")
+    return r.original.replace(list_fitted_values(r), "fit")

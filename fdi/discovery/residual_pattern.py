@@ -56,10 +56,10 @@ class Pattern(NamedTuple):
                     f"{1e3 * length:.4g} m{STATES[self.state][0]}")
         if not self.state:
             return f"{said}; it follows none of position, speed, pressure, spool, current or time alone"
-        return f"{said}; {self.share:.0%} of it follows the {self.state}: {_described(self)}"
+        return f"{said}; {self.share:.0%} of it follows the {self.state}: {_describe_pattern(self)}"
 
 
-def _described(p: Pattern) -> str:
+def _describe_pattern(p: Pattern) -> str:
     unit, middle = STATES[p.state][0], float(np.interp(0.5 * (p.at[0] + p.at[-1]), p.at, p.height))
     return (f"{p.height[0]:.3g} {p.unit} at {p.at[0]:.3g} {unit}, {middle:.3g} in the middle, "
             f"{p.height[-1]:.3g} at {p.at[-1]:.3g} {unit}")
@@ -69,10 +69,10 @@ def find_pattern(search: Search, h: Hypothesis) -> Pattern:
     """The shape of what a hypothesis leaves unexplained."""
     found, states = compute_balances(search, h)
     pumped = found[0].place == "flow" and "pump.displacement" in search.problem.model.values
-    return _shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
+    return _find_shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
 
 
-def _shape(best: Balance, states: States) -> Pattern:
+def _find_shape(best: Balance, states: States) -> Pattern:
     if best.ratio < PATTERN_VISIBLE_RATIO:
         none = np.empty(0)
         return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
@@ -153,7 +153,7 @@ def write_effect(p: Pattern, path: str | Path, name: str = "discovered") -> None
     else:
         fields, starts = [("gain", "1", "0.0", "")], "0.5, 1.0,"
         q = STATES[p.state or "position"][1]
-        body = [f"    q = {q}", f"    curve = {_interpolated(p)}"]
+        body = [f"    q = {q}", f"    curve = {_format_interpolation(p)}"]
         what = f"p.{name}.gain * curve"
     lines = [f'"""Found in a measurement: {p}."""', "from math import pi, sin",
              "from typing import Annotated, NamedTuple", "from plant.effects import effect",
@@ -165,7 +165,7 @@ def write_effect(p: Pattern, path: str | Path, name: str = "discovered") -> None
     write_text(path, "\n".join(lines), "--write-effect")
 
 
-def _interpolated(p: Pattern) -> str:
+def _format_interpolation(p: Pattern) -> str:
     """Straight lines between the knots, flat beyond, as sums of clipped ramps: a law without branches."""
     if len(p.at) < 2:
         return "0.0"

@@ -40,7 +40,7 @@ def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: st
     """
     files = [trace, *repeats, *([holdout] if holdout else [])]
     sources = [read_source(file) for file in files]
-    _distinct(sources, len(repeats))
+    _check_distinct(sources, len(repeats))
     return _prepare_runs(model, [Trace.read(file) for file in files], sources, len(repeats), signals)
 
 
@@ -53,15 +53,15 @@ def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), hold
     """
     traces = [trace, *repeats, *([holdout] if holdout is not None else [])]
     sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
-    _distinct(sources, len(repeats))
+    _check_distinct(sources, len(repeats))
     return _prepare_runs(model, traces, sources, len(repeats), signals)
 
 
 def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Source], repeats: int,
                   signals: Sequence[str] | None) -> Runs:
     """The runs of a search: the one to explain, so many repeats, and a held-out one if there is one more."""
-    chosen, names = _chosen(signals), [s.file for s in sources]
-    est = _prepare(traces[0], model, chosen, names[0])
+    chosen, names = _choose_signals(signals), [s.file for s in sources]
+    est = _prepare_run(traces[0], model, chosen, names[0])
     model = match_period(model, est, SAME_PERIOD)
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
     unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
@@ -86,14 +86,14 @@ def read_source(file: str) -> Source:
         raise InputError(file, "", f"a trace that can be read ({error.strerror})") from error
 
 
-def _chosen(signals: Sequence[str] | None) -> tuple[str, ...] | None:
+def _choose_signals(signals: Sequence[str] | None) -> tuple[str, ...] | None:
     for name in signals or ():
         if name not in OUTPUTS:
             raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
     return tuple(s for s in OUTPUTS if s in signals) if signals is not None else None
 
 
-def _distinct(sources: Sequence[Source], repeats: int) -> None:
+def _check_distinct(sources: Sequence[Source], repeats: int) -> None:
     """Refuse a run that stands in for itself: it would prove whatever is asked of it."""
     seen: dict[str, str] = {}
     for number, (file, content) in enumerate(sources):
@@ -104,7 +104,7 @@ def _distinct(sources: Sequence[Source], repeats: int) -> None:
         seen[content] = file
 
 
-def _prepare(trace: Trace, model: Model, outputs: Sequence[str] | None, source: str) -> Trace:
+def _prepare_run(trace: Trace, model: Model, outputs: Sequence[str] | None, source: str) -> Trace:
     """A run as fits use it; the checks of ranges and rates are those of the reference model alone."""
     if model.plant != "eha":
         return hold_inputs(trace, outputs or None, source)
@@ -127,7 +127,7 @@ def _prepare_repeat(est: Trace, trace: Trace, model: Model, source: str, number:
 def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source: str) -> Trace:
     """The held-out run, with those of the run's outputs that it has."""
     outputs = [s for s in est.outputs if s in trace.signals]
-    unseen = _prepare(trace, model, outputs or est.outputs, source)
+    unseen = _prepare_run(trace, model, outputs or est.outputs, source)
     period = model["controller.period"]
     if match_period(model, unseen, SAME_PERIOD)["controller.period"] != period:
         raise InputError(source, "t", f"rows {period:g} s apart, as in {fitted}")

@@ -64,15 +64,15 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
              for start in (*CATALOGUE[name].starts, *find_tones(problem, fit, name))]
-    best = _best(_tried(problem, fit, first, workers))
+    best = _pick_best(_simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
-        near = [(t.effect, start, t.along) for t in promising for start in _near(problem, t, factors)]
-        best = _best([*best.values(), *_tried(problem, fit, near, workers)])
-    return sorted((_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
+        near = [(t.effect, start, t.along) for t in promising for start in _list_starts_around(problem, t, factors)]
+        best = _pick_best([*best.values(), *_simulate_starts(problem, fit, near, workers)])
+    return sorted((_make_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
 
-def _prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
+def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
     mine = {u.name: u for u in effect_unknowns(CATALOGUE[t.effect], problem.model)}
     kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
     own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
@@ -82,7 +82,7 @@ def _prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
     return Prospect(t.effect, t.cost, free, np.array([(values[f.name] - f.centre) / f.scale for f in free]))
 
 
-def _near(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
+def _list_starts_around(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
     free = effect_unknowns(CATALOGUE[t.effect], problem.model)
     units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
@@ -114,13 +114,13 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     still = {**entry.starts[0], named["Hz"]: max(1e-6, entry.parameters[named["Hz"]].low), named["rad"]: 0.5 * np.pi}
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
-    white = problem.whitened(problem.left(problem.predict(names, at)))
+    white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, at)))
     answer = white[1] - white[0]
     product = fit.white * answer
     period = problem.model.values["controller.period"]
     spectra = np.fft.rfft(product - product.mean(axis=1, keepdims=True), FINER * product.shape[1])
     hertz = np.fft.rfftfreq(FINER * product.shape[1], period)
-    height = (_prominence(np.abs(spectra), round(AROUND / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
+    height = (_measure_prominence(np.abs(spectra), round(AROUND / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
     line = spectra.sum(axis=0) * 2.0 / max(float((answer**2).sum()), 1e-300)  # in sizes of the start
     found = []
     for _ in range(LINES):
@@ -132,7 +132,7 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     return found
 
 
-def _prominence(spectra: Floats, width: int) -> Floats:
+def _measure_prominence(spectra: Floats, width: int) -> Floats:
     """Magnitudes (s, n) over the median of those around them, `width` bins on either side."""
     out = np.empty_like(spectra)
     for first in range(0, spectra.shape[1], width):
@@ -141,7 +141,7 @@ def _prominence(spectra: Floats, width: int) -> Floats:
     return out
 
 
-def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
+def _pick_best(trials: Iterable[Trial]) -> dict[str, Trial]:
     best: dict[str, Trial] = {}
     for t in trials:
         if t.effect not in best or t.cost < best[t.effect].cost:
@@ -149,20 +149,21 @@ def _best(trials: Iterable[Trial]) -> dict[str, Trial]:
     return best
 
 
-def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int) -> list[Trial]:
+def _simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int
+                     ) -> list[Trial]:
     """The starts simulated at the fit's values, or with what goes with them, side by side."""
     if not starts:
         return []
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
     ways = list_powers(problem)
-    begun = [_moved(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
+    begun = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
     at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
           for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
     steep = prepare_slope(fit)
 
     def trials(part: NDArray[np.int64]) -> list[Trial]:
-        white = problem.whitened(problem.left(problem.predict(names, rows[part])))
+        white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
         found = []
         for i, r in zip(part, white, strict=True):
             effect, start, goes_along = starts[i]
@@ -174,7 +175,7 @@ def _tried(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]]
     return [trial for several in map_in_threads(trials, parts, workers) for trial in several]
 
 
-def _moved(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:
+def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
     left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
     low, high = scaled_bounds(fit.free)

@@ -71,18 +71,20 @@ class Search:
         self.fine: Problem | None = None  # with the steps of last residuals
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
 
-    def base(self) -> Hypothesis:
+    def fit_base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
         free = all_unknowns(self.model)
 
         def fit_base(ease: bool) -> Fit:
-            return fit_unknowns(self.problem, free, self.eased(free) if ease else None)
+            return fit_unknowns(self.problem, free, self.find_eased_start(free) if ease else None)
 
-        fits = self.each(fit_base, (False, True))
-        first = self.judged((), min(fits, key=lambda f: f.cost))
-        return first if first.reached else self.retried(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
+        fits = self.map_parallel(fit_base, (False, True))
+        first = self.judge_fit((), min(fits, key=lambda f: f.cost))
+        if first.reached:
+            return first
+        return self.retry_from(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
-    def eased(self, free: Sequence[Free]) -> Floats:
+    def find_eased_start(self, free: Sequence[Free]) -> Floats:
         """Where a fit gets to, (p,), that takes the noise for larger at first: priors hold it, small events vanish."""
         x = np.zeros(len(free))
         for factor in EASED:
@@ -90,14 +92,14 @@ class Search:
             x = fit_unknowns(replace(self.problem, noise=noise), free, x, 4).x
         return x
 
-    def retried(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
+    def retry_from(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
-        for other in self.each(partial(fit_unknowns, self.problem, h.fit.free), starts):
+        for other in self.map_parallel(partial(fit_unknowns, self.problem, h.fit.free), starts):
             if other.cost < h.cost - 1.0:
-                h = self.judged(h.effects, other)
+                h = self.judge_fit(h.effects, other)
         return h
 
-    def without(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis:
+    def refit_base(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis:
         """The base fitted again from where fits with an effect have left its parameters.
 
         What an effect gains is then not what the base's own fit had left lying about.
@@ -107,29 +109,29 @@ class Search:
             values = h.fit.values
             starts.append([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
                            for f in base.fit.free])
-        return self.retried(base, map(np.array, starts))
+        return self.retry_from(base, map(np.array, starts))
 
-    def add_one(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
+    def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
-        effects = [e for e in self.effects if e not in start.effects and not self._excluded(e, start.effects)]
+        effects = [e for e in self.effects if e not in start.effects and not self._is_excluded(e, start.effects)]
         prospects = scan_effects(self.problem, start.fit, effects, self.workers)
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
             nominal = linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
-            prospects = _merged(prospects, scan_effects(self.problem, nominal, effects, self.workers))
+            prospects = _merge_prospects(prospects, scan_effects(self.problem, nominal, effects, self.workers))
         worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
-        fits = list(zip([p.effect for p in worth], self.each(self._begun, worth), strict=True))
+        fits = list(zip([p.effect for p in worth], self.map_parallel(self._begin_fit, worth), strict=True))
         for rounds, kept in RACE:
             fits.sort(key=lambda each: each[1].cost)
-            fits[:kept] = self.each(partial(self._further, rounds), fits[:kept])
-        done = self.each(lambda each: self.judged((*start.effects, each[0]), each[1]), fits)
+            fits[:kept] = self.map_parallel(partial(self._continue_begun_fit, rounds), fits[:kept])
+        done = self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits)
         ranked = sorted(done, key=lambda h: h.cost)
         if ranked and not ranked[0].reached:
             x = ranked[0].fit.x
             settled = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
-            ranked[0] = self.retried(ranked[0], [np.where(settled & (np.abs(x) > 1.0), 0.0, x)])
+            ranked[0] = self.retry_from(ranked[0], [np.where(settled & (np.abs(x) > 1.0), 0.0, x)])
         return ranked
 
-    def lighter(self, h: Hypothesis) -> list[Hypothesis]:
+    def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
         usual = {f.name: f for f in all_unknowns(self.model)}
 
@@ -140,42 +142,42 @@ class Search:
             x = [(h.fit.values[f.name] - f.centre) / f.scale for f in kept]
             inside = np.array([v if f.name not in own or f.low < h.fit.values[f.name] < f.high else 0.0
                                for f, v in zip(kept, x, strict=True)])
-            return self.judged(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, inside))
+            return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, inside))
 
-        return sorted(self.each(left_out, h.effects), key=lambda each: each.cost)
+        return sorted(self.map_parallel(left_out, h.effects), key=lambda each: each.cost)
 
-    def each(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""
         return map_in_threads(do, items, self.workers)
 
-    def _further(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
+    def _continue_begun_fit(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else continue_fit(self.problem, each[1], rounds)
 
-    def _begun(self, p: Prospect) -> Fit:
+    def _begin_fit(self, p: Prospect) -> Fit:
         """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
         own = np.isin([f.name for f in p.free], CATALOGUE[p.effect].fitted)
         starts = np.array([p.x, np.where(own, p.x, 0.0)])
         prior = np.array([f.prior**-2 for f in p.free])
-        costs = compute_misfit(self.problem.whitened(self.problem.residuals(p.free, starts))) + (starts**2) @ prior
+        costs = compute_misfit(self.problem.compute_white_residuals(p.free, starts)) + (starts**2) @ prior
         return linearise(self.problem, p.free, starts[int(np.argmin(costs))])
 
-    def _excluded(self, effect: str, present: Sequence[str]) -> bool:
+    def _is_excluded(self, effect: str, present: Sequence[str]) -> bool:
         return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
 
-    def judged(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
+    def judge_fit(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats."""
         signals = self.problem.trace.outputs
         own = found.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
-        errors = _rms(own, signals)
+        errors = _measure_rms(own, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         x = found.x[None, :]
-        others = [p.residuals(found.free, x)[0] for p in self.repeats]
+        others = [p.compute_residuals(found.free, x)[0] for p in self.repeats]
         if not others:
             floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
             return Hypothesis(effects, found, errors, {}, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
-        cost = float(np.mean([compute_misfit(p.whitened(r[None]))[0] for p, r in pairs]))
-        repeated = {s: float(np.sqrt(np.mean([_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
+        cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))
+        repeated = {s: float(np.sqrt(np.mean([_measure_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
         ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
 
@@ -185,31 +187,31 @@ class Search:
         self.problem = replace(self.problem, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
 
-    def floor(self, best: Hypothesis) -> dict[str, float]:
+    def estimate_floor(self, best: Hypothesis) -> dict[str, float]:
         """What the sensors' noise alone leaves of each signal, RMS SI, under the best hypothesis."""
         found = learn_noise(best, self.problem.trace, self.noise)
         return {s: float(np.hypot(n.level, self.coarse.get(s, 0.0)))
                 for s, n in zip(self.problem.trace.outputs, found, strict=True)}
 
-    def again(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
+    def refit_hypothesis(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
-        return self.judged(h.effects, fit_unknowns(self.problem, h.fit.free, h.fit.x, rounds))
+        return self.judge_fit(h.effects, fit_unknowns(self.problem, h.fit.free, h.fit.x, rounds))
 
-    def settle(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
+    def finish_hypothesis(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
-        return self.judged(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem))
+        return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem))
 
-    def solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
+    def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
         halved = replace(self.problem, steps=2 * self.problem.steps, also=(), _lanes={})
         coarse = replace(self.problem, also=(), _lanes={})
         x = h.fit.x[None]
-        change = (halved.residuals(h.fit.free, x) - coarse.residuals(h.fit.free, x))[0]
+        change = (halved.compute_residuals(h.fit.free, x) - coarse.compute_residuals(h.fit.free, x))[0]
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
         return max(float(t) / floor[s] for s, t in zip(self.problem.trace.outputs, typical, strict=True))
 
-    def refine(self, steps: int, finest: int) -> None:
+    def refine_steps(self, steps: int, finest: int) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats),
                                workers=self.workers)
@@ -246,11 +248,11 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
     return ratios
 
 
-def _rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
+def _measure_rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(signals, residuals, strict=True)}
 
 
-def _merged(a: Sequence[Prospect], b: Sequence[Prospect]) -> list[Prospect]:
+def _merge_prospects(a: Sequence[Prospect], b: Sequence[Prospect]) -> list[Prospect]:
     best = {p.effect: p for p in a}
     for p in b:
         if p.effect not in best or p.cost < best[p.effect].cost:

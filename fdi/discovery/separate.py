@@ -45,21 +45,23 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
     own = search.problem.trace
-    for more in _sensors(own.outputs):
-        left = min(_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
+    for more in _list_sensor_sets(own.outputs):
+        left = min(_measure_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
     for words, command, play in list_commands(search.problem.model.values["controller.period"]):
-        left = min(_misfit(search, a, b, _played(search, a, play, own.outputs)) for a, b in pairs)
+        left = min(_measure_misfit(search, a, b, _simulate_command(search, a, play, own.outputs)) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
     return best
 
 
-def _sensors(there: Sequence[str]) -> list[tuple[str, ...]]:
+def _list_sensor_sets(there: Sequence[str]) -> list[tuple[str, ...]]:
     missing = tuple(s for s in OUTPUTS if s not in there)
-    return [*((s,) for s in missing), missing] if len(missing) > 1 else [missing] if missing else []
+    if len(missing) > 1:
+        return [*((s,) for s in missing), missing]
+    return [missing] if missing else []
 
 
 def list_commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
@@ -91,14 +93,14 @@ def list_commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Fl
 def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
     """The run as a hypothesis predicts it, with more sensors."""
     names = [f.name for f in h.fit.free]
-    predicted = search.problem.all_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    predicted = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     own = search.problem.trace
     xj, p12, xs = predicted
     return replace(own, outputs=tuple(s for s in OUTPUTS if s in signals), xj=xj, p12=p12, xs=xs,
                    usable=np.ones(len(own), bool))
 
 
-def _played(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
+def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
             signals: tuple[str, ...]) -> Trace:
     """Another command as a hypothesis predicts it, with the model's own controller."""
     problem = search.problem
@@ -111,7 +113,7 @@ def _played(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats
     return hold_inputs(Trace.of({"com": com, "load": load, **columns}, period, {}), signals)
 
 
-def _misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:
+def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:
     """What `wrong` leaves of what `truth` predicts, noise aside, -2 log likelihood."""
     known = dict(zip(search.problem.trace.outputs, search.noise, strict=True))
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]

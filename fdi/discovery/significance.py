@@ -35,8 +35,9 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
     rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
-    white = np.concatenate([problem.whitened(problem.left(problem.predict(names, part)))
-                            for part in np.array_split(rows, -(-len(rows) // 64))])
+    parts = np.array_split(rows, -(-len(rows) // 64))
+    residuals = (problem.subtract_measurements(problem.predict_outputs(names, part)) for part in parts)
+    white = np.concatenate([problem.whiten_residuals(r) for r in residuals])
     thin = (white[1:] - white[0])[:, :, ::NULL_STRIDE].reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
     own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), -1) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])

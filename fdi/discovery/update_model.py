@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import Suspicious, Value, fitted_parameters, list_suspicious
+from fdi.discovery.candidates import Suspicious, Value, list_fitted_parameters, list_suspicious
 from fdi.discovery.explain_runs import prepare_effects
 from fdi.discovery.model_file import Provenance, Row
-from fdi.discovery.refit import Refit, check_addable, fitted_model, refit_effects
+from fdi.discovery.refit import Refit, build_fitted_model, check_addable, refit_effects
 from fdi.discovery.runs import Runs, read_runs, read_source
 from fdi.estimation.unknowns import limit_friction_values
 from fdi.output import write_text
@@ -112,7 +112,7 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     notes = runs.notes
     if known.ledger and not continues:
         notes = (*notes, "these are other runs than those of the ledger: it begins again")
-    return _finish(r, runs, known, every, [*kept, *rows[bool(kept):]], notes, command, added=tuple(effects))
+    return _make_update(r, runs, known, every, [*kept, *rows[bool(kept):]], notes, command, added=tuple(effects))
 
 
 def remove_effect(name: str, runs: Runs | None, model: Model, known: Provenance, command: str = "",
@@ -136,17 +136,17 @@ def remove_effect(name: str, runs: Runs | None, model: Model, known: Provenance,
     left = known_without.effects
     r = refit_effects(start, left, runs.est, runs.repeats, runs.holdout, progress, model.values, len(left))
     rows.append(Row(name, r.last.error, r.last.holdout, True))
-    return _finish(r, runs, known_without, left, rows, runs.notes, command, removed=name)
+    return _make_update(r, runs, known_without, left, rows, runs.notes, command, removed=name)
 
 
 def _continues_ledger(known: Provenance, runs: Runs) -> bool:
     return bool(known.ledger) and known.same_data(runs.sources, len(runs.repeats), runs.est.outputs)
 
 
-def _finish(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
+def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
             notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
-    model, fit = fitted_model(r), r.last.hypothesis.fit
-    parameters = {name: v for e in effects for name, v in fitted_parameters(e, fit, runs.model).items()}
+    model, fit = build_fitted_model(r), r.last.hypothesis.fit
+    parameters = {name: v for e in effects for name, v in list_fitted_parameters(e, fit, runs.model).items()}
     parameters |= {name: Value(*of, find_quantity(name, plant=model.plant).unit) for name, of in r.marks.items()}
     before = {name: runs.model[name] for name in fit.values if name in runs.model.values}
     known_floor = known.floor or {}

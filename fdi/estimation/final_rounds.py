@@ -54,11 +54,11 @@ def linearise_along(problem: Problem, free: Sequence[Free], x: Floats, covarianc
 
     Along `flat` (p, k) there is no slope.
     """
-    directions = _principal(covariance)
+    directions = _find_principal(covariance)
     moves = np.array([cut_at_bounds(free, x, d) for d in directions.T])
-    near = slopes.whitened(slopes.residuals(free, np.vstack([x, x + moves])))
-    residuals = problem.residuals(free, x[None])
-    white = problem.whitened(residuals)
+    near = slopes.compute_white_residuals(free, np.vstack([x, x + moves]))
+    residuals = problem.compute_residuals(free, x[None])
+    white = problem.whiten_residuals(residuals)
     steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
     jacobian = remove_slope(steep.reshape(len(x), *white[0].shape), flat)
     prior = np.diag([f.prior**-2 for f in free])
@@ -69,7 +69,7 @@ def linearise_along(problem: Problem, free: Sequence[Free], x: Floats, covarianc
     return Fit(tuple(free), x, held + float(x @ prior @ x), held, known, residuals[0], white[0], jacobian)
 
 
-def _principal(covariance: Floats) -> Floats:
+def _find_principal(covariance: Floats) -> Floats:
     """Principal directions (p, p), one a column, `DIRECTION_WIDTH_SD` standard deviations long."""
     variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     wide: Floats = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, NARROWEST_VARIANCE, WIDEST_VARIANCE))
@@ -82,8 +82,8 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
     flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * compute_weights(fit.white)))
     gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
     trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
-    residuals = problem.residuals(fit.free, trials)
-    white = problem.whitened(residuals)
+    residuals = problem.compute_residuals(fit.free, trials)
+    white = problem.whiten_residuals(residuals)
     held = compute_misfit(white)
     costs = held + np.einsum("ij,jk,ik->i", trials, prior, trials)
     k = int(np.argmin(costs))
@@ -119,7 +119,7 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
     moves = np.zeros((len(places), len(free)))
     moves[:, places] = wide.T
     moves = np.array([cut_at_bounds(free, x, way) for way in moves])
-    white = problem.whitened(residuals := problem.residuals(free, np.vstack([x, x + moves])))
+    white = problem.whiten_residuals(residuals := problem.compute_residuals(free, np.vstack([x, x + moves])))
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
     jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
     prior = np.diag([f.prior**-2 for f in free])
@@ -130,6 +130,6 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
                residuals[0], white[0], jacobian)
 
 
-def first_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
+def guess_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
     """A covariance, (p, p), that gives differences across the valley their first width."""
     return np.diag([min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4 for f in free])

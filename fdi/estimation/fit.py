@@ -54,16 +54,16 @@ def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = 
 def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
-        gradient, hessian = _normal(now)
+        gradient, hessian = _normal_equations(now)
         trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
-        white = problem.whitened(problem.residuals(now.free, trials))
-        costs = compute_misfit(white) + (trials**2) @ _prior(now.free)
+        white = problem.compute_white_residuals(now.free, trials)
+        costs = compute_misfit(white) + (trials**2) @ _prior_weights(now.free)
         k = int(np.argmin(costs))
         gained = now.cost - float(costs[k])
         if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
-            final = _moved(problem, now, trials[k]) if gained > 0.0 else now
+            final = _move_fit(problem, now, trials[k]) if gained > 0.0 else now
             return replace(final, converged=True)
-        now = linearise(problem, now.free, trials[k], _widths(now.free, hessian))
+        now = linearise(problem, now.free, trials[k], _choose_widths(now.free, hessian))
     return now
 
 
@@ -74,43 +74,43 @@ def linearise(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | 
     signs = np.array([-1.0 if f.centre + f.scale * (v + h) > f.high else 1.0
                       for f, v, h in zip(free, x, step, strict=True)])
     moved = np.vstack([x, x + np.diag(signs * step)])
-    residuals = problem.residuals(free, moved)
-    white = problem.whitened(residuals)
+    residuals = problem.compute_residuals(free, moved)
+    white = problem.whiten_residuals(residuals)
     jacobian = (white[1:] - white[0]) / (signs * step)[:, None, None]
     held = float(compute_misfit(white[:1])[0])
-    return Fit(free, x, held + float(x**2 @ _prior(free)), held, _covariance(free, jacobian, white[0]), residuals[0],
-               white[0], jacobian)
+    covariance = _compute_covariance(free, jacobian, white[0])
+    return Fit(free, x, held + float(x**2 @ _prior_weights(free)), held, covariance, residuals[0], white[0], jacobian)
 
 
-def _moved(problem: Problem, fit: Fit, x: Floats) -> Fit:
+def _move_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
     """The fit at `x`, close enough to keep its Jacobian."""
-    residuals = problem.residuals(fit.free, x[None])
-    white = problem.whitened(residuals)
+    residuals = problem.compute_residuals(fit.free, x[None])
+    white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white)[0])
-    return Fit(fit.free, x, held + float(x**2 @ _prior(fit.free)), held, fit.covariance, residuals[0], white[0],
+    return Fit(fit.free, x, held + float(x**2 @ _prior_weights(fit.free)), held, fit.covariance, residuals[0], white[0],
                fit.jacobian)
 
 
-def _prior(free: Sequence[Free]) -> Floats:
+def _prior_weights(free: Sequence[Free]) -> Floats:
     return np.array([f.prior**-2 for f in free])
 
 
-def _normal(fit: Fit) -> tuple[Floats, Floats]:
+def _normal_equations(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
     heavy = fit.jacobian * compute_weights(fit.white)
-    prior = _prior(fit.free)
+    prior = _prior_weights(fit.free)
     flat = fit.jacobian.reshape(len(fit.x), -1)
     heavy = heavy.reshape(len(fit.x), -1)
     return heavy @ fit.white.reshape(-1) + prior * fit.x, heavy @ flat.T + np.diag(prior)
 
 
-def _covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
+def _compute_covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
     flat = (jacobian * np.sqrt(compute_weights(white))).reshape(len(free), -1)
-    inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior(free))), np.float64)
+    inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior_weights(free))), np.float64)
     return inverse
 
 
-def _widths(free: Sequence[Free], hessian: Floats) -> Floats:
+def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
     widest = np.array([f.step for f in free])
     wanted = DIFFERENCE_WIDTH_SD / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     widths: Floats = np.clip(wanted, NARROWEST_SHARE * widest, widest)

@@ -45,13 +45,13 @@ class Problem:
     also: tuple[Trace, ...] = ()  # further runs, of the same signals, that a fit takes in
     _lanes: dict[tuple[str, ...], Lanes] = field(default_factory=dict)
 
-    def predict(self, names: Sequence[str], values: Floats) -> Floats:
+    def predict_outputs(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
-        runs = map_in_threads(lambda r: self.all_signals(names, values, r)[:, r.output_columns],
-                              (self.trace, *self.also), self.workers)
+        runs = map_in_threads(lambda r: self.predict_signals(names, values, r)[:, r.output_columns], (self.trace, *self.also),
+                      self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
-    def all_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
+    def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         """XJ, P12 and XS of one run (default: the first), whichever were measured: (m, 3, n)."""
         key = tuple(names)
         if key not in self._lanes:
@@ -62,13 +62,21 @@ class Problem:
         signals: Floats = out.transpose(0, 2, 1)
         return signals
 
-    def residuals(self, free: Sequence[Free], x: Floats) -> Floats:
+    def compute_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
-        values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])
         names = [f.name for f in free]
-        return self.left(self.predict(names, limit_dynamic_friction(names, values)))
+        return self.subtract_measurements(self.predict_outputs(names, self.convert_unknowns(free, x)))
 
-    def left(self, predicted: Floats) -> Floats:
+    def compute_white_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
+        """The same, whitened: (m, s, n), 0 where not measured."""
+        return self.whiten_residuals(self.compute_residuals(free, x))
+
+    def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Parameters in SI units, (m, p), of scaled unknowns `x` (m, p)."""
+        values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])
+        return limit_dynamic_friction([f.name for f in free], values)
+
+    def subtract_measurements(self, predicted: Floats) -> Floats:
         """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
         parts, start = [], 0
         for trace in (self.trace, *self.also):
@@ -78,7 +86,7 @@ class Problem:
             start += len(trace)
         return np.concatenate(parts, axis=-1) if self.also else parts[0]
 
-    def whitened(self, residuals: Floats) -> Floats:
+    def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
         return np.stack([n.whiten(residuals[:, i]) for i, n in enumerate(self.noise)], axis=1)
 

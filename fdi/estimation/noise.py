@@ -81,7 +81,7 @@ def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: floa
     pairs = [(a - b) / np.sqrt(2.0) for a, b in combinations(runs, 2)]
     difference = float(np.sqrt(np.nanmean(np.concatenate(pairs) ** 2)))
     lines = find_hum_lines(runs, period)
-    steady = [_without(r, lines, period) for r in runs]
+    steady = [_remove_lines(r, lines, period) for r in runs]
     level, share, freedom = measure_quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])
     hum = float(np.sqrt(sum(power for _, power in lines)))
     return Floor(float(np.hypot(level, hum)), "repeats", False, share, difference, hum, freedom)
@@ -134,7 +134,7 @@ def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[
     is chi-squared with as many degrees of freedom as the noise's autocorrelation leaves it; that says what the quietest
     windows are to be divided by, and which windows are too large to belong.
     """
-    pieces = np.concatenate([_windows(x, window) for x in noise])
+    pieces = np.concatenate([_cut_windows(x, window) for x in noise])
     pieces = pieces[np.isnan(pieces).mean(axis=1) < 0.5]
     if not len(pieces):
         x = np.concatenate(list(noise))
@@ -144,7 +144,7 @@ def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[
     kept = order[:max(1, round(QUIET * len(order)))]
     level, freedom = float(np.quantile(power, QUIET)), float(window)
     for _ in range(30):
-        freedom = _freedom(pieces[kept])
+        freedom = _measure_freedom(pieces[kept])
         if not len(kept) or level == 0.0:
             break
         if len(kept) == max(1, round(QUIET * len(order))):
@@ -165,13 +165,13 @@ def _mean_square(part: float, freedom: float) -> float:
     return 2.0 * float(half) / freedom
 
 
-def _windows(x: Floats, window: int) -> Floats:
+def _cut_windows(x: Floats, window: int) -> Floats:
     n = len(x) // window * window
     out: Floats = x[:n].reshape(-1, window)
     return out
 
 
-def _freedom(pieces: Floats) -> float:
+def _measure_freedom(pieces: Floats) -> float:
     """Degrees of freedom of a window's mean square: samples over the sum of the squared autocorrelation."""
     x = np.nan_to_num(pieces)
     size = pieces.shape[1]
@@ -191,27 +191,27 @@ def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, f
     grid = np.array([[f, *(f + d for d in NEIGHBOURS)] for f in mains])
     power = np.zeros(grid.shape)
     for r in runs:
-        loud = _loudness(r)
+        loud = _measure_loudness(r)
         if np.isfinite(loud).sum() < FEWEST_HUM_WINDOWS or not grid.size:
             return []
         rows = loud <= np.nanquantile(loud, 0.5)
-        power += np.abs(_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
+        power += np.abs(_fit_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
     line, beside = power[:, 0], power[:, 1:].mean(axis=1)
     return [(f, float(a - b)) for f, a, b in zip(mains, line, beside, strict=True) if a > HUM_LINE_RATIO * b > 0.0]
 
 
-def _loudness(x: Floats) -> Floats:
-    pieces = _windows(x, WINDOW)
+def _measure_loudness(x: Floats) -> Floats:
+    pieces = _cut_windows(x, WINDOW)
     if not len(pieces):
         return np.empty(0)
     out: Floats = np.mean(pieces**2, axis=1)
     return out
 
 
-def _phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: float) -> NDArray[np.complex128]:
+def _fit_phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: float) -> NDArray[np.complex128]:
     """Amplitude and phase of sines in the chosen windows of x, which are freed of their mean and slope first."""
     t = np.arange(WINDOW) - (WINDOW - 1) / 2
-    pieces = _windows(x, WINDOW)
+    pieces = _cut_windows(x, WINDOW)
     chosen = np.flatnonzero(rows[:len(pieces)] & ~np.isnan(pieces).any(axis=1))
     if not len(chosen):
         return np.zeros(len(frequencies), complex)
@@ -223,14 +223,14 @@ def _phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: fl
     return out
 
 
-def _without(x: Floats, lines: Sequence[tuple[float, float]], period: float) -> Floats:
+def _remove_lines(x: Floats, lines: Sequence[tuple[float, float]], period: float) -> Floats:
     """x without the lines as they stand in it."""
     if not lines:
         return x
     frequencies = np.array([f for f, _ in lines])
     rows = np.ones(len(x) // WINDOW, bool)
     wave = np.exp(2j * np.pi * period * np.outer(np.arange(len(x)), frequencies))
-    out: Floats = x - np.einsum("ij,j->i", wave, _phasors(x, rows, frequencies, period)).real
+    out: Floats = x - np.einsum("ij,j->i", wave, _fit_phasors(x, rows, frequencies, period)).real
     return out
 
 
@@ -245,14 +245,16 @@ class Noise(NamedTuple):
         """Residuals, (.., n), time last, as white noise of variance 1; NaN (nothing measured) gives 0."""
         missing = np.isnan(residual)
         x = np.where(missing, 0.0, residual)
-        white: Floats = x / self.innovation if len(self.filter) == 1 else _through(self.filter / self.innovation, x)
+        white: Floats = x / self.innovation
+        if len(self.filter) > 1:
+            white = _apply_filter(self.filter / self.innovation, x)
         if missing.any():
-            missing = _through(np.ones(len(self.filter)), missing.astype(float)) > 0.5
+            missing = _apply_filter(np.ones(len(self.filter)), missing.astype(float)) > 0.5
             white = np.where(missing, 0.0, white)
         return white
 
 
-def _through(weights: Floats, x: Floats) -> Floats:
+def _apply_filter(weights: Floats, x: Floats) -> Floats:
     """Weighted sums of each value, (.., n), and those before it, as scipy.signal.lfilter has them.
 
     Without it, as that takes longer to import than all else here together.

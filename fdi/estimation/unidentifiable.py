@@ -74,7 +74,7 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
                 break
     if not found:
         return [], np.empty((len(x), 0))
-    white = problem.whitened(problem.residuals(free, np.vstack([x, *trials])))
+    white = problem.compute_white_residuals(free, np.vstack([x, *trials]))
     flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < FLAT_DIRECTION_MISFIT * white.shape[2] / 13500.0
     held = [said for said, level in zip(found, flat, strict=True) if level]
     ways = [(scale_together(free, x, said, 1e-6) - x) / 1e-6 for said in held]
@@ -111,8 +111,8 @@ def relax_fit(problem: Problem, found: Fit) -> Fit:
                 break
         else:
             break
-    residuals = problem.residuals(free, x[None])
-    white = problem.whitened(residuals)
+    residuals = problem.compute_residuals(free, x[None])
+    white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white)[0])
     cost = held + float(x**2 @ prior)
     if cost >= found.cost:
@@ -129,7 +129,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats) -> F
     ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in said])
     trials = np.array([cut_at_bounds(free, x, TRIED * way) for way in ways])
     full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)
-    white = problem.whitened(problem.residuals(free, np.vstack([x, x + trials])))
+    white = problem.compute_white_residuals(free, np.vstack([x, x + trials]))
     moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
     found: Floats = ways[full & (moved < FLAT_DIRECTION_MISFIT)].T
     return found

@@ -39,8 +39,8 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
             table = plant.table if plant else None
             rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
             if table is None:
-                return CsvColumns(*_parse(path, rows, tuple(required), tuple(optional)), None)
-            sources, unknown = _parse(path, rows, tuple(sorted(table.sources)), ())
+                return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
+            sources, unknown = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
             return CsvColumns(_combine_columns(sources, table), unknown, plant)
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
@@ -68,7 +68,7 @@ def open_text(path: Path) -> io.TextIOBase:
     return path.open(encoding="utf-8-sig", newline="")
 
 
-def _parse(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
+def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
            optional: tuple[str, ...]) -> tuple[dict[str, Floats], tuple[str, ...]]:
     header = [name.strip() for name in next(rows, [])]
     for name in required:
@@ -86,7 +86,7 @@ def _parse(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
         if len(row) != len(header):
             raise InputError(f"{path}: line {line}", "", f"{len(header)} fields as in the header, not {len(row)}")
         for out, (i, name) in zip(values, known, strict=True):
-            out.append(_number(path, line, name, row[i]))
+            out.append(_parse_number(path, line, name, row[i]))
             if name == "t":
                 if not out[-1] > last:
                     raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, not {row[i]!r}")
@@ -97,7 +97,7 @@ def _parse(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
             tuple(name for name in header if name not in required and name not in optional))
 
 
-def _number(path: Path, line: int, name: str, text: str) -> float:
+def _parse_number(path: Path, line: int, name: str, text: str) -> float:
     try:
         value = float(text) if text.strip() else math.nan
     except ValueError:

@@ -54,7 +54,7 @@ class Log:
         with self.path.open("rb") as stream:
             for index in self._chunks:
                 if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
-                    for channel, time_ns, _, data in scan_messages(_chunk(self.path, stream, index)):
+                    for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
                         if channel in decode:
                             out.append((time_ns, channel, data))
         out.sort(key=lambda item: item[0])
@@ -94,7 +94,8 @@ class Log:
                     if index.message_index_offsets:
                         continue
                     return None  # a chunk without an index
-                rows = _rows(_chunk(self.path, stream, index), _message_offsets(stream, index, numbers[0]), dtype)
+                offsets = _message_offsets(stream, index, numbers[0])
+                rows = _read_rows(_read_chunk(self.path, stream, index), offsets, dtype)
                 if rows is None:
                     return None
                 parts.append(rows)
@@ -129,7 +130,7 @@ def open_log(path: Path) -> Log:
     return Log(path, summary.schemas, summary.channels, attachments, metadata, tuple(summary.chunk_indexes))
 
 
-def _chunk(path: Path, stream: Any, index: ChunkIndex) -> bytes:
+def _read_chunk(path: Path, stream: Any, index: ChunkIndex) -> bytes:
     stream.seek(index.chunk_start_offset + 9)
     try:
         data, size = get_chunk_data_stream(Chunk.read(ReadDataStream(stream)), validate_crc=True)
@@ -175,7 +176,7 @@ def _message_offsets(stream: Any, index: ChunkIndex, channel: int) -> NDArray[np
     return pairs[:, 1].astype(np.int64)
 
 
-def _rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+def _read_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """The records at `offsets` of a chunk; None if one would end beyond it."""
     if len(offsets) and offsets.max() + dtype.itemsize > len(raw):
         return None

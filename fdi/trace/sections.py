@@ -44,32 +44,32 @@ def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
     Straight lines are found greedily within the resolution of the bus; what is not straight for 0.15 s is dynamic.
     Missing rows (NaN) continue the last demand.
     """
-    com = _filled(command)
+    com = _fill_command(command)
     shortest = max(3, round(SHORTEST / period))
     out: list[Section] = []
-    for start, stop, slope in _lines(com):
+    for start, stop, slope in _find_lines(com):
         before = com[start - 1] if start else com[0]
-        if stop - start < shortest or _tangent(com, start, stop, slope, 3 * shortest):
+        if stop - start < shortest or _is_tangent(com, start, stop, slope, 3 * shortest):
             kind, rate = "dynamic", 0.0
         elif abs(slope) * (stop - start) <= 2 * RESOLUTION:
-            kind, rate = ("step" if _jumps(com, start) else "hold"), 0.0
+            kind, rate = ("step" if _is_jump(com, start) else "hold"), 0.0
         else:
             kind, rate = "ramp", slope / period
         if out and kind == out[-1].kind == "dynamic":
             out[-1] = out[-1]._replace(stop=stop, last=float(com[stop - 1]))
         else:
             out.append(Section(kind, start, stop, float(before), float(com[stop - 1]), rate))
-    return _tidy(out, shortest)
+    return _merge_short_parts(out, shortest)
 
 
-def _filled(command: Floats) -> Floats:
+def _fill_command(command: Floats) -> Floats:
     com = np.asarray(command, float)
     index = np.where(np.isnan(com), 0, np.arange(len(com)))
     filled: Floats = np.nan_to_num(com[np.maximum.accumulate(index)])
     return filled
 
 
-def _lines(com: Floats) -> list[tuple[int, int, float]]:
+def _find_lines(com: Floats) -> list[tuple[int, int, float]]:
     """(start, stop, slope per row): from each start the longest piece that a line through its first value fits."""
     values, out, start = com.tolist(), [], 0
     while start < len(values):
@@ -86,7 +86,7 @@ def _lines(com: Floats) -> list[tuple[int, int, float]]:
     return out
 
 
-def _tangent(com: Floats, start: int, stop: int, slope: float, longest: int) -> bool:
+def _is_tangent(com: Floats, start: int, stop: int, slope: float, longest: int) -> bool:
     """True for a short line that only touches a slow curve: its slope bends on beyond one of its ends."""
     if stop - start > longest or abs(slope) * (stop - start) <= 2 * RESOLUTION:
         return False
@@ -98,7 +98,7 @@ def _tangent(com: Floats, start: int, stop: int, slope: float, longest: int) -> 
     return any(0 < abs(rise / (20 * slope) - 1) < 0.2 and abs(rise - 20 * slope) > RESOLUTION / 10 for rise in beyond)
 
 
-def _jumps(com: Floats, row: int) -> bool:
+def _is_jump(com: Floats, row: int) -> bool:
     """True when the demand jumps into `row` by much more than it moved in the rows before."""
     if row == 0:
         return False
@@ -106,7 +106,7 @@ def _jumps(com: Floats, row: int) -> bool:
     return bool(abs(com[row] - com[row - 1]) > JUMP + 3 * (before.max() if len(before) else 0.0))
 
 
-def _tidy(parts: list[Section], shortest: int) -> list[Section]:
+def _merge_short_parts(parts: list[Section], shortest: int) -> list[Section]:
     """Scraps between lines go to the neighbour before; a ramp that only bends is a slow curve, hence dynamic."""
     out: list[Section] = []
     for part in parts:

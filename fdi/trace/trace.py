@@ -141,7 +141,7 @@ class Trace:
     def of(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
         """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
         grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
-        return _trace(grid, period, [], provenance=dict(provenance))
+        return _make_trace(grid, period, [], provenance=dict(provenance))
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ def _from_csv(path: Path) -> Trace:
     grid, gaps = _on_grid(path, rows, {**columns, "t": t})
     lost = np.isnan(grid["t"])
     grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
-    return _trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
+    return _make_trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
                   units=UNITS | ({"cor": plant.unit} if plant else {}),
                   notes=tuple(f"column {name} is not known and was left out" for name in unknown))
 
@@ -228,7 +228,7 @@ def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats])
     return out, [Gap(float(a), float(b), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1]
 
 
-def _trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: object) -> Trace:
+def _make_trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: object) -> Trace:
     t = grid["t"]
     nothing = np.full(len(t), math.nan)
     columns = {name: grid.get(name, nothing) for name in (*REQUIRED, *OPTIONAL)}
@@ -239,7 +239,7 @@ def _trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: o
 
 
 def _from_log(log: Log, everything: bool) -> Trace:
-    signals, timing, rest = log.read_columns("/signals"), log.read_columns("/timing"), _messages(log)
+    signals, timing, rest = log.read_columns("/signals"), log.read_columns("/timing"), _read_messages(log)
     run = dict(log.metadata.get("run", {}))
     if not len(signals["time_ns"]):
         raise InputError(log.path, "/signals", "at least one cycle")
@@ -249,28 +249,28 @@ def _from_log(log: Log, everything: bool) -> Trace:
     cycle, phase = table[:, 1].astype(int), table[:, 2].astype(int)
     if (np.diff(cycle) == 0).any():
         raise InputError(log.path, "/signals.cycle", f"each cycle once, not {cycle[:-1][np.diff(cycle) == 0][0]} again")
-    period = _period(log, run, table[:, 0] * 1e-9, cycle)
+    period = _find_period(log, run, table[:, 0] * 1e-9, cycle)
     main = np.flatnonzero(phase == MAIN)
     if not everything and not len(main):
         raise InputError(log.path, "/signals.phase", "a main phase; this run ended in its set-up")
     first = main[0] if len(main) else 0
     kept = slice(None) if everything else slice(main[0], main[-1] + 1)
-    seconds = _seconds(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
+    seconds = _make_clock(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
     rows = cycle[kept] - cycle[kept][0]
     grid, gaps = _on_grid(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
                           | {"phase": phase[kept].astype(float)})
     grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
-    return _trace(grid, period, gaps, phase=filled.astype(int), provenance=_provenance(log, run),
+    return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
                   units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
-                  timing=_timing(timing, cycle[kept], int(cycle[first]), period),
+                  timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                   events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
                   nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
                   checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
 
 
-def _messages(log: Log) -> dict[str, Messages]:
+def _read_messages(log: Log) -> dict[str, Messages]:
     """Events, NMT states and checks: the topics with few messages."""
     found: dict[str, Messages] = {name: [] for name in ("/events", "/nmt", "/checks")}
     for topic, time_ns, message in log.messages(*found):
@@ -278,7 +278,7 @@ def _messages(log: Log) -> dict[str, Messages]:
     return found
 
 
-def _period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
+def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
     """The run's own figure, else the median over the cycles, to the microsecond."""
     try:
         return float(run["period"])
@@ -288,14 +288,14 @@ def _period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64
         raise InputError(log.path, "metadata run.period", f"seconds, not {run['period']!r}") from error
 
 
-def _provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
+def _collect_provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
     """The record `run` as it is; other metadata records with their name in front (`verdict.status`)."""
     more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
             for key, value in record.items()}
     return {"source": log.path.name, **run, **more}
 
 
-def _seconds(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:
+def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:
     """Log time, ns, to s on the rows' own axis, where a cycle is one period long however long it took.
 
     Rows were logged at `time_ns` and stand at `t`, shape (rows,) both; a real-time run that was late by whole periods
@@ -311,7 +311,7 @@ def _seconds(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], fl
     return seconds
 
 
-def _timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
+def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
     """Of the cycles that have a row; t = 0 at cycle `zero`."""
     if not len(columns["time_ns"]):
         return NO_TIMING

@@ -82,7 +82,7 @@ def test_flat_directions_change_no_signal() -> None:
     x = make_start(free, 0.2, 20.0)
     flat = find_flat_directions(problem, free, x)
     assert flat.shape == (len(free), 4)
-    white = problem.whitened(problem.residuals(free, np.vstack([x, x + 0.01 * flat.T, x + 0.01 * np.diag(flat[:, 0])])))
+    white = problem.compute_white_residuals(free, np.vstack([x, x + 0.01 * flat.T, x + 0.01 * np.diag(flat[:, 0])]))
     moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
     assert moved[:4].max() < 100 and moved[4 + [f.name for f in free].index("pilot.flow_gain")] > 1000
 

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from fdi.discovery.candidates import Answer, Candidate, Value, fitted_parameters
+from fdi.discovery.candidates import Answer, Candidate, Value, list_fitted_parameters
 from fdi.estimation.fit import Fit
 from fdi.estimation.unknowns import Free
 from plant import Model
@@ -27,7 +27,7 @@ def test_dynamic_friction_is_not_thought_possible_above_static_friction() -> Non
     free = tuple(Free(f"jack.{kind}_friction", 500.0, 100.0, np.inf, 0.0, 1e5, 0.05) for kind in ("static", "dynamic"))
     none = np.empty((0, 0))
     fit = Fit(free, np.array([0.0, -0.1]), 0.0, 0.0, np.diag([0.01, 1600.0]), none, none, none)
-    found = fitted_parameters("jack_friction", fit, Model())
+    found = list_fitted_parameters("jack_friction", fit, Model())
     static, dynamic = found["jack.static_friction"], found["jack.dynamic_friction"]
     assert 500.0 < static.high < 600.0 and dynamic.value == 490.0
     assert dynamic.low == 0.0 and dynamic.high == static.high

@@ -177,6 +177,6 @@ def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None
     """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
     ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
     search = Search(Model(), hold_inputs(recorded(ripple)), [], ["supply_ripple"], 1)
-    starts = find_tones(search.problem, search.base().fit, "supply_ripple")
+    starts = find_tones(search.problem, search.fit_base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10
