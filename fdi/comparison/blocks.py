@@ -33,11 +33,10 @@ from fdi.thresholds import (
     SHAPE_TIE_GAIN,
     SPOOL_FITS_RATIO,
 )
-from fdi.trace.columns import bridge_gaps, hold_last, rms, shift_rows
-from fdi.trace.trace import Trace
-from plant.effects import combine_laws
-from plant.forced import compute_flow_balance, compute_force_balance
-from plant.model import Model, build_kernel
+from fdi.trace.trace import Trace, bridge_gaps, hold_last, rms, shift_rows
+from plant.effects import at
+from plant.forced import flow_balance, force_balance
+from plant.model import Model, kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -10,21 +10,30 @@ from numpy.typing import NDArray
 
 from fdi.comparison import blocks
 from fdi.comparison.blocks import ControllerBlock
-from fdi.comparison.localisation import Motion, Place, combine_residuals, describe_motion, find_condition, locate_error
-from fdi.comparison.residual_tests import ResidualTests, examine_residuals
+from fdi.comparison.residuals import (
+    Motion,
+    Place,
+    ResidualTests,
+    combine_residuals,
+    describe_motion,
+    examine_residuals,
+    find_condition,
+    locate_error,
+)
 from fdi.estimation.noise import Floor, find_floors, sensor_floors, simulate_reading_noise
 from fdi.estimation.preparation import Repeat, align_columns, find_repeat, match_period, prepare_trace
 from fdi.estimation.replay import (
     Columns,
     Replay,
+    Scatter,
     compute_residuals,
+    fit_scatter,
     measure_drift,
     measure_misfit,
     replay_command,
     replay_current,
     replay_with_checked_steps,
 )
-from fdi.estimation.scatter import Scatter, fit_scatter
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     BLOCK_ERROR_RATIO,
@@ -37,9 +46,8 @@ from fdi.thresholds import (
     SOLVER_HIDES_RATIO,
     UNDECIDED_SHARE,
 )
-from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, rms
 from plant.model import Model
 
 Floats = NDArray[np.float64]

@@ -29,9 +29,8 @@ from fdi.thresholds import (
     SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
-from fdi.trace.columns import hold_last
 from fdi.trace.sections import Section, describe_section, find_sections
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, hold_last
 from plant.errors import InputError
 from plant.model import Model, load_model
 

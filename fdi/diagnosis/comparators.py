@@ -16,9 +16,8 @@ from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, class
 from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.progress import Progress, ignore_progress
-from fdi.trace.columns import hold_last
 from fdi.trace.sections import find_sections
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, hold_last
 from plant.errors import InputError
 from plant.model import Model
 

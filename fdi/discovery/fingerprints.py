@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.columns import hold_last
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, hold_last
 from plant.effects import CATALOGUE
 from plant.model import Model, build_kernel
 

@@ -25,10 +25,9 @@ from fdi.thresholds import (
     NOISE_WINDOW_CONFIDENCE,
     NOISIER_THAN_MODEL,
 )
-from fdi.trace.columns import rms
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace
-from plant.effects import CATALOGUE, combine_laws
+from fdi.trace.trace import Trace, rms
+from plant.effects import CATALOGUE, at
 from plant.model import Model
 from plant.state import Input
 

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.replay import measure_misfit
-from fdi.trace.columns import bridge_gaps, hold_last, hold_next
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, bridge_gaps, hold_last, hold_next
 from plant.errors import InputError
 from plant.model import Model
 from plant.plants import MODULES

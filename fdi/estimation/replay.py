@@ -5,6 +5,10 @@ adds up every bias for ever, so the ram is pulled to the measured position at AN
 reported as a speed. The solver is checked first: with steps half as long the replay must not move; and where a ram that
 stops or goes on hangs on a thousandth of its friction, neither model nor solver can say which, so such windows are not
 judged.
+
+Could the residual be nothing but scatter from one unit to the next? `fit_scatter` takes two Gauss-Newton steps from the
+model, each parameter tied to its value by its own tolerance, and judges by a replay and not by the linear forecast.
+`rig explain` does the same with every effect beside it.
 """
 from __future__ import annotations
 
@@ -16,11 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise import WINDOW
-from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction
-from fdi.thresholds import ANCHOR_RATE, FRICTION_UNCERTAINTY, SOLVER_ERROR_SHARE, UNDECIDED_SMALLEST
-from fdi.trace.columns import bridge_gaps, rms
+from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerance_sizes
+from fdi.thresholds import (
+    ANCHOR_RATE,
+    FRICTION_UNCERTAINTY,
+    RESIDUAL_IS_SCATTER,
+    SCATTER_LARGE_RESIDUAL,
+    SCATTER_TOLERANCES,
+    SOLVER_ERROR_SHARE,
+    UNDECIDED_SMALLEST,
+)
 from fdi.trace.signals import OUTPUTS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, bridge_gaps, rms
 from plant.lanes import Lanes
 from plant.model import Model
 
@@ -31,6 +42,10 @@ Columns = dict[str, Floats]  # by signal, (n,)
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
 SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
+SCATTER_STEPS = 20  # a cycle; only sizes matter here
+SCATTER_ROUNDS = 2
+SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
+ALIKE = 20  # neighbouring samples that say the same thing
 
 
 class Replay(NamedTuple):
@@ -44,10 +59,20 @@ class Replay(NamedTuple):
     blind: Mapping[str, float]  # RMS, elsewhere, by which the current that was not recorded may move a replay
 
 
+def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | None = None,
+                 anchor: float = ANCHOR_RATE) -> Floats:
+    """XJ, P12 and XS, (m, n, 3), of the plant driven by a current (default: the measured one), for each row of values.
+
+    The replay starts at the first measured position, or in the middle where that is not known.
+    """
+    position = trace.xj if has_known_start(trace) else None
+    return lanes.replay(values, trace.cor if current is None else current, trace.load, position, anchor)
+
+
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
     """XJ, P12 and XS, (n,) each, of the plant driven by the measured current, without noise."""
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
-    out = lanes.replay(np.empty((1, 0)), trace.cor, trace.load, trace.xj if has_known_start(trace) else None, anchor)
+    out = replay_lanes(lanes, np.empty((1, 0)), trace, anchor=anchor)
     return {name: out[0, :, i] for i, name in enumerate(OUTPUTS)}
 
 
@@ -66,10 +91,8 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     values = vary_frictions(model)
     lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), REPLAY_STEPS)
-    position = trace.xj if has_known_start(trace) else None
-    runs = lanes.replay(values, trace.cor, trace.load, position, ANCHOR_RATE)
-    others = [lanes.replay(values[:1], cor, trace.load, position, ANCHOR_RATE) for cor in guess_current(trace)]
-    runs = np.concatenate([runs, *others])
+    others = [replay_lanes(lanes, values[:1], trace, current) for current in guess_current(trace)]
+    runs = np.concatenate([replay_lanes(lanes, values, trace), *others])
     undecided = np.zeros(len(trace), bool)
     for i, name in enumerate(OUTPUTS):
         if name in floor:
@@ -79,7 +102,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     coarse, steps = runs[0], REPLAY_STEPS
     while True:
         finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
-        fine = finer.replay(values[:1], trace.cor, trace.load, position, ANCHOR_RATE)[0]
+        fine = replay_lanes(finer, values[:1], trace)[0]
         error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
         small = all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error)
         coarse, steps = fine, 2 * steps
@@ -164,3 +187,48 @@ def differentiate(x: Floats, size: int, order: int) -> Floats:
     weights = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))[order] * order
     out: Floats = np.correlate(np.pad(x, size // 2, "edge"), weights, "valid")
     return out
+
+
+class Scatter(NamedTuple):
+    """What a refit within the tolerances makes of the error."""
+
+    error: dict[str, float]  # by signal, SI unit
+    ratio: dict[str, float]  # over the floor
+    moved: dict[str, float]  # parameter "group.field" to its change in tolerances
+    enough: bool  # within reach of the floor
+
+
+def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
+    """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
+    known = tolerance_sizes(model)
+    base = np.array([model[name] for name in known])
+    size = np.array(list(known.values()))
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), SCATTER_STEPS)
+    scale = np.array([floor[name] for name in trace.outputs])[:, None]
+
+    def residual(x: Floats) -> Floats:
+        """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
+        values = limit_dynamic_friction(list(known), base + x * size)
+        out = replay_lanes(lanes, values, trace).transpose(0, 2, 1)[:, trace.output_columns]
+        left: Floats = np.nan_to_num((trace.measurements - out) / scale)
+        return left.reshape(len(x), -1)
+
+    x = np.zeros(len(base))
+    now = residual(x[None])[0]
+    for _ in range(SCATTER_ROUNDS):
+        slope = (residual(x + SCATTER_DIFFERENCE * np.eye(len(base))) - now) / SCATTER_DIFFERENCE
+        weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
+        normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
+        step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
+        tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -SCATTER_TOLERANCES, SCATTER_TOLERANCES)
+        found = residual(tried)
+        large = SCATTER_LARGE_RESIDUAL
+        costs = 2 * large**2 * (np.sqrt(1 + (found / large) ** 2) - 1).sum(axis=1) / ALIKE
+        best = int(np.argmin(costs + (tried**2).sum(axis=1)))
+        x, now = tried[best], found[best]
+    rows = now.reshape(len(scale), -1)
+    ratio = {name: rms(np.where(np.isnan(y), np.nan, r))
+             for name, r, y in zip(trace.outputs, rows, trace.measurements, strict=True)}
+    error = {name: ratio[name] * floor[name] for name in ratio}
+    moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
+    return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)

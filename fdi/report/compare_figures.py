@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.comparison.compare import Comparison
-from fdi.comparison.residual_tests import Depends, ResidualTests
+from fdi.comparison.residuals import Depends, ResidualTests
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, RED, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES, format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO

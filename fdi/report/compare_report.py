@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from fdi.comparison.compare import BALANCED, Comparison, SignalError
-from fdi.comparison.residual_tests import ResidualTests
+from fdi.comparison.residuals import ResidualTests
 from fdi.report import compare_figures
 from fdi.report.numbers import (
     SIGNAL_NAMES,

@@ -10,8 +10,7 @@ from noisy_traces import healthy
 from fdi.comparison.blocks import compare_controller, find_lags, measure_resolution
 from fdi.estimation.preparation import read_cycles
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
-from fdi.trace.columns import shift_rows
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, shift_rows
 from plant import Model, simulate
 
 MODEL = Model()

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.estimation.preparation import FEWEST_ROWS, align_columns, align_repeat, find_repeat, read_cycles
-from fdi.trace.columns import bridge_gaps, hold_last, shift_rows
-from fdi.trace.trace import Trace
+from fdi.estimation.preparation import FEWEST_ROWS, align_columns, find_repeat, read_cycles
+from fdi.trace.trace import Trace, bridge_gaps, hold_last, shift_rows
 from plant import InputError, Model
 
 MODEL = Model()

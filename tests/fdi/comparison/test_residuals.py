@@ -7,21 +7,19 @@ import numpy as np
 import pytest
 from noisy_traces import LEVELS, healthy, noise
 
-from fdi.comparison.localisation import (
-    Motion,
-    combine_residuals,
-    describe_motion,
-    find_condition,
-    locate_error,
-)
-from fdi.comparison.residual_tests import (
+from fdi.comparison.residuals import (
     WHITE,
+    Motion,
     apply_whitener,
     bin_residual,
+    combine_residuals,
     correlate_with_input,
     cumulate_periodogram,
+    describe_motion,
     examine_residuals,
+    find_condition,
     fit_whitener,
+    locate_error,
     name_shape,
 )
 from fdi.estimation.preparation import read_cycles
