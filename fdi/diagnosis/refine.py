@@ -23,9 +23,9 @@ from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estima
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import descend_valley, guess_covariance
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, limit_dynamic_friction
 from fdi.estimation.unidentifiable import find_flat_directions
-from fdi.estimation.unknowns import Free, all_unknowns, effect_unknowns, limit_dynamic_friction, silence_readings
+from fdi.estimation.unknowns import all_unknowns, effect_unknowns, silence_readings
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,

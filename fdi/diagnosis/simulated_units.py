@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
-from fdi.estimation.unknowns import limit_dynamic_friction, tolerance_sizes
+from fdi.estimation.likelihood import limit_dynamic_friction
+from fdi.estimation.unknowns import tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from plant.block import NARROW
 from plant.lanes import Lanes

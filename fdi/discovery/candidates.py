@@ -13,7 +13,8 @@ from fdi.discovery.fingerprints import Fingerprint, measure_firmware_resolution
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.significance import compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit
-from fdi.estimation.unknowns import UNREPLAYED, limit_friction_values
+from fdi.estimation.likelihood import limit_friction_values
+from fdi.estimation.unknowns import UNREPLAYED
 from fdi.thresholds import (
     EFFECT_INTERVAL_FACTOR,
     EFFECT_SYSTEMATIC_SD,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from fdi.discovery.candidates import Value
 from fdi.discovery.runs import Source
-from fdi.estimation.unknowns import limit_friction_values
+from fdi.estimation.likelihood import limit_friction_values
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.model import Model, parse_model

@@ -13,15 +13,13 @@ from fdi.discovery.scan import Prospect, scan_effects
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, linearise
-from fdi.estimation.likelihood import compute_misfit
+from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
 from fdi.estimation.unknowns import (
     UNREPLAYED,
-    Free,
     active_effects,
     all_unknowns,
     complete_model,
     effect_unknowns,
-    limit_friction_values,
     silence_readings,
 )
 from fdi.progress import Progress, ignore_progress

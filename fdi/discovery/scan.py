@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scaled_bounds
 from fdi.estimation.unidentifiable import list_powers, scale_together
-from fdi.estimation.unknowns import Free, effect_unknowns, scaled_bounds
+from fdi.estimation.unknowns import effect_unknowns
 from plant.effects import CATALOGUE
 from plant.threads import map_in_threads
 

@@ -12,9 +12,9 @@ from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
-from fdi.estimation.likelihood import Problem, compute_misfit
+from fdi.estimation.likelihood import Free, Problem, compute_misfit
 from fdi.estimation.noise import Noise
-from fdi.estimation.unknowns import Free, all_unknowns, complete_model, silence_readings
+from fdi.estimation.unknowns import all_unknowns, complete_model, silence_readings
 from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
@@ -94,7 +94,10 @@ class Search:
 
     def retry_from(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
-        for other in self.map_parallel(partial(fit_unknowns, self.problem, h.fit.free), starts):
+        def fit_from(start: Floats) -> Fit:
+            return fit_unknowns(self.problem, h.fit.free, start)
+
+        for other in self.map_parallel(fit_from, starts):
             if other.cost < h.cost - 1.0:
                 h = self.judge_fit(h.effects, other)
         return h

@@ -11,7 +11,7 @@ from fdi.discovery.explain_runs import prepare_effects
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, build_fitted_model, check_addable, refit_effects
 from fdi.discovery.runs import Runs, read_runs, read_source
-from fdi.estimation.unknowns import limit_friction_values
+from fdi.estimation.likelihood import limit_friction_values
 from fdi.output import write_text
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import software

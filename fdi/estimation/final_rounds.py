@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, step_within_bounds
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights
 from fdi.estimation.unidentifiable import choose_across, find_tangents, relax_along, relax_fit, remove_slope
-from fdi.estimation.unknowns import Free
 from fdi.thresholds import CONVERGED_GAIN
 
 Floats = NDArray[np.float64]

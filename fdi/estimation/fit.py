@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights
-from fdi.estimation.unknowns import Free, scaled_bounds
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scaled_bounds
 from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The likelihood of measured runs under a model: replays of many trial values at once, whitened, counted by blocks.
+"""The unknowns of a fit, and the likelihood of measured runs: replays of many values, whitened, counted by blocks.
 
 Blocks of residuals may hold more noise than is known: a block that is fitted counts by its squares, one that is not by
 the logarithm of its mean square. So no single stop of the ram, made or missed, outweighs a whole run, and physics that
@@ -6,15 +6,15 @@ is missing is not made up for by parameters that no healthy unit has.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.noise import Noise
-from fdi.estimation.unknowns import Free, limit_dynamic_friction
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
@@ -26,6 +26,45 @@ Floats = NDArray[np.float64]
 FIT_STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 BLOCK = 100  # cycles
+
+
+class Free(NamedTuple):
+    """A parameter that a fit may change. Fits work on x = (value - centre) / scale."""
+
+    name: str
+    centre: float
+    scale: float
+    prior: float  # standard deviation of x that is known beforehand; inf: nothing is
+    low: float
+    high: float
+    step: float  # of x, for differences
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units, within what is possible."""
+        return min(max(self.centre + self.scale * x, self.low), self.high)
+
+
+def scaled_bounds(free: Sequence[Free]) -> tuple[Floats, Floats]:
+    """The least and the most that scaled unknowns, (p,), can be."""
+    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
+    return low, high
+
+
+def limit_dynamic_friction(names: Sequence[str], values: Floats) -> Floats:
+    """Values (.., p) of named parameters, changed in place: dynamic friction is at most the static friction."""
+    for body in ("jack", "spool"):
+        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
+        if static in names and dynamic in names:
+            i, j = names.index(static), names.index(dynamic)
+            values[..., j] = np.minimum(values[..., i], values[..., j])
+    return values
+
+
+def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
+    """Parameters by name, in which dynamic friction is at most the static friction."""
+    names = [name for name in values if name.endswith("_friction")]
+    limited = limit_dynamic_friction(names, np.array([values[name] for name in names]))
+    return {**values, **dict(zip(names, limited.tolist(), strict=True))}
 
 
 @dataclass
@@ -47,8 +86,10 @@ class Problem:
 
     def predict_outputs(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
-        runs = map_in_threads(lambda r: self.predict_signals(names, values, r)[:, r.output_columns], (self.trace, *self.also),
-                      self.workers)
+        def predict_run(run: Trace) -> Floats:
+            return self.predict_signals(names, values, run)[:, run.output_columns]
+
+        runs = map_in_threads(predict_run, (self.trace, *self.also), self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:

@@ -19,8 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.noise import WINDOW
-from fdi.estimation.unknowns import WITHOUT_NOISE, limit_dynamic_friction, tolerance_sizes
+from fdi.estimation.unknowns import WITHOUT_NOISE, tolerance_sizes
 from fdi.thresholds import (
     ANCHOR_RATE,
     FRICTION_UNCERTAINTY,

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit, cut_at_bounds
-from fdi.estimation.likelihood import Problem, compute_misfit
-from fdi.estimation.unknowns import Free, scaled_bounds
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, scaled_bounds
 from fdi.thresholds import FLAT_DIRECTION_MISFIT
 
 Floats = NDArray[np.float64]

@@ -1,12 +1,12 @@
 """What a fit may change: the tolerances of a unit, the parameters of effects, and what is known of them beforehand."""
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.estimation.likelihood import Free
 from fdi.thresholds import HEALTHY_TOLERANCES
 from plant.effects import CATALOGUE, Effect
 from plant.model import Model, find_quantity, list_offered_effects
@@ -15,28 +15,6 @@ Floats = NDArray[np.float64]
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
 WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
-
-
-class Free(NamedTuple):
-    """A parameter that a fit may change. Fits work on x = (value - centre) / scale."""
-
-    name: str
-    centre: float
-    scale: float
-    prior: float  # standard deviation of x that is known beforehand; inf: nothing is
-    low: float
-    high: float
-    step: float  # of x, for differences
-
-    def value(self, x: float) -> float:
-        """The parameter in SI units, within what is possible."""
-        return min(max(self.centre + self.scale * x, self.low), self.high)
-
-
-def scaled_bounds(free: Sequence[Free]) -> tuple[Floats, Floats]:
-    """The least and the most that scaled unknowns, (p,), can be."""
-    low, high = (np.array([(getattr(f, end) - f.centre) / f.scale for f in free]) for end in ("low", "high"))
-    return low, high
 
 
 def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
@@ -106,23 +84,6 @@ def _off_nominal(e: Effect, model: Model) -> bool:
     tolerance = model.kind.tolerance
     return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])
                for name, q in e.parameters.items())
-
-
-def limit_dynamic_friction(names: Sequence[str], values: Floats) -> Floats:
-    """Values (.., p) of named parameters, changed in place: dynamic friction is at most the static friction."""
-    for body in ("jack", "spool"):
-        static, dynamic = f"{body}.static_friction", f"{body}.dynamic_friction"
-        if static in names and dynamic in names:
-            i, j = names.index(static), names.index(dynamic)
-            values[..., j] = np.minimum(values[..., i], values[..., j])
-    return values
-
-
-def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
-    """Parameters by name, in which dynamic friction is at most the static friction."""
-    names = [name for name in values if name.endswith("_friction")]
-    limited = limit_dynamic_friction(names, np.array([values[name] for name in names]))
-    return {**values, **dict(zip(names, limited.tolist(), strict=True))}
 
 
 def complete_model(model: Model) -> Model:

@@ -7,7 +7,7 @@ import numpy as np
 
 from fdi.discovery.candidates import Answer, Candidate, Value, list_fitted_parameters
 from fdi.estimation.fit import Fit
-from fdi.estimation.unknowns import Free
+from fdi.estimation.likelihood import Free
 from plant import Model
 
 
