@@ -162,11 +162,12 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
     error, (rate, place, gain, both) = _measure_remainders(b.way[there], columns, len(rates))
     effective = int(there.sum()) / lag
 
-    def worse(one: float, other: float) -> float:
+    def measure_evidence(one: float, other: float) -> float:
         """Twice the log likelihood by which `one` describes worse than `other`."""
         return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
 
-    tie = worse(gain, both) < SHAPE_TIE_GAIN + len(columns) or abs(worse(rate, place)) < SHAPE_TIE_GAIN
+    gain_suffices = measure_evidence(gain, both) < SHAPE_TIE_GAIN + len(columns)
+    tie = gain_suffices or abs(measure_evidence(rate, place)) < SHAPE_TIE_GAIN
     if tie:
         winner = "sensor" if noisy else "either"
     else:
@@ -183,13 +184,13 @@ def _measure_remainders(y: Floats, columns: list[Floats], first: int
     # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
     gram = np.einsum("ki,kj->ij", z, z) / len(y)
 
-    def left(pick: slice) -> float:
+    def measure_remainder(pick: slice) -> float:
         inverse = np.linalg.pinv(gram[pick, pick], rcond=1e-9, hermitian=True)
         part = gram[pick, -1]
         return float(size[-1]) * math.sqrt(max(0.0, 1.0 - float(part @ inverse @ part)))
 
     parts = slice(0, first), slice(first, -1), slice(first, first + 1), slice(0, -1)
-    return float(size[-1]), tuple(left(part) for part in parts)  # type: ignore[return-value]
+    return float(size[-1]), tuple(measure_remainder(part) for part in parts)  # type: ignore[return-value]
 
 
 def _list_rate_shapes(xs: Floats, p12: Floats) -> list[Floats]:

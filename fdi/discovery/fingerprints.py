@@ -75,12 +75,12 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float) -
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
     unit, ready = measure_firmware_resolution(model), model.having([name])
 
-    def left(size: float) -> float:
+    def measure_error(size: float) -> float:
         return _measure_rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
 
     for _ in range(ZOOMS):
         sizes = np.linspace(low, high, SIZES)
-        errors = [left(s) for s in sizes]
+        errors = [measure_error(s) for s in sizes]
         k = int(np.argmin(errors))
         low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
     value = float(np.exp(sizes[k]))

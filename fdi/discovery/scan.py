@@ -162,7 +162,7 @@ def _simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Sta
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
     steep = prepare_slope(fit)
 
-    def trials(part: NDArray[np.int64]) -> list[Trial]:
+    def run_trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
         found = []
         for i, r in zip(part, white, strict=True):
@@ -172,7 +172,7 @@ def _simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Sta
         return found
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
-    return [trial for several in map_in_threads(trials, parts, workers) for trial in several]
+    return [trial for several in map_in_threads(run_trials, parts, workers) for trial in several]
 
 
 def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:

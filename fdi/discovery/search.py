@@ -75,10 +75,10 @@ class Search:
         """The model without a further effect, its tolerances fitted."""
         free = all_unknowns(self.model)
 
-        def fit_base(ease: bool) -> Fit:
+        def fit_tolerances(ease: bool) -> Fit:
             return fit_unknowns(self.problem, free, self.find_eased_start(free) if ease else None)
 
-        fits = self.map_parallel(fit_base, (False, True))
+        fits = self.map_parallel(fit_tolerances, (False, True))
         first = self.judge_fit((), min(fits, key=lambda f: f.cost))
         if first.reached:
             return first
@@ -130,15 +130,15 @@ class Search:
         ranked = sorted(done, key=lambda h: h.cost)
         if ranked and not ranked[0].reached:
             x = ranked[0].fit.x
-            settled = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
-            ranked[0] = self.retry_from(ranked[0], [np.where(settled & (np.abs(x) > 1.0), 0.0, x)])
+            has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
+            ranked[0] = self.retry_from(ranked[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
         return ranked
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
         usual = {f.name: f for f in all_unknowns(self.model)}
 
-        def left_out(gone: str) -> Hypothesis:
+        def fit_without(gone: str) -> Hypothesis:
             own = set(CATALOGUE[gone].fitted)
             free = [usual.get(f.name) if f.name in own else f for f in h.fit.free]
             kept = [f for f in free if f is not None]
@@ -147,7 +147,7 @@ class Search:
                                for f, v in zip(kept, x, strict=True)])
             return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, inside))
 
-        return sorted(self.map_parallel(left_out, h.effects), key=lambda each: each.cost)
+        return sorted(self.map_parallel(fit_without, h.effects), key=lambda each: each.cost)
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""

@@ -207,7 +207,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), SCATTER_STEPS)
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
 
-    def residual(x: Floats) -> Floats:
+    def compute_scaled_residuals(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
         values = limit_dynamic_friction(list(known), base + x * size)
         out = replay_lanes(lanes, values, trace).transpose(0, 2, 1)[:, trace.output_columns]
@@ -215,14 +215,14 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
         return left.reshape(len(x), -1)
 
     x = np.zeros(len(base))
-    now = residual(x[None])[0]
+    now = compute_scaled_residuals(x[None])[0]
     for _ in range(SCATTER_ROUNDS):
-        slope = (residual(x + SCATTER_DIFFERENCE * np.eye(len(base))) - now) / SCATTER_DIFFERENCE
+        slope = (compute_scaled_residuals(x + SCATTER_DIFFERENCE * np.eye(len(base))) - now) / SCATTER_DIFFERENCE
         weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
         step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
         tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -SCATTER_TOLERANCES, SCATTER_TOLERANCES)
-        found = residual(tried)
+        found = compute_scaled_residuals(tried)
         large = SCATTER_LARGE_RESIDUAL
         costs = 2 * large**2 * (np.sqrt(1 + (found / large) ** 2) - 1).sum(axis=1) / ALIKE
         best = int(np.argmin(costs + (tried**2).sum(axis=1)))

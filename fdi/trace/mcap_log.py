@@ -95,7 +95,7 @@ class Log:
                         continue
                     return None  # a chunk without an index
                 offsets = _message_offsets(stream, index, numbers[0])
-                rows = _read_rows(_read_chunk(self.path, stream, index), offsets, dtype)
+                rows = _decode_rows(_read_chunk(self.path, stream, index), offsets, dtype)
                 if rows is None:
                     return None
                 parts.append(rows)
@@ -176,7 +176,7 @@ def _message_offsets(stream: Any, index: ChunkIndex, channel: int) -> NDArray[np
     return pairs[:, 1].astype(np.int64)
 
 
-def _read_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+def _decode_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """The records at `offsets` of a chunk; None if one would end beyond it."""
     if len(offsets) and offsets.max() + dtype.itemsize > len(raw):
         return None
