@@ -232,7 +232,7 @@ class Jack(NamedTuple):
 
 
 def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
-         level: Mapping[str, float]) -> Jack | None:
+               level: Mapping[str, float]) -> Jack | None:
     """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
 
     None if too few rows hang together.
@@ -270,7 +270,7 @@ def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
 
 
 def collect_block_ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
-           controller: float | None, spool: bool = True) -> dict[str, float | None]:
+                         controller: float | None, spool: bool = True) -> dict[str, float | None]:
     """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
 
     Where the spool is as the model says, an error of P12 in the replay is the jack's too: it sees standstill and

@@ -190,8 +190,8 @@ def _describe_cycles(n: int) -> str:
 
 
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
-            table: Mapping[str, SignalError], found: ControllerBlock,
-            noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
+                  table: Mapping[str, SignalError], found: ControllerBlock,
+                  noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, and the parts of the jack's."""
     signal = {name: s.ratio for name, s in table.items()}
     pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
@@ -215,7 +215,7 @@ def _list_blocks_above(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
 
 
 def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
-             replay: Replay, period: float) -> tuple[str, str]:
+                    replay: Replay, period: float) -> tuple[str, str]:
     """The verdict, and why it cannot tell."""
     coarse = [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]
     if coarse:

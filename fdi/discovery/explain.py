@@ -150,7 +150,7 @@ def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN)
 
 
 def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
-               holdout: Trace | None) -> Explanation:
+              holdout: Trace | None) -> Explanation:
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
@@ -200,7 +200,7 @@ def _find_parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> H
 
 
 def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
-             found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
+                    found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
              ) -> tuple[str, tuple[str, ...]]:
     """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run,
     `part` says that the best one leaves less of it than the base does.

@@ -76,8 +76,8 @@ class Refit:
 
 
 def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
-          holdout: Trace | None = None, progress: Progress = ignore_progress,
-          begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
+                  holdout: Trace | None = None, progress: Progress = ignore_progress,
+                  begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
     """Add effects to a model in this order.
 
     Args:

@@ -101,7 +101,7 @@ def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Tr
 
 
 def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
-            signals: tuple[str, ...]) -> Trace:
+                      signals: tuple[str, ...]) -> Trace:
     """Another command as a hypothesis predicts it, with the model's own controller."""
     problem = search.problem
     period = problem.model.values["controller.period"]

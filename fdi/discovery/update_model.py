@@ -83,7 +83,7 @@ def find_runs(model: Model, known: Provenance, trace: str | None = None, repeats
         return read_runs(original, trace, repeats, holdout, signals)
     known_holdout = known.holdout.file if known.holdout else None
     return read_runs(original, trace or known.trace.file, repeats or [r.file for r in known.repeats],
-                holdout or known_holdout, signals or known.signals or None)
+                     holdout or known_holdout, signals or known.signals or None)
 
 
 def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provenance, command: str = "",
@@ -130,7 +130,7 @@ def remove_effect(name: str, runs: Runs | None, model: Model, known: Provenance,
     rows = list(known.ledger) if _continues_ledger(known, runs) else []
     if not rows:
         before = refit_effects(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
-                       len(known.effects)).last
+                               len(known.effects)).last
         rows = [Row(before.effect, before.error, before.holdout)]
     start = runs.model if name in known.effects else model_file.remove_effect(runs.model, known, name)[0]
     left = known_without.effects
@@ -144,7 +144,7 @@ def _continues_ledger(known: Provenance, runs: Runs) -> bool:
 
 
 def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
-            notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
+                 notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
     model, fit = build_fitted_model(r), r.last.hypothesis.fit
     parameters = {name: v for e in effects for name, v in list_fitted_parameters(e, fit, runs.model).items()}
     parameters |= {name: Value(*of, find_quantity(name, plant=model.plant).unit) for name, of in r.marks.items()}

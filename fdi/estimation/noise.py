@@ -60,7 +60,7 @@ class Floor(NamedTuple):
 
 
 def find_floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats]],
-           period: float = 1e-3) -> dict[str, Floor]:
+                period: float = 1e-3) -> dict[str, Floor]:
     """The floor of each signal from the residuals (n,) of the same model on repeats of one command.
 
     Rows correspond; NaN is a missing sample. Signals that no repeat has are left out. Lengths may differ at the end.

@@ -33,7 +33,7 @@ FLAT: tuple[Mapping[str, float], ...] = (
 )
 # static friction of the jack is known here by its ratio to the dynamic one, which stays
 FLAT_BY_RATIO = tuple({name: power for name, power in flat.items() if name != "jack.static_friction"}
-             for flat in FLAT)
+                      for flat in FLAT)
 
 
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:

@@ -69,7 +69,7 @@ def open_text(path: Path) -> io.TextIOBase:
 
 
 def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
-           optional: tuple[str, ...]) -> tuple[dict[str, Floats], tuple[str, ...]]:
+                optional: tuple[str, ...]) -> tuple[dict[str, Floats], tuple[str, ...]]:
     header = [name.strip() for name in next(rows, [])]
     for name in required:
         if name not in header:

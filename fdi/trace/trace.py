@@ -211,8 +211,8 @@ def _from_csv(path: Path) -> Trace:
     lost = np.isnan(grid["t"])
     grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
     return _make_trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
-                  units=UNITS | ({"cor": plant.unit} if plant else {}),
-                  notes=tuple(f"column {name} is not known and was left out" for name in unknown))
+                       units=UNITS | ({"cor": plant.unit} if plant else {}),
+                       notes=tuple(f"column {name} is not known and was left out" for name in unknown))
 
 
 def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Gap]]:
@@ -262,11 +262,11 @@ def _from_log(log: Log, everything: bool) -> Trace:
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
     return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
-                  units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
-                  timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
-                  events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
-                  nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
-                  checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
+                       units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
+                       timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
+                       events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
+                       nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
+                       checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
 
 
 def _read_messages(log: Log) -> dict[str, Messages]:
