@@ -34,9 +34,9 @@ from fdi.thresholds import (
     SPOOL_FITS_RATIO,
 )
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, rms, shift_rows
-from plant.effects import at
-from plant.forced import flow_balance, force_balance
-from plant.model import Model, kernel
+from plant.effects import combine_laws
+from plant.forced import compute_flow_balance, compute_force_balance
+from plant.model import Model, build_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -27,7 +27,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace, rms
-from plant.effects import CATALOGUE, at
+from plant.effects import CATALOGUE, combine_laws
 from plant.model import Model
 from plant.state import Input
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import healthy
 
-from fdi.estimation.preparation import FEWEST_ROWS, align_columns, find_repeat, read_cycles
+from fdi.estimation.preparation import FEWEST_ROWS, align_columns, align_repeat, find_repeat, read_cycles
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, shift_rows
 from plant import InputError, Model
 
