@@ -47,16 +47,17 @@ class StoredCode:
         self._entry: Any = None
         code = _read_object(self._path)
         if code is not None and not os.environ.get("NUMBA_DISABLE_JIT"):
-            self._engine, self._entry = _link_object(code)
+            with contextlib.suppress(Exception):  # whatever LLVM has against the file, numba can compile it again
+                self._engine, self._entry = _link_object(code)
 
     def warm(self, flat: Array, record: Array) -> None:
         """Make sure that there is machine code: with numba, and stored for the next process, if it was not."""
         if self._entry is None:
             run = self._compile()
             run(flat, 0.0, 0.0, 0.0, 0.0, record, 0)
-            code = _emit_object(run)
-            if code is not None:
-                with contextlib.suppress(OSError):
+            with contextlib.suppress(Exception):  # another release of numba may name its inner parts otherwise
+                code = _emit_object(run)
+                if code is not None and _gives_same_bits(code, run, flat, record):
                     _write_object(self._path, code)
 
     def bind(self, flat: Array, record: Array, steps: int) -> Advance:
@@ -74,6 +75,20 @@ class StoredCode:
                 self._compile()(flat, current, load, noise, t, record, steps)
 
         return advance
+
+
+def _gives_same_bits(code: bytes, run: Any, flat: Array, record: Array) -> bool:
+    """Whether the object code moves a copy of the state as numba's function does; else it is not to be stored."""
+    _engine, entry = _link_object(code)
+    expected, state = flat.copy(), flat.copy()
+    result, failure = ctypes.c_void_p(), ctypes.c_void_p()
+    for current in (1e-3, -2e-3, 5e-3):
+        run(expected, current, 100.0, 0.0, 0.0, record, 10)
+        status = entry(ctypes.byref(result), ctypes.byref(failure), *_describe_array(state), current, 100.0, 0.0, 0.0,
+                       *_describe_array(record), 10)
+        if status != 0:
+            return False
+    return state.tobytes() == expected.tobytes()
 
 
 def _describe_array(array: Array) -> tuple[int | None, ...]:
@@ -106,9 +121,13 @@ def _write_object(path: Path, code: bytes) -> None:
     """Store object code at once: another process sees the whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    with os.fdopen(handle, "wb") as file:
-        file.write(hashlib.sha256(code).digest() + code)
-    Path(name).replace(path)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(code).digest() + code)
+        Path(name).replace(path)
+    except OSError:
+        Path(name).unlink(missing_ok=True)
+        raise
 
 
 def _emit_object(run: Any) -> bytes | None:

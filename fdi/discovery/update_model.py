@@ -17,7 +17,7 @@ from fdi.progress import Progress, ignore_progress
 from fdi.sources import software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
-from plant.model import Model, find_quantity
+from plant.model import Model, find_effect, find_quantity
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,8 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     Raises:
         InputError: an effect that cannot be added to this model or be fitted to these runs.
     """
+    for name in effects:
+        find_effect(name, runs.model.plant)
     every = [*known.effects, *effects]
     check_addable(runs.model, every)
     prepare_effects(runs, every, progress)

@@ -28,7 +28,10 @@ BEFORE, AFTER, HELD, FLOOR = "#c9ced6", "#1f6feb", "#d9730d", "#2b8a3e"
 
 def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor: Mapping[str, float],
                    name_of_after: str = "with the missing effect") -> str:
-    """The residual of each signal over time, without and with the effects, below the command."""
+    """The residual, measured minus model, of each signal over time, without and with the effects, below the command.
+
+    (The residuals of a fit have the other sign: model minus measured.)
+    """
     t, n = trace.t, len(trace)
     with start_figure(1.4 + 1.7 * len(trace.outputs)) as figure:
         heights = [0.8] + [1.2] * len(trace.outputs)
@@ -37,10 +40,10 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
         axes[0].set_ylabel("Com [mm]")
         for i, (ax, name) in enumerate(zip(axes[1:], trace.outputs, strict=True)):
             unit, scale = DRAWN_UNITS[name]
-            line = thin_line(t, before.fit.residuals[i, :n] * scale)
+            line = thin_line(t, -before.fit.residuals[i, :n] * scale)
             ax.plot(*line, color=BEFORE, lw=0.9, label="model as it was")
             if after is not None:
-                line = thin_line(t, after.fit.residuals[i, :n] * scale)
+                line = thin_line(t, -after.fit.residuals[i, :n] * scale)
                 ax.plot(*line, color=AFTER, lw=0.9, label=name_of_after)
             for side in (-1, 1):
                 ax.axhline(side * NOISE_BAND_RATIO * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",

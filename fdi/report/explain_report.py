@@ -207,10 +207,11 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
     columns += [Column("evidence", align="right"), Column("p", align="right"), Column("size", medium=page)]
     rows = [_baseline_row(a, signals, has_holdout)]
     rows += [_candidate_row(a, c, signals, has_holdout) for c in a.explanations]
-    return Table(columns, rows, "Signals: repeatable part of the error over its noise floor (1: noise alone). "
-                                "Held-out run: error of the worst signal over its noise floor. Evidence: gain in log "
-                                "likelihood minus a penalty for parameters and candidates. p: probability of such a "
-                                "gain where nothing is missing.", terminal_rows=most + 1)
+    caption = ("Signals: repeatable part of the error over its noise floor (1: noise alone). Held-out run: error of "
+               "the worst signal over its noise floor (on the page: error of each signal). Evidence: gain in log "
+               "likelihood minus a penalty for parameters and candidates. p: probability of such a gain where nothing "
+               "is missing.")
+    return Table(columns, rows, caption, terminal_rows=most + 1)
 
 
 def _baseline_row(a: Answer, signals: Sequence[str], has_holdout: bool) -> list[Cell | str]:

@@ -172,6 +172,7 @@ def _name_state(code: int) -> str:
 
 def _read_frames(source: Path) -> Iterator[Frame]:
     import can
+    from can.io.blf import BLFParseError
 
     first = None
     try:
@@ -184,7 +185,7 @@ def _read_frames(source: Path) -> Iterator[Frame]:
                 yield Frame(t_ns, message.arbitration_id, bytes(message.data))
     except OSError as error:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error
-    except (ValueError, IndexError, can.CanError) as error:
+    except (ValueError, IndexError, can.CanError, BLFParseError) as error:
         raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
 
 

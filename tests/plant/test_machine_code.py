@@ -5,14 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-from plant import Actuator, Model
+import pytest
+
+from plant import Actuator, Model, machine_code
 from plant.effects import CATALOGUE
 from plant.machine_code import StoredCode
 from plant.model import build_kernel
 
 RUN = """
 import sys
-from plant import Actuator, Model
+import pytest
+
+from plant import Actuator, Model, machine_code
 effects = tuple(sys.argv[1:])
 plant = Actuator(Model(effects=effects), seed=3)
 plant.warm()
@@ -60,3 +64,22 @@ def test_stored_code_equals_numba(tmp_path: Path) -> None:
         advance(1e-3 * k, 10.0 * k, 0.1, 1e-3 * k)
         run(plant._flat, 1e-3 * k, 10.0 * k, 0.1, 1e-3 * k, plant._record, plant.steps)
         assert plant._flat.tobytes() == other._flat.tobytes()
+
+
+def test_code_that_gives_other_bits_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = Actuator(Model())
+    run = build_kernel("advance_flat_state", ())
+    monkeypatch.setattr(machine_code, "_link_object", lambda code: (None, lambda *arguments: 0))  # moves nothing
+    StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_release_of_numba_runs_without_stored_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(run: object) -> bytes:
+        raise AttributeError("_get_module_for_linking")
+
+    monkeypatch.setattr(machine_code, "_emit_object", fail)
+    plant = Actuator(Model())
+    run = build_kernel("advance_flat_state", ())
+    StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
+    assert list(tmp_path.iterdir()) == []

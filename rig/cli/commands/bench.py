@@ -5,6 +5,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
+from rig.cli.options import parse_whole_number
+
 if TYPE_CHECKING:
     from rig.studies.resumable.batch import BatchProgress
 
@@ -17,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
     add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
     add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
-    add("--seed", type=int, default=0, help="seed of the first case; each case uses the next seed (default: 0)")
+    add("--seed", type=parse_whole_number, default=0, metavar="N",
+        help="seed of the first case; each case uses the next seed (default: 0)")
     add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
     add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
 

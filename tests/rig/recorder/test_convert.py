@@ -97,6 +97,9 @@ def test_refusals(log: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.log").write_text("hello\n")
     with pytest.raises(InputError, match=r"CAN frames as \.log"):
         import_frames(tmp_path / "bad.log", tmp_path / "y.mcap", dbc.DBC)
+    (tmp_path / "bad.blf").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"CAN frames as \.blf"):
+        import_frames(tmp_path / "bad.blf", tmp_path / "y.mcap", dbc.DBC)
     (tmp_path / "silent.log").write_text("(0.000000) can0 702#05\n")
     with pytest.raises(InputError, match="SYNC"):
         import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", dbc.DBC)

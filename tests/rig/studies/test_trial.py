@@ -257,3 +257,9 @@ def test_blind_trial(tmp_path: Path) -> None:
     """200 cases through `rig explain`: an hour or two."""
     missed = [rate for rate in score.count_rates(run_trial(RIG_EXPLAIN, range(200), tmp_path)) if not rate.met]
     assert missed == []
+
+
+def test_a_negative_seed_is_refused_in_one_line(tmp_path: Path) -> None:
+    said = rig("bench", "explain", "--seed", "-1", "--cases", 1, "--folder", tmp_path / "trial")
+    assert said.status == 2 and "--seed" in said.err and len(said.err.splitlines()) == 1
+    assert not (tmp_path / "trial").exists()
