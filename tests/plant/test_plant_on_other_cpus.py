@@ -13,10 +13,10 @@ from places import ROOT
 from plant import blas
 
 COMPILE = """
-from plant.compile import compiled
+from plant.compile import compile_function
 def double(x):
     return x + x
-compiled(double)(1.5)
+compile_function(double)(1.5)
 """
 
 

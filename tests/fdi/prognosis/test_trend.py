@@ -291,7 +291,7 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "unit").mkdir()
     there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
     Trace.of(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
-    monkeypatch.setattr(gather, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(gather, "find_cache_folder", lambda: tmp_path / "cache")
     first = rig("trend", tmp_path / "unit", "--json")
     assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"
     assert first.json["points"][0]["date"] == "2026-01-05" and first.json["points"][0]["fss"]["low"] < 5.0

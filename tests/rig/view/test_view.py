@@ -135,7 +135,7 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
         print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
 
 
-@pytest.mark.parametrize(("part", "title"), [("_states", rerun_log.LANES), ("_texts", rerun_log.TEXTS)])
+@pytest.mark.parametrize(("part", "title"), [("_send_states", rerun_log.LANES), ("_send_texts", rerun_log.TEXTS)])
 def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str,
                                              title: str) -> None:
     missing = _missing()
