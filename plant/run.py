@@ -78,7 +78,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
 
 @contextmanager
 def report_law_errors(model: Model) -> Iterator[None]:
-    """What a user's own law does wrong is told as bad input: numba and Python raise what they like."""
+    """Report an error in a user's own law as bad input, whatever numba or Python raised."""
     try:
         yield
     except Exception as error:

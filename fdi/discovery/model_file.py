@@ -61,7 +61,7 @@ def read_provenance(path: Path) -> Provenance:
     """The table [provenance] of a model file; an empty one of a file without.
 
     Raises:
-        InputError: a table that is none of ours.
+        InputError: a table that this software did not write.
     """
     said = read_toml(path).get("provenance", {})
     try:

@@ -36,7 +36,7 @@ def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: st
     """Read the files of a search.
 
     Raises:
-        InputError: a file that cannot be used, a repeat that is none, or a run given twice, in one line.
+        InputError: a file that cannot be used, a repeat of another command, or a run given twice.
     """
     files = [trace, *repeats, *([holdout] if holdout else [])]
     sources = [read_source(file) for file in files]
@@ -49,7 +49,7 @@ def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), hold
     """The runs of a search, from traces that have been read or simulated.
 
     Raises:
-        InputError: a trace that cannot be used, a repeat that is none, or a run given twice, in one line.
+        InputError: a trace that cannot be used, a repeat of another command, or a run given twice.
     """
     traces = [trace, *repeats, *([holdout] if holdout is not None else [])]
     sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]

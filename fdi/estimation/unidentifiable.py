@@ -3,7 +3,7 @@
 Torques, pressures and forces inside the servovalve are not measured. A filter that lets through less and pilot gains
 that are larger by as much are the same plant to every sensor; so are stronger springs behind a stronger motor. Slopes
 by differences do not show it, as each parameter shifts a hundred small stops of the spool; so along these directions
-slopes are nought by construction, where a trial confirms it.
+slopes are set to zero, where a trial replay confirms it.
 """
 from __future__ import annotations
 

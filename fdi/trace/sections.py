@@ -107,7 +107,7 @@ def _is_jump(com: Floats, row: int) -> bool:
 
 
 def _merge_short_parts(parts: list[Section], shortest: int) -> list[Section]:
-    """Scraps between lines go to the neighbour before; a ramp that only bends is a slow curve, hence dynamic."""
+    """Scraps between lines go to the neighbour before; a ramp that only bends is a slow curve: dynamic."""
     out: list[Section] = []
     for part in parts:
         scrap = part.kind == "dynamic" and part.stop - part.start < shortest // 10

@@ -210,7 +210,7 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
     A word is "healthy", "filter_clogging=0.1,0.2" or "filter_clogging=0.17/spool_friction=45".
 
     Raises:
-        InputError: a word that is none of these.
+        InputError: another word.
     """
     blocks: list[dict[str, Any]] = []
     for word in words:

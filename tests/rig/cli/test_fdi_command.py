@@ -146,7 +146,7 @@ def test_what_it_cannot_use_is_said_in_a_line(folder: Path, words: tuple[str, ..
 
 
 def test_a_unit_without_leakage_is_judged_and_not_by_the_bands_of_another(folder: Path) -> None:
-    """What the model says is nought has no logarithm; and shipped bands are of the nominal unit."""
+    """A parameter that is zero in the model has no logarithm; the shipped bands are those of the nominal unit."""
     said = rig("fdi", folder / "healthy.csv", "--set", "jack.leakage=0", "--json")
     assert said.status in (0, 1) and said.json["refined"]["kintas"]["low"] == 0.0, said.err
     said = rig("fdi", folder / "healthy.csv", "--set", "valve.flow_gain=0.24", "--json")
