@@ -122,7 +122,9 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
     """
     if port not in Ports._fields:
         raise ValueError(f"no port {port!r}; there are {', '.join(Ports._fields)}")
-    free = () if disturbance else group._fields if fitted is None else tuple(fitted)
+    free = group._fields if fitted is None else tuple(fitted)
+    if disturbance:
+        free = ()
     if not set(free) <= set(group._fields):
         raise ValueError(f"fitted are fields of {group.__name__} ({', '.join(group._fields)}), not {', '.join(free)}")
 

@@ -14,7 +14,7 @@ RECORDED_PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap
 def collect_provenance(**given: object) -> dict[str, str]:
     """Collect host, time, package versions and state of the checkout; `given` adds seed, bus, pace, model.
 
-    >>> provenance(seed=1)["seed"]
+    >>> collect_provenance(seed=1)["seed"]
     '1'
     """
     return {

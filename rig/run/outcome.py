@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdi.output import write_text
+from fdi.report.json import to_plain
 from plant.segments import Array
 from rig.run.history import History
 from rig.run.job import Job
@@ -70,9 +70,9 @@ class Outcome:
     def to_json(self) -> dict[str, Any]:
         """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
-                "checks": [_replace_nan(check._asdict()) for check in self.checks],
+                "checks": [to_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
-                "events": [_replace_nan(event._asdict()) for event in self.events],
+                "events": [to_plain(event._asdict()) for event in self.events],
                 "run": self.job.settings(), "fdi": self.fdi}
 
     def save(self) -> None:
@@ -94,7 +94,3 @@ def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
         return dict.fromkeys(("p50", "p99", "p99_9", "max"))
     p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
     return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
-
-
-def _replace_nan(row: dict[str, Any]) -> dict[str, Any]:
-    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
