@@ -78,10 +78,13 @@ class Timing(NamedTuple):
     response: Floats  # NaN: no answer
     work: Floats
     overrun: NDArray[np.bool_]
+    feedback_response: Floats  # NaN: none came; older logs do not have this column
+    valve_response: Floats
+    execution: Floats
 
 
 _NONE = np.empty(0)
-NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool))
+NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool), _NONE, _NONE, _NONE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,8 +321,9 @@ def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64
     if not kept.any():
         return NO_TIMING
     t = (columns["cycle"][kept].astype(int) - zero) * period
-    lateness, response, work, overrun = (columns[name][kept] for name in ("lateness", "response", "work", "overrun"))
-    return Timing(np.round(t, 9), lateness, response, work, overrun)
+    absent = np.full(len(columns["cycle"]), math.nan)
+    measured = {name: columns.get(name, absent)[kept] for name in Timing._fields if name != "t"}
+    return Timing(np.round(t, 9), **measured)
 
 
 # Single columns, shape (n,): missing samples are NaN.

@@ -67,7 +67,13 @@ class Timing:
     overrun: bool = _describe_field("the cycle was skipped or ended after the next one was due")
     lateness: float = _describe_field("SYNC sent this long after it was due", "s")
     response: float = _describe_field("from SYNC to the controller's drive frame; NaN: none came", "s")
-    work: float = _describe_field("time the bench spent in the cycle", "s")
+    work: float = _describe_field("from SYNC to the last of the cycle's answers; NaN: one is missing", "s")
+    feedback_response: float = _describe_field("from SYNC to the plant's feedback frame; NaN: none came", "s",
+                                               default=math.nan)
+    valve_response: float = _describe_field("from SYNC to the plant's valve state; NaN: none came", "s",
+                                            default=math.nan)
+    execution: float = _describe_field("time the rig's own code took in the cycle, without waiting", "s",
+                                       default=math.nan)
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""The signals of all cycles as columns, for the verdict: 80 bytes per cycle, so that an hour fits in memory."""
+"""The signals of all cycles as columns, for the verdict: 104 bytes per cycle, so that an hour fits in memory."""
 from __future__ import annotations
 
 from array import array
@@ -8,7 +8,8 @@ import numpy as np
 from plant.segments import Array
 from rig.recorder import Signals, Timing
 
-_FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response")
+_FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response",
+           "feedback_response", "valve_response", "execution")
 
 
 class History:
@@ -23,7 +24,8 @@ class History:
     def add(self, row: Signals, timing: Timing) -> None:
         """Append one cycle."""
         self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
-                              timing.lateness, timing.response))
+                              timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
+                              timing.execution))
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""

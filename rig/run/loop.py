@@ -63,6 +63,7 @@ class CycleLoop:
         lateness = self._wait_until_due()
         closed = self._close()
         master, k = self._master, self.k
+        began = self._wall.now()
         row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
                       step.load, step.control, 0, 0)
         timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
@@ -71,6 +72,7 @@ class CycleLoop:
         self._command(codec.pack_command(step.demand, step.control, k))
         self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
         master.send(codec.SYNC, b"")
+        timing.execution = (self._wall.now() - began) * 1e-9
         if not self._realtime:
             self._wire.wait_for_answers(self._t_ns, lambda: self._seen == _ALL)
             self._send_held(self._t_ns + self._period)
@@ -119,12 +121,16 @@ class CycleLoop:
         if self._open is not None and not self._seen & _XJ and len(frame.data) == 8:
             row = self._open[1]
             row.xj, row.p12 = codec.unpack_feedback(frame.data)
+            self._open[2].feedback_response = self._since_sync(frame)
             self._answered(_XJ, frame)
 
     def _valve(self, frame: Frame) -> None:
         if self._open is not None and len(frame.data) == 8:
-            row, state = self._open[1], codec.unpack_valve_state(frame.data)
+            _, row, timing = self._open
+            state = codec.unpack_valve_state(frame.data)
             if state.cycle == row.cycle & 0xFFFF:
+                if not self._seen & _XS:
+                    timing.valve_response = self._since_sync(frame)
                 row.xs, row.flags = state.spool, state.flags
                 self._answered(_XS, frame)
 

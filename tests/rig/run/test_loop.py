@@ -250,4 +250,6 @@ def test_response_and_work_are_measured_from_sync_to_reception() -> None:
     one, book = loop(bench)
     run(one, 4)
     assert [t.response for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
-    assert [t.work for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
+    for column in ("work", "feedback_response", "valve_response"):
+        assert [getattr(t, column) for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
+    assert all(t.execution > 0 for t in book.timings)
