@@ -10,7 +10,6 @@ from typing import Any
 
 import canopen
 from canopen.emcy import EmcyError
-from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from dbc import EDS
@@ -19,6 +18,7 @@ from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from rig.device.nmt import NmtState
 from rig.network import codec
 from rig.network.frame import Frame
+from rig.network.sdo_client import CheckedSdoClient
 from rig.network.wire import Wire
 from rig.nodes import firmware
 from rig.nodes.emulator import SCENARIO
@@ -37,23 +37,11 @@ class BusError(RigError):
     """A node does not answer, or refuses a request."""
 
 
-class _Sdo(SdoClient):
-    """The library's SDO client; while it waits, the wire delivers frames."""
-
-    def read_response(self) -> Any:
-        network: Any = self.network
-        wire: Wire = network.wire
-        wire.wait(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
-        if self.responses.empty():
-            raise SdoCommunicationError("No SDO response received")
-        return super().read_response()
-
-
 class _Node(canopen.RemoteNode):
-    """The library's remote node with that client."""
+    """The library's remote node with an SDO client that lets the wire deliver frames while it waits."""
 
-    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> SdoClient:
-        client = _Sdo(rx_cobid, tx_cobid, self.object_dictionary)
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> CheckedSdoClient:
+        client = CheckedSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
         self.sdo_channels.append(client)
         return client
 

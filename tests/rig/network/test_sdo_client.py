@@ -1,0 +1,172 @@
+"""The SDO client opposite a server that answers as a script says: every wrong confirmation ends in one clear line."""
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+
+import pytest
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from rig.network.clock import VirtualClock
+from rig.network.frame import Frame, Send
+from rig.network.master import PLANT, BusError, Master
+from rig.network.sdo_client import CheckedSdoClient
+from rig.network.wire import EmbeddedWire
+
+TYPE = bytes.fromhex("4300100000000000")  # of 0x1000
+Script = Sequence[str | None]
+
+
+class Server:
+    """Answers the requests of node 3 one after the other from a list of frames in hexadecimal; None: no answer."""
+
+    def __init__(self, send: Send, script: Script) -> None:
+        self._send, self._script = send, list(script)
+        self.requests: list[str] = []
+
+    def receive(self, frame: Frame) -> None:
+        if frame.cob_id != 0x603:
+            return
+        self.requests.append(frame.data.hex())
+        answer = self._script.pop(0) if self._script else None
+        if answer is not None:
+            self._send(0x583, bytes.fromhex(answer))
+
+    def tick(self, t_ns: int) -> None:
+        """No timers."""
+
+
+def client(*script: str | None) -> tuple[CheckedSdoClient, Server]:
+    servers: list[Server] = []
+
+    def make(send: Send) -> Server:
+        servers.append(Server(send, script))
+        return servers[0]
+
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    sdo = master.network.nodes[PLANT].sdo
+    assert isinstance(sdo, CheckedSdoClient)
+    return sdo, servers[0]
+
+
+def flush(sdo: CheckedSdoClient) -> None:
+    """Deliver what the client sent last."""
+    sdo.network.wire.wait(lambda: False, 0.0)
+
+
+def upload(sdo: CheckedSdoClient) -> bytes:
+    return sdo.upload(0x1000, 0)
+
+
+def upload_name(sdo: CheckedSdoClient) -> bytes:
+    return sdo.upload(0x1008, 0)
+
+
+def download(sdo: CheckedSdoClient) -> None:
+    sdo.download(0x1017, 0, b"\x64\0")
+
+
+def download_scenario(sdo: CheckedSdoClient) -> None:
+    sdo.download(0x2210, 0, bytes(9))
+
+
+@pytest.mark.parametrize(("transfer", "script", "line", "code"), [
+    (upload, ["4301100000000000"], "the node answered for object 0x1001 sub 0, asked was 0x1000 sub 0", 0x05040001),
+    (upload, ["4300100100000000"], "the node answered for object 0x1000 sub 1, asked was 0x1000 sub 0", 0x05040001),
+    (upload, ["8001100000000206"], "the node aborted object 0x1001 sub 0, asked was 0x1000 sub 0", 0x05040001),
+    (upload, ["6000100000000000"], r"command specifier 3 \(0x60\), expected 2", 0x05040001),
+    (upload, ["c200100000000000"], r"command specifier 6 \(0xC2\), expected 2", 0x05040001),
+    (upload, [None], "No SDO response received", 0x05040000),
+    (download, ["6017100100000000"], "answered for object 0x1017 sub 1, asked was 0x1017 sub 0", 0x05040001),
+    (download, ["6018100000000000"], "answered for object 0x1018 sub 0, asked was 0x1017 sub 0", 0x05040001),
+    (download, ["4317100000000000"], r"command specifier 2 \(0x43\), expected 3", 0x05040001),
+    (download, ["a017100000000000"], r"command specifier 5 \(0xA0\), expected 3", 0x05040001),
+    (upload_name, ["4108100009000000", "1061626364656667"], "wrong toggle bit", 0x05030000),
+    (upload_name, ["4108100009000000", "4161626364656667"], "command specifier 2", 0x05040001),
+    (upload_name, ["4108100005000000", "0061626364656667"], "more than the 5 bytes announced", 0x06070010),
+    (download_scenario, ["6010220000000000", "3000000000000000"], "wrong toggle bit", 0x05030000),
+    (download_scenario, ["6010220000000000", "2000000000000000", "2000000000000000"], "wrong toggle bit", 0x05030000),
+    (download_scenario, ["6010220000000000", "6010220000000000"], "command specifier 3", 0x05040001),
+])  # fmt: skip
+def test_wrong_confirmation_ends_the_transfer(
+    transfer: Callable[[CheckedSdoClient], object], script: Script, line: str, code: int
+) -> None:
+    sdo, server = client(*script)
+    with pytest.raises(SdoCommunicationError, match=line) as caught:
+        transfer(sdo)
+    assert "\n" not in str(caught.value)
+    flush(sdo)
+    last = bytes.fromhex(server.requests[-1])
+    assert (last[0], struct.unpack_from("<I", last, 4)[0]) == (0x80, code)
+    assert last[1:4].hex() == server.requests[0][2:8]  # the abort names the object
+    assert len(server.requests) == len(script) + 1  # the abort, and nothing after it
+
+
+@pytest.mark.parametrize(("transfer", "script", "line"), [
+    (upload, ["4b00100000000000"], "the node sent 2 bytes, the object has 4"),
+    (upload, ["4100100006000000", "0361626364656600"], "the node sent 6 bytes, the object has 4"),
+    (upload_name, ["4108100009000000", "0161626364656667"], "7 bytes came, 9 were announced"),
+])  # fmt: skip
+def test_wrong_length_of_a_finished_upload(
+    transfer: Callable[[CheckedSdoClient], object], script: Script, line: str
+) -> None:
+    sdo, _ = client(*script)
+    with pytest.raises(SdoCommunicationError, match=line):
+        transfer(sdo)
+
+
+def test_what_is_right_passes() -> None:
+    assert upload(client("4300100092010000")[0]) == bytes.fromhex("92010000")
+    assert upload(client("4200100092010000")[0]) == bytes.fromhex("92010000")  # expedited without a length
+    sdo, server = client("4108100009000000", "0061626364656667", "1b68690000000000")
+    assert upload_name(sdo) == b"abcdefghi"
+    assert [request[:2] for request in server.requests] == ["40", "60", "70"]
+    sdo, server = client("6017100000000000")
+    download(sdo)
+    assert server.requests == ["2b17100064000000"]
+    sdo, server = client("6010220000000000", "2000000000000000", "3000000000000000")
+    download_scenario(sdo)
+    assert [request[:2] for request in server.requests] == ["21", "00", "1b"]
+    sdo, server = client("6010220000000000", "2000000000000000")
+    sdo.download(0x2210, 0, b"")
+    assert [request[:2] for request in server.requests] == ["21", "0f"]
+
+
+def test_an_endless_upload_is_ended() -> None:
+    sdo, server = client("4008100000000000", *["0061626364656667", "1061626364656667"] * 10)
+    sdo.largest_upload = 100
+    with pytest.raises(SdoCommunicationError, match="more than 100 bytes"):
+        upload_name(sdo)
+    flush(sdo)
+    assert server.requests[-1].startswith("80")
+
+
+def test_refusal_by_the_server_keeps_its_code() -> None:
+    with pytest.raises(SdoAbortedError) as caught:
+        upload(client("8000100000000206")[0])
+    assert caught.value.code == 0x06020000
+    sdo, server = client("6010220000000000", "8010220030000906")
+    with pytest.raises(SdoAbortedError):
+        download_scenario(sdo)
+    flush(sdo)
+    assert len(server.requests) == 2  # nothing is sent after an abort
+
+
+def test_response_left_over_from_an_earlier_transfer_is_dropped() -> None:
+    sdo, _ = client("4300100092010000")
+    sdo.on_response(0x583, bytes.fromhex("4301100000000000"), 0.0)
+    assert upload(sdo) == bytes.fromhex("92010000")
+
+
+def test_streams_and_block_transfer_are_not_offered() -> None:
+    sdo, server = client()
+    for options in ({"mode": "wb", "block_transfer": True}, {"block_transfer": True}, {}):
+        with pytest.raises(NotImplementedError):
+            sdo.open(0x2210, 0, **options)
+    assert server.requests == []
+
+
+def test_the_master_names_node_and_object_in_one_line() -> None:
+    master = Master(EmbeddedWire(VirtualClock(), [lambda send: Server(send, ["6011220000000000"])]), lambda: 0)
+    with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210: the node answered for object 0x2211 sub 0"):
+        master.configure(b"12345678", None, 0)
