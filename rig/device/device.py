@@ -4,9 +4,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from rig.device.cob_id import check_switchable, check_sync
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
-from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer, check_consumer_entry
 from rig.device.nmt import Nmt, NmtState
 from rig.device.pdo import Pdos
 from rig.device.sdo import Abort, SdoAbort, SdoServer
@@ -153,7 +154,7 @@ class Device:
 
     def _download(self, index: int, sub: int, data: bytes) -> None:
         value = self.od.decode(index, sub, data)
-        self.pdo.check(index, sub, value)
+        self._check(index, sub, value)
         if index == HISTORY:
             if value != 0:
                 raise SdoAbort(Abort.VALUE)
@@ -163,9 +164,24 @@ class Device:
         self.od.values[index, sub] = value
         self._configure(index)
 
+    def _check(self, index: int, sub: int, value: Value) -> None:
+        """Refuse a value of a communication object that CiA 301 forbids. Raises SdoAbort."""
+        self.pdo.check(index, sub, value)
+        if not isinstance(value, int):
+            return
+        if index == 0x1005:
+            check_sync(value)
+        elif index == 0x1014:
+            check_switchable(self.od.number(0x1014, 0), value)
+        elif index == 0x1016:
+            others = [other for other in self.od.subs(0x1016) if other != sub]
+            check_consumer_entry(value, [self.od.number(0x1016, other) for other in others])
+
     def _configure(self, index: int) -> None:
         """Pass a changed communication object to the service that uses it."""
-        if index == 0x1006:
+        if index == 0x1005:
+            self._gate()
+        elif index == 0x1006:
             self.sync.configure(self.od.number(0x1006, 0))
         elif index == 0x1016:
             self.consumer.configure([self.od.number(0x1016, sub) for sub in self.od.subs(0x1016)])

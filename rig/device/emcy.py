@@ -5,10 +5,10 @@ import struct
 from collections.abc import Callable
 from enum import IntEnum, IntFlag
 
+from rig.device.cob_id import INVALID
 from rig.device.dictionary import Dictionary
 
 _FRAME = struct.Struct("<HB5s")
-_INVALID = 1 << 31  # in 0x1014
 REGISTER, HISTORY, COB_ID = 0x1001, 0x1003, 0x1014
 
 
@@ -94,6 +94,6 @@ class Emcy:
         for bits in self._active.values():
             register |= bits
         self._od.values[REGISTER, 0] = register
-        cob_id = self._od.number(COB_ID, 0, _INVALID)
-        if self._permitted() and not cob_id & _INVALID:
+        cob_id = self._od.number(COB_ID, 0, INVALID)
+        if self._permitted() and not cob_id & INVALID:
             self._send(cob_id & 0x7FF, _FRAME.pack(code, register, info[:5]))

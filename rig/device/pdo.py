@@ -8,13 +8,13 @@ import struct
 from collections.abc import Callable
 
 from plant.errors import InputError
+from rig.device.cob_id import INVALID, check_switchable
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
 from rig.network.frame import Frame, Send
 
 RPDO, TPDO = 0x1400, 0x1800  # communication parameters; the mapping is 0x200 further on
-_INVALID = 1 << 31  # in a PDO's COB-ID
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = (254, 255)
 
@@ -22,10 +22,15 @@ _EVENT_DRIVEN = (254, 255)
 class Mapping:
     """What lies in a PDO, in order: the keys of the objects and the struct that packs them.
 
-    Raises InputError if the dictionary maps what is not there, not mappable, of another length, or beyond 8 bytes.
+    Raises InputError if the dictionary maps what is not there, not mappable, of another length, or beyond 8 bytes, or
+    lets a master change the mapping.
     """
 
     def __init__(self, od: Dictionary, index: int) -> None:
+        writable = [sub for sub in (0, *od.subs(index)) if (index, sub) in od and od.entries[index, sub].writable]
+        if writable:
+            where = f"{index:04X}sub{writable[0]:X}.AccessType"
+            raise InputError(od.path, where, "const: the mapping cannot be changed")
         self.keys: list[tuple[int, int]] = []
         codes = "<"
         for sub in range(1, od.number(index, 0) + 1):
@@ -59,9 +64,11 @@ class Rpdo:
     def configure(self) -> None:
         self.cob_id = _cob_id(self._od, RPDO, self.n)
         self.synchronous = self._od.number(RPDO + self.n - 1, 2) <= _LAST_SYNCHRONOUS
+        if self.cob_id is None:
+            self.forget()
 
     def forget(self) -> None:
-        """Drop what waits for a SYNC: the device left OPERATIONAL."""
+        """Drop what waits for a SYNC: the device left OPERATIONAL, or the PDO was switched off."""
         self._waiting, self.fresh = None, False
 
     def receive(self, frame: Frame) -> None:
@@ -164,12 +171,14 @@ class Pdos:
         return [*self.rpdos.values(), *self.tpdos.values()]
 
     def check(self, index: int, sub: int, value: Value) -> None:
-        """Refuse a communication parameter that means nothing. Raises SdoAbort."""
+        """Refuse a communication parameter that CiA 301 forbids. Raises SdoAbort."""
         if not isinstance(value, int) or not (RPDO <= index < RPDO + 0x200 or TPDO <= index < TPDO + 0x200):
             return
+        if sub == 1:
+            check_switchable(self._od.number(index, 1), value)
+            if not value & INVALID and value & 0x7FF == self._od.number(0x1005, 0, 0x80) & 0x7FF:
+                raise SdoAbort(Abort.VALUE)  # the device consumes SYNC under that identifier
         if sub == 2 and _LAST_SYNCHRONOUS < value < _EVENT_DRIVEN[0]:  # reserved, or by remote frame
-            raise SdoAbort(Abort.VALUE)
-        if sub == 1 and (value & 0x3FFFF800 or (not value & _INVALID and not 0x180 < value & 0x7FF < 0x600)):
             raise SdoAbort(Abort.VALUE)
 
 
@@ -180,4 +189,4 @@ def _numbers(od: Dictionary, base: int) -> list[int]:
 def _cob_id(od: Dictionary, base: int, n: int) -> int | None:
     """COB-ID in use, None while the PDO is switched off (bit 31)."""
     word = od.number(base + n - 1, 1)
-    return None if word & _INVALID else word & 0x7FF
+    return None if word & INVALID else word & 0x7FF

@@ -1,9 +1,12 @@
 """NMT: every transition, what each state lets through, boot-up, heartbeat and error behaviour."""
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from device_bench import Rack
 
+from dbc import EDS
 from rig.device import EmcyCode, NmtCommand, NmtState
 
 PRE, OPERATIONAL, STOPPED = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
@@ -190,3 +193,38 @@ def test_consumer_and_producer_times_by_sdo() -> None:
     assert rack.wait(500) == []
     rack.send(0x603, bytes.fromhex("2b1710000a000000"))
     assert len(rack.wait(20)) == 2
+
+
+def write_entry(rack: Rack, sub: int, entry: int) -> str:
+    """Download to 0x1016; the answer in hexadecimal."""
+    return rack.send(0x603, bytes.fromhex(f"231610{sub:02x}") + entry.to_bytes(4, "little"))[0][1].hex()
+
+
+@pytest.mark.parametrize("entry", [0x018000FA, 0x008000FA, 0x00FF0001, 0x010100FA, 0x80010000])
+def test_consumer_entry_with_reserved_bits_or_a_node_beyond_127_is_refused(entry: int) -> None:
+    rack = Rack()
+    assert write_entry(rack, 1, entry) == "8016100130000906"
+    assert rack.device.read(0x1016, 1) == 0x000100FA
+
+
+@pytest.mark.parametrize("entry", [0x007F00FA, 0x00010000, 0x00000000, 0x000000FA, 0x00800000])
+def test_consumer_entry_within_the_rules_is_accepted(entry: int) -> None:
+    assert write_entry(Rack(), 1, entry).startswith("60")
+
+
+def test_two_consumer_entries_for_one_node_are_refused(tmp_path: Path) -> None:
+    """CiA 301, 7.5.2.19: abort 0x06040043."""
+    text = EDS[3].read_text()
+    head, section, tail = text.partition("[1016sub1]\n")
+    body = tail[:tail.index("[")]
+    text = head + section + body + "[1016sub2]\n" + body.replace("0x000100FA", "0x00000000") + tail[len(body):]
+    text = text.replace("ParameterName=Consumer heartbeat time\nObjectType=0x8\nSubNumber=0x2",
+                        "ParameterName=Consumer heartbeat time\nObjectType=0x8\nSubNumber=0x3")
+    path = tmp_path / "two.eds"
+    path.write_text(text)
+    rack = Rack(eds=path)
+    assert write_entry(rack, 2, 0x00010064) == "8016100243000406"
+    assert write_entry(rack, 2, 0x00010000).startswith("60")  # switched off
+    assert write_entry(rack, 2, 0x00020064).startswith("60")
+    assert write_entry(rack, 1, 0x00010064).startswith("60")  # its own node again, another time
+    assert write_entry(rack, 1, 0x00020064) == "8016100143000406"

@@ -100,6 +100,7 @@ def test_rpdo_can_be_made_asynchronous_moved_and_switched_off() -> None:
     download(rack, 0x1400, 2, 255, 1)
     rack.send(0x182, DRIVE)
     assert rack.device.read(0x2205) == 1
+    download(rack, 0x1400, 1, 0x80000182, 4)
     download(rack, 0x1400, 1, 0x345, 4)
     rack.send(0x182, codec.pack_drive(2e-8, 0, 0))
     rack.send(0x345, codec.pack_drive(3e-8, 0, 0))
@@ -116,13 +117,90 @@ def test_rpdo_can_be_made_asynchronous_moved_and_switched_off() -> None:
     assert rack.device.read(0x2205) == 5
 
 
-@pytest.mark.parametrize(
-    ("sub", "value", "size"), [(2, 241, 1), (2, 252, 1), (1, 0x20000183, 4), (1, 0x701, 4), (1, 0, 4)]
-)
+@pytest.mark.parametrize(("sub", "value", "size"), [(2, 241, 1), (2, 252, 1), (1, 0x20000183, 4), (1, 0xA0000800, 4)])
 def test_meaningless_communication_parameters_are_refused(sub: int, value: int, size: int) -> None:
     rack = running()
     assert download(rack, 0x1800, sub, value, size).hex() == f"800018{sub:02x}30000906"
     assert [cob_id for cob_id, _ in rack.sync()] == [0x183, 0x283]
+
+
+RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
+PERMITTED = (0x081, 0x0FF, 0x100, 0x181, 0x580, 0x600, 0x680, 0x6DF, 0x700)
+
+
+@pytest.mark.parametrize("base", [0x1400, 0x1800])
+def test_restricted_identifiers_are_refused_and_their_neighbours_are_not(base: int) -> None:
+    """CiA 301, table 40, at both ends of each range; and the SYNC that this device consumes."""
+    rack = running()
+    for can_id in (*RESTRICTED, 0x080):
+        assert download(rack, base, 1, 0x80000183, 4)[0] == 0x60
+        assert download(rack, base, 1, can_id, 4).hex() == f"8000{base >> 8:x}0130000906", hex(can_id)
+        assert rack.device.read(base, 1) == 0x80000183
+    for can_id in PERMITTED:
+        assert download(rack, base, 1, 0x80000183, 4)[0] == 0x60
+        assert download(rack, base, 1, can_id, 4)[0] == 0x60, hex(can_id)
+
+
+@pytest.mark.parametrize("base", [0x1400, 0x1800])
+def test_the_identifier_of_a_valid_pdo_is_fixed(base: int) -> None:
+    """CiA 301, 7.5.2.35: it is first made invalid. The same value, or only bit 30, may be written at any time."""
+    rack = running()
+    valid = int(rack.device.read(base, 1))
+    assert download(rack, base, 1, 0x345, 4).hex() == f"8000{base >> 8:x}0122000008"
+    assert rack.device.read(base, 1) == valid
+    assert download(rack, base, 1, valid, 4)[0] == 0x60
+    assert download(rack, base, 1, valid | 1 << 30, 4)[0] == 0x60
+    assert download(rack, base, 1, 0x80000345, 4)[0] == 0x60  # as the canopen library switches a PDO off
+    assert download(rack, base, 1, 0x345, 4)[0] == 0x60
+    assert download(rack, base, 1, valid, 4)[0] == 0x80
+
+
+def test_a_frame_that_waits_for_sync_is_dropped_when_its_pdo_is_switched_off() -> None:
+    rack = running()
+    rack.send(0x182, DRIVE)
+    download(rack, 0x1400, 1, 0x80000182, 4)
+    download(rack, 0x1400, 1, 0x182, 4)
+    rack.sync()
+    assert rack.device.read(0x2205) == 0
+
+
+def writable(tmp_path: Path, *sections: str) -> Rack:
+    """Node 3 with a dictionary in which these constants may be written."""
+    text = EDS[3].read_text()
+    for section in sections:
+        head, found, tail = text.partition(f"[{section}]\n")
+        assert found
+        text = head + found + tail.replace("AccessType=const", "AccessType=rw", 1)
+    path = tmp_path / "writable.eds"
+    path.write_text(text)
+    rack = Rack(eds=path)
+    rack.nmt(NmtCommand.START)
+    return rack
+
+
+def test_identifier_of_emcy_follows_the_same_rules(tmp_path: Path) -> None:
+    rack = writable(tmp_path, "1014")
+    assert download(rack, 0x1014, 0, 0x84, 4).hex() == "8014100022000008"
+    assert download(rack, 0x1014, 0, 0x80000083, 4)[0] == 0x60
+    assert rack.send(0x182, b"") == []
+    assert download(rack, 0x1014, 0, 0x701, 4).hex() == "8014100030000906"
+    assert download(rack, 0x1014, 0, 0x84, 4)[0] == 0x60
+    assert rack.send(0x182, DRIVE) == [(0x084, NO_ERROR)]
+
+
+@pytest.mark.parametrize("value", [0x40000080, 0x20000080, 0x701, 0x0])
+def test_identifier_of_sync_may_not_be_restricted_nor_make_a_producer(tmp_path: Path, value: int) -> None:
+    rack = writable(tmp_path, "1005")
+    assert download(rack, 0x1005, 0, value, 4).hex() == "8005100030000906"
+    assert download(rack, 0x1005, 0, 0x90, 4)[0] == 0x60
+    assert rack.sync() == []
+    assert [cob_id for cob_id, _ in rack.send(0x090)] == [0x183, 0x283]
+
+
+def test_a_mapping_that_a_master_could_change_is_refused(tmp_path: Path) -> None:
+    """The core reads mappings once: it must not confirm a change that has no effect."""
+    with pytest.raises(InputError, match=r"1A00sub1\.AccessType: expected const"):
+        writable(tmp_path, "1A00sub1")
 
 
 def test_short_pdo_is_not_processed_and_says_so_once() -> None:
