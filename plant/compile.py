@@ -7,6 +7,7 @@ so a changed effect is never served by stale code: numba's own cache looks at on
 """
 from __future__ import annotations
 
+import ctypes
 import dis
 import hashlib
 import math
@@ -23,6 +24,40 @@ import numpy as np
 from plant import functions
 
 Function = Any  # a plain function, or numba's dispatcher of one
+
+
+class LibraryFunction:
+    """A function of the C library by its name: compiled code calls it directly, interpreted code through ctypes.
+
+    Compiled code that calls one can be stored on disk, which is not so for a function pointer of ctypes.
+    """
+
+    def __init__(self, name: str, signature: str) -> None:
+        """`signature`: type of the result, then of the arguments, a letter each; for instance "qiqi" for recvmsg.
+
+        i is a 32-bit integer; q is a 64-bit integer, a size or an address.
+        """
+        self.name, self.signature = name, signature
+        self._entry: Any = None
+
+    def __call__(self, *arguments: int) -> int:
+        """Call it from interpreted code."""
+        if self._entry is None:
+            kinds = {"i": ctypes.c_int32, "q": ctypes.c_int64}
+            self._entry = ctypes.CDLL(None)[self.name]
+            self._entry.restype, *self._entry.argtypes = (kinds[letter] for letter in self.signature)
+        return int(self._entry(*arguments))
+
+    def declare(self) -> Any:
+        """The declaration that numba needs."""
+        import numba
+
+        kinds: dict[str, Any] = {"i": numba.types.int32, "q": numba.types.int64}
+        result, *arguments = (kinds[letter] for letter in self.signature)
+        return numba.types.ExternalFunction(self.name, result(*arguments))
+
+    def __repr__(self) -> str:
+        return f"LibraryFunction({self.name!r}, {self.signature!r})"
 
 
 def find_cache_folder() -> Path:
@@ -55,7 +90,7 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     import numba.core.compiler_lock
 
     root = _link_calls(function, ports or {}, lambda f: f)
-    linked = _link_calls(function, ports or {}, lambda f: numba.njit(f, **INLINE_OPTIONS))
+    linked = _link_calls(function, ports or {}, lambda f: numba.njit(f, **INLINE_OPTIONS), LibraryFunction.declare)
     plain = rebind_names(linked.py_func)
     settings: Any = numba.config
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
@@ -73,8 +108,12 @@ INLINE_OPTIONS: Any = {
 }
 
 
-def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function]) -> Function:
-    """Copy the call graph below `function`, names in `ports` replaced by theirs, each copy through `make`."""
+def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
+                declare: Callable[[LibraryFunction], Any] = lambda f: f) -> Function:
+    """Copy the call graph below `function`, names in `ports` replaced by theirs.
+
+    Each copy goes through `make`, each function of the C library through `declare`.
+    """
     made: dict[Function, Function] = {}
 
     def link(f: Function) -> Function:
@@ -83,7 +122,8 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
             return f
         if f not in made:
             calls = {name: link(ports.get(name, g)) for name, g in _find_calls(f).items()}
-            made[f] = make(rebind_names(f, **calls, **_copy_libraries(f, link)))
+            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, LibraryFunction)}
+            made[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
         return made[f]
 
     return link(function)

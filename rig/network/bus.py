@@ -86,9 +86,9 @@ def choose_bus(spec: str = "auto") -> tuple[str, str]:
         unasked = f"; {', '.join(live)} up, but not taken unasked" if live else ""
         return "embedded", f"embedded bus: no --bus and no {BUS_VARIABLE}{unasked}"
     where, taken = (BUS_VARIABLE, configured) if spec == "auto" else ("--bus", spec)
-    kind, channel = _parse_spec(taken, where)
+    kind, channel = parse_spec(taken, where)
     if kind == "socketcan":
-        _require_interface(channel)
+        require_interface(channel)
     return taken, f"{taken}, as {BUS_VARIABLE} says" if where == BUS_VARIABLE else f"{taken}, as asked"
 
 
@@ -98,11 +98,11 @@ def open_can(spec: str) -> can.BusABC:
 
     Raises InputError for a bad spec, RigError if the bus cannot be opened.
     """
-    kind, channel = _parse_spec(spec, "--bus")
+    kind, channel = parse_spec(spec, "--bus")
     if kind == "embedded":
         raise InputError("--bus", spec, "a bus between programs, such as udp_multicast or socketcan:vcan0")
     if kind == "socketcan":
-        _require_interface(channel)
+        require_interface(channel)
     try:
         if kind == "virtual":
             return can.Bus(interface="virtual", channel=channel)
@@ -139,14 +139,15 @@ def explain_socketcan_problem(interface: str) -> str:
     return ""
 
 
-def _require_interface(interface: str) -> None:
+def require_interface(interface: str) -> None:
+    """Raise RigError unless this kernel CAN interface can be used."""
     problem = explain_socketcan_problem(interface)
     if problem:
         raise RigError(f"socketcan:{interface}: {problem}")
 
 
-def _parse_spec(spec: str, where: str) -> tuple[str, str]:
-    """Kind and channel of a spec, defaults filled in. Raises InputError."""
+def parse_spec(spec: str, where: str) -> tuple[str, str]:
+    """Kind and channel of a bus spec, defaults filled in. Raises InputError, which names `where` the spec stood."""
     kind, _, channel = spec.partition(":")
     if kind == "embedded" and not channel:
         return kind, ""

@@ -4,20 +4,19 @@ The datagrams are those of python-can's `udp_multicast`. Its own bus listens on 
 route, needs one to exist at all, and hears its own frames; here the group is joined on 127.0.0.1, sent to from there
 with a TTL of 0, and a bus does not hear itself, as on a real one. All nodes hear all frames in one order, as on a real
 one too: the kernel hands a datagram to one socket after the other, and a node that heard it early could answer before
-the others have it. A lock between the processes keeps the next frame back until this one is everywhere.
+the others have it. The turn to send (turn.py) keeps the next frame back until this one is everywhere.
 """
 from __future__ import annotations
 
-import fcntl
 import select
 import socket
 import struct
-import tempfile
-from pathlib import Path
-from typing import IO
 
 import can
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
+
+from plant.errors import RigError
+from rig.network.turn import Turn
 
 PORT = 43113  # python-can's
 _LOOPBACK = socket.inet_aton("127.0.0.1")
@@ -33,23 +32,19 @@ class LoopbackBus(can.BusABC):
         self.channel_info = f"udp_multicast {group}:{port} on the loopback interface"
         self.overflows = 0
         self._destination = group, port
-        self._rx = _make_socket()
-        self._tx = _make_socket()
         try:
-            self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-            self._rx.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
-            self._rx.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
-            self._rx.bind((group, port))
-            membership = socket.inet_aton(group) + _LOOPBACK
-            self._rx.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-            self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
-            self._tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            self._tx.bind(("127.0.0.1", 0))
-            self._turn = _open_lock_file(f"eha-rig-{group}-{port}.lock")
+            self._tx = open_sender()
+            self._rx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            try:
+                self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+                self._rx.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+                join_group(self._rx, group, port)
+                self._turn = Turn(group, port)
+            except OSError:
+                self._tx.close()
+                self._rx.close()
+                raise
         except OSError as error:
-            self._rx.close()
-            self._tx.close()
             raise can.CanInitializationError(f"{group}: {error.strerror}") from error
         self._own = self._tx.getsockname()
         super().__init__(channel=group)
@@ -68,11 +63,13 @@ class LoopbackBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         data = pack_message(msg)
         try:
-            fcntl.flock(self._turn, fcntl.LOCK_EX)
+            self._turn.take()
             try:
                 self._tx.sendto(data, self._destination)
             finally:
-                fcntl.flock(self._turn, fcntl.LOCK_UN)
+                self._turn.give()
+        except RigError as error:
+            raise can.CanOperationError(str(error)) from error
         except OSError as error:
             raise can.CanOperationError(f"{self.channel_info}: {error.strerror}") from error
 
@@ -86,15 +83,6 @@ class LoopbackBus(can.BusABC):
         self._turn.close()
 
 
-def _open_lock_file(name: str) -> IO[bytes]:
-    """A file of this name that processes of all users may lock."""
-    path = Path(tempfile.gettempdir()) / name
-    if not path.exists():
-        path.touch()
-        path.chmod(0o444)  # whatever the umask
-    return path.open("rb")
-
-
 def _decode_message(data: bytes) -> can.Message:
     """The frame in a datagram; a datagram without a valid frame becomes an error frame."""
     try:
@@ -103,5 +91,22 @@ def _decode_message(data: bytes) -> can.Message:
         return can.Message(is_error_frame=True)
 
 
-def _make_socket() -> socket.socket:
-    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def open_sender() -> socket.socket:
+    """A socket that sends to groups on this machine only: from 127.0.0.1, with a TTL of 0. Raises OSError."""
+    tx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, _LOOPBACK)
+        tx.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        tx.bind(("127.0.0.1", 0))
+    except OSError:
+        tx.close()
+        raise
+    return tx
+
+
+def join_group(rx: socket.socket, group: str, port: int) -> None:
+    """Let a socket hear the group, on 127.0.0.1 alone. Raises OSError."""
+    rx.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    rx.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+    rx.bind((group, port))
+    rx.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + _LOOPBACK)

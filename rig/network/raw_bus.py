@@ -1,0 +1,644 @@
+"""One CAN frame in, one CAN frame out, as compiled code: SocketCAN and the project's UDP bus, with kernel times.
+
+A loop that must not be late is a plain function that calls `receive_frame` and `send_frame`, compiled as a whole by
+`plant.compile.compile_function`. It runs without the interpreter lock; it makes no Python object and allocates nothing.
+
+    with open_raw_bus("udp_multicast:239.0.0.1", (codec.SYNC, codec.DRIVE)) as bus:   # Python: opens, sets the filters
+        run = compile_function(my_loop)
+        run(bus.port, ...)                                                            # in a thread of its own
+
+    def my_loop(port, ...):
+        status, t_ns, cob_id, length, data = receive_frame(port, deadline_ns)
+        if status == FRAME: ...
+        status = send_frame(port, cob_id, 8, data)
+
+`data` is the payload as one signed 64-bit integer, first byte lowest, bytes beyond `length` zero: `join_words` and
+`join_halves` build it, `split_words` and `split_halves` read it. All times are those of CLOCK_MONOTONIC, ns
+(`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel received the frame. A port belongs to one
+thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN once. The same functions also run
+interpreted, which is slow.
+
+Filters: the kernel drops frames with other COB-IDs (CAN_RAW_FILTER; on UDP a socket filter, which also drops the bus's
+own frames). What still arrives and is not a classical data frame with an 11-bit identifier is counted and dropped.
+"""
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import struct
+import sys
+import time
+from collections.abc import Sequence
+from ctypes import addressof, c_char
+from typing import Any, NamedTuple
+
+import can
+import numpy as np
+from can.interfaces.udp_multicast.utils import pack_message
+from numpy.typing import NDArray
+
+from plant.compile import LibraryFunction
+from plant.errors import InputError, RigError
+from rig.network import udp
+from rig.network.bus import parse_spec, require_interface
+from rig.network.turn import GIVE, TAKE, TURN_LIMIT_NS, Turn
+
+# status of receive_frame
+TIMEOUT, FRAME, WOKEN = 0, 1, 2
+# status of send_frame
+SENT, QUEUE_FULL = 0, 1
+# of both: FAILED, the kernel refused (errno in the port); of send_frame: the turn to send did not come (turn.py)
+FAILED, NO_TURN = -1, -2
+NEVER = 2**63 - 1  # a deadline that does not come
+
+SOCKETCAN, UDP = 0, 1
+KINDS = {"socketcan": SOCKETCAN, "udp_multicast": UDP}
+
+# The port's memory, as words of 8 bytes. First single numbers ..
+_KIND, _RX, _TX, _TURN, _ERROR = range(5)
+_IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
+_LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
+_ID_AT, _LENGTH_AT, _DATA_AT, _TAIL = range(11, 15)  # byte offsets in the datagram to be sent; length of its end
+# .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
+_MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
+_TAKE, _GIVE, _EVENT = 400, 416, 424
+_CONTROL, _ALLOWED, _IN, _OUT = 448, 1024, 2048, 4096
+_CONTROL_SIZE, _IN_SIZE, _OUT_SIZE = 256, 2048, 512
+_CAN_SIZE = 16  # struct can_frame
+
+_SOL_SOCKET, _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE, _SO_ATTACH_FILTER = 1, 35, 40, 33, 26
+_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER = 101, 1, 2
+_DONTWAIT, _POLLIN = 0x40, 1
+_EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
+_TRUNCATED = 0x20  # MSG_TRUNC
+_CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
+_REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
+_RECEIVE_BUFFER = 8 << 20  # bytes asked for
+
+_recvmsg = LibraryFunction("recvmsg", "qiqi")
+_send = LibraryFunction("send", "qiqqi")
+_ppoll = LibraryFunction("ppoll", "iqqqq")
+_read = LibraryFunction("read", "qiqq")
+_semtimedop = LibraryFunction("semtimedop", "iiqqq")
+_clock_gettime = LibraryFunction("clock_gettime", "iiq")
+_clock_nanosleep = LibraryFunction("clock_nanosleep", "iiiqq")
+_errno_location = LibraryFunction("__errno_location", "q")
+_memcpy = LibraryFunction("memcpy", "qqqq")
+
+
+class Port(NamedTuple):
+    """What compiled code knows of a bus: one block of memory, seen as words, as 32-bit integers and as bytes."""
+
+    words: NDArray[np.int64]
+    halves: NDArray[np.int32]
+    octets: NDArray[np.uint8]
+
+
+def _integer(value: Any) -> int:
+    """A number of an array as the integer that compiled code and Python calculate alike with: 64 bits, signed."""
+    return int(np.int64(value))
+
+
+# ---------------------------------------------------------------------------------------- payloads
+
+
+def join_words(low: int, middle: int, high: int) -> int:
+    """Payload of INT32, UNSIGNED16, UNSIGNED16: command, valve state and drive (`codec.SIGNALS`)."""
+    return (low & 0xFFFFFFFF) | (middle & 0xFFFF) << 32 | _sign_word(high & 0xFFFF) << 48
+
+
+def join_halves(low: int, high: int) -> int:
+    """Payload of two INT32: feedback."""
+    return (low & 0xFFFFFFFF) | _sign_half(high) << 32
+
+
+def split_words(data: int) -> tuple[int, int, int]:
+    """INT32, UNSIGNED16, UNSIGNED16 of a payload."""
+    return _sign_half(data), data >> 32 & 0xFFFF, data >> 48 & 0xFFFF
+
+
+def split_halves(data: int) -> tuple[int, int]:
+    """The two INT32 of a payload."""
+    return _sign_half(data), data >> 32
+
+
+def _sign_half(value: int) -> int:
+    """The lower 32 bits as a signed number."""
+    return ((value & 0xFFFFFFFF) ^ 0x80000000) - 0x80000000
+
+
+def _sign_word(value: int) -> int:
+    """The lower 16 bits as a signed number: as the top bits of a payload they decide its sign."""
+    return ((value & 0xFFFF) ^ 0x8000) - 0x8000
+
+
+# ---------------------------------------------------------------------------------------- time
+
+
+def read_clock(port: Port) -> int:
+    """CLOCK_MONOTONIC, ns."""
+    _clock_gettime(_MONOTONIC, port.octets.ctypes.data + _TIME)
+    return _integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
+
+
+def sleep_until(port: Port, t_ns: int) -> None:
+    """Sleep until CLOCK_MONOTONIC says `t_ns`; a signal does not end it."""
+    port.words[_TIME // 8] = t_ns // 1_000_000_000
+    port.words[_TIME // 8 + 1] = t_ns % 1_000_000_000
+    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, port.octets.ctypes.data + _TIME, 0) == _EINTR:
+        pass
+
+
+def _read_wall_clock(port: Port) -> int:
+    _clock_gettime(_REALTIME, port.octets.ctypes.data + _TIME)
+    return _integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
+
+
+# ---------------------------------------------------------------------------------------- receive
+
+
+def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int]:
+    """The next frame; if none is waiting, wait for one until `deadline_ns` (absolute; 0: do not wait, NEVER).
+
+    Returns (status, t_ns, cob_id, length, data): FRAME; or TIMEOUT, WOKEN or FAILED with zeros.
+    """
+    words = port.words
+    while True:
+        size = _take_datagram(port)
+        if size >= 0:
+            kind, cob_id, length, data = _decode(port, size)
+            if kind == _DATA:
+                if not port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1:
+                    continue
+                return FRAME, _find_time(port), cob_id, length, data
+            if kind == _ERROR_FRAME:
+                words[_ERROR_FRAMES] += 1
+            else:
+                words[_DROPPED] += 1
+        elif words[_ERROR] == _EAGAIN:
+            status = _wait_for_input(port, deadline_ns)
+            if status != FRAME:
+                return status, 0, 0, 0, 0
+        elif words[_ERROR] != _EINTR:
+            return FAILED, 0, 0, 0, 0
+
+
+_DATA, _ERROR_FRAME, _OTHER = 0, 1, 2  # what came
+
+
+def _take_datagram(port: Port) -> int:
+    """Its length; -1 with the reason in the port. Notes how many the kernel had to drop before it."""
+    base = port.octets.ctypes.data
+    port.words[(_MESSAGE + 40) // 8] = _CONTROL_SIZE
+    size = _recvmsg(port.words[_RX], base + _MESSAGE, _DONTWAIT)
+    if size < 0:
+        _note_errno(port)
+    return size
+
+
+def _note_errno(port: Port) -> None:
+    base = port.octets.ctypes.data
+    port.words[_ERRNO // 8] = 0
+    _memcpy(base + _ERRNO, _errno_location(), 4)
+    port.words[_ERROR] = port.words[_ERRNO // 8]
+
+
+def _wait_for_input(port: Port, deadline_ns: int) -> int:
+    """FRAME when there is something to read, TIMEOUT, WOKEN or FAILED."""
+    left = deadline_ns
+    if deadline_ns != NEVER:
+        left = deadline_ns - read_clock(port)
+        if left <= 0:
+            return TIMEOUT
+    base = port.octets.ctypes.data
+    port.words[_TIME // 8] = left // 1_000_000_000
+    port.words[_TIME // 8 + 1] = left % 1_000_000_000
+    count = _ppoll(base + _POLL, 2, base + _TIME, 0)
+    if count < 0:
+        _note_errno(port)
+        return FRAME if port.words[_ERROR] == _EINTR else FAILED
+    if port.halves[_POLL // 4 + 1] >> 16:  # revents of the socket
+        return FRAME
+    if count:
+        _read(port.halves[_POLL // 4 + 2], base + _EVENT, 8)
+        return WOKEN
+    return TIMEOUT
+
+
+def _find_time(port: Port) -> int:
+    """When the kernel received the frame, on the monotonic clock; never before the one before it, nor in the future.
+
+    The kernel stamps with the wall clock. Its distance to the monotonic clock is taken now: if somebody has set the
+    clock in between, the limits hold.
+    """
+    words = port.words
+    place, end = _CONTROL, _CONTROL + words[(_MESSAGE + 40) // 8]
+    wall = -1
+    while place + 16 <= end:
+        size = words[place // 8]
+        if port.halves[place // 4 + 2] == _SOL_SOCKET:
+            if port.halves[place // 4 + 3] == _SO_TIMESTAMPNS:
+                wall = words[place // 8 + 2] * 1_000_000_000 + words[place // 8 + 3]
+            elif port.halves[place // 4 + 3] == _SO_RXQ_OVFL:
+                words[_IN_KERNEL] = _integer(port.halves[place // 4 + 4]) & 0xFFFFFFFF
+        if size < 16:
+            break
+        place += (size + 7) // 8 * 8
+    now = read_clock(port)
+    t_ns = now
+    if wall >= 0:
+        t_ns = _integer(wall) - (_read_wall_clock(port) - now)
+    t_ns = max(min(t_ns, now), _integer(words[_LATEST]))
+    words[_LATEST] = t_ns
+    return t_ns
+
+
+def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
+    """(kind, COB-ID, length, payload) of what came."""
+    if port.words[_KIND] == UDP:
+        if port.halves[(_MESSAGE + 48) // 4] & _TRUNCATED:
+            return _ERROR_FRAME, 0, 0, 0
+        return decode_datagram(port.octets, _IN, size)
+    if size != _CAN_SIZE:
+        return _OTHER, 0, 0, 0
+    identifier = _integer(port.halves[_IN // 4]) & 0xFFFFFFFF
+    length = min(_integer(port.octets[_IN + 4]), 8)
+    if identifier & 0x20000000:
+        port.words[_IN_CONTROLLER] += identifier & _CONTROLLER != 0 and port.octets[_IN + 9] & _RX_OVERFLOW != 0
+        return _ERROR_FRAME, 0, 0, 0
+    if identifier > 0x7FF:
+        return _OTHER, 0, 0, 0
+    data = _integer(port.words[(_IN + 8) // 8])
+    if length < 8:
+        data &= (1 << 8 * length) - 1
+    return _DATA, identifier, length, data
+
+
+# ---------------------------------------------------------------------------------------- send
+
+
+def send_frame(port: Port, cob_id: int, length: int, data: int) -> int:
+    """Put a frame on the bus: SENT; QUEUE_FULL, the frame is lost and counted; FAILED or NO_TURN."""
+    if port.words[_KIND] == UDP:
+        return _send_datagram(port, cob_id, length, data)
+    port.halves[_OUT // 4] = cob_id
+    port.halves[_OUT // 4 + 1] = length
+    port.words[_OUT // 8 + 1] = data
+    return _transmit(port, _CAN_SIZE)
+
+
+def _send_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
+    size = encode_datagram(port, cob_id, length, data)
+    base = port.octets.ctypes.data
+    while _semtimedop(port.words[_TURN], base + _TAKE, 2, base + _LIMIT) != 0:
+        _note_errno(port)
+        if port.words[_ERROR] != _EINTR:
+            return NO_TURN
+    status = _transmit(port, size)
+    _semtimedop(port.words[_TURN], base + _GIVE, 1, 0)
+    return status
+
+
+def _transmit(port: Port, size: int) -> int:
+    words = port.words
+    while _send(words[_TX], port.octets.ctypes.data + _OUT, size, _DONTWAIT) < 0:
+        _note_errno(port)
+        if words[_ERROR] == _EAGAIN or words[_ERROR] == _ENOBUFS:
+            words[_UNSENT] += 1
+            return QUEUE_FULL
+        if words[_ERROR] != _EINTR:
+            return FAILED
+    return SENT
+
+
+# ---------------------------------------------------------------------------------------- datagrams of python-can
+
+_NAMES = ("arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "dlc", "data",
+          "timestamp", "channel", "bitrate_switch", "error_state_indicator")
+_ID, _EXTENDED, _REMOTE, _IS_ERROR, _FD, _DLC, _PAYLOAD = range(7)
+_KEYS = np.array([list(name.encode().ljust(24, b"\0")) for name in _NAMES], np.uint8)
+_KEY_LENGTHS = np.array([len(name) for name in _NAMES])
+
+
+def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
+    """Write a frame into the port's buffer, as python-can's udp_multicast packs it; its length in bytes."""
+    octets, words = port.octets, port.words
+    place = _OUT + words[_ID_AT]
+    octets[place], octets[place + 1] = cob_id >> 8, cob_id & 0xFF
+    octets[_OUT + words[_LENGTH_AT]] = length
+    place = _OUT + words[_DATA_AT]
+    octets[place - 1] = length
+    for i in range(length):
+        octets[place + i] = data >> 8 * i & 0xFF
+    tail = _OUT + _OUT_SIZE - words[_TAIL]  # what follows the payload stands at the end of the buffer
+    for i in range(words[_TAIL]):
+        octets[place + length + i] = octets[tail + i]
+    return _integer(place + length + words[_TAIL] - _OUT)
+
+
+def decode_datagram(octets: NDArray[np.uint8], start: int, size: int) -> tuple[int, int, int, int]:
+    """(kind, COB-ID, length, payload) of a msgpack map as python-can's udp_multicast packs it, keys in any order.
+
+    What is no such map, or contradicts itself, counts as an error frame, as in `udp.LoopbackBus`.
+    """
+    end = start + size
+    pairs, place = _read_map_head(octets, start, end)
+    cob_id, dlc, flags = -1, -1, 0
+    payload, length = 0, 0
+    for _ in range(pairs):
+        key, place = _read_key(octets, place, end)
+        kind, value, span, place = _read_value(octets, place, end)
+        if place < 0 or key < 0:
+            return _ERROR_FRAME, 0, 0, 0
+        if key == _PAYLOAD:
+            if kind != _BYTES and kind != _NOTHING:
+                return _ERROR_FRAME, 0, 0, 0
+            payload, length = value, span
+        elif key == _ID:
+            if kind != _NUMBER:
+                return _ERROR_FRAME, 0, 0, 0
+            cob_id = value
+        elif key == _DLC:
+            if kind == _NUMBER:
+                dlc = value
+            elif kind != _NOTHING:
+                return _ERROR_FRAME, 0, 0, 0
+        elif key <= _FD and value:
+            flags |= 1 << key
+    if pairs < 0 or place != end:
+        return _ERROR_FRAME, 0, 0, 0
+    if flags & 1 << _IS_ERROR:
+        return _ERROR_FRAME, 0, 0, 0
+    if dlc < 0:
+        dlc = length
+    if flags:
+        return _OTHER, 0, 0, 0
+    if cob_id < 0 or cob_id > 0x7FF or length > 8 or dlc != length:
+        return _ERROR_FRAME, 0, 0, 0
+    bits = 0
+    for i in range(length):
+        value = _integer(octets[payload + i])
+        bits |= (value ^ 0x80) - 0x80 << 8 * i if i == 7 else value << 8 * i
+    return _DATA, cob_id, length, bits
+
+
+def _read_map_head(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
+    """(number of pairs, place behind the head); -1 pairs for what is no small map."""
+    if place >= end or octets[place] & 0xF0 != 0x80:
+        return -1, place
+    return _integer(octets[place] & 0x0F), place + 1
+
+
+def _read_key(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
+    """(index in `_NAMES`, place behind the key); -1 for what is no such text."""
+    if place < 0 or place >= end or octets[place] & 0xE0 != 0xA0:
+        return -1, -1
+    length = _integer(octets[place] & 0x1F)
+    place += 1
+    if place + length > end:
+        return -1, -1
+    for key in range(len(_KEY_LENGTHS)):
+        if _KEY_LENGTHS[key] == length:
+            i = 0
+            while i < length and octets[place + i] == _KEYS[key, i]:
+                i += 1
+            if i == length:
+                return key, place + length
+    return -1, place + length
+
+
+_NUMBER, _NOTHING, _BYTES, _TEXT = range(4)  # kinds of value
+
+
+def _read_value(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int, int, int]:
+    """(kind, number or place of the bytes, their length, place behind the value); place -1 for any other value."""
+    if place < 0 or place >= end:
+        return 0, 0, 0, -1
+    first = _integer(octets[place])
+    place += 1
+    if first < 0x80:
+        return _NUMBER, first, 0, place
+    if first == 0xC0:
+        return _NOTHING, 0, 0, place
+    if first == 0xC2 or first == 0xC3:
+        return _NUMBER, first - 0xC2, 0, place
+    if 0xCC <= first <= 0xCF:  # unsigned, 1 to 8 bytes
+        value, place = _read_big_endian(octets, place, 1 << first - 0xCC, end)
+        return _NUMBER, value, 0, place
+    if first == 0xCA or first == 0xCB:  # float: a time stamp
+        value, place = _read_big_endian(octets, place, 1 << first - 0xC8, end)
+        return _TEXT, value, 0, place
+    length = -1
+    kind = _TEXT
+    if first & 0xE0 == 0xA0:
+        length = first & 0x1F
+    elif first == 0xC4 or first == 0xC5:
+        length, place = _read_big_endian(octets, place, 1 << first - 0xC4, end)
+        kind = _BYTES
+    elif first == 0xD9 or first == 0xDA:
+        length, place = _read_big_endian(octets, place, 1 << first - 0xD9, end)
+    if place < 0 or length < 0 or place + length > end:
+        return 0, 0, 0, -1
+    return kind, place, length, place + length
+
+
+def _read_big_endian(octets: NDArray[np.uint8], place: int, length: int, end: int) -> tuple[int, int]:
+    """(number, place behind it)."""
+    value = 0
+    if place + length > end:
+        return value, -1
+    for i in range(length):
+        value = value << 8 | _integer(octets[place + i])
+    return value, place + length
+
+
+# ---------------------------------------------------------------------------------------- opening
+
+
+class RawBus:
+    """A bus for compiled loops; `port` is what they get. Use it as a context, or close it.
+
+    Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, frames that are
+    not classical 11-bit data frames; `unsent`, frames the full transmit queue refused.
+    """
+
+    def __init__(self, spec: str, cob_ids: Sequence[int] | None = None) -> None:
+        """`cob_ids`: those to be received, all by default.
+
+        Raises:
+            InputError: a bus of another kind.
+            RigError: the bus cannot be opened.
+        """
+        kind, channel = parse_spec(spec, "--bus")
+        if kind not in KINDS or sys.byteorder != "little":
+            raise InputError("--bus", spec, "socketcan:INTERFACE or udp_multicast[:GROUP] on a little-endian machine")
+        self.spec = spec
+        self.port = _make_port()
+        self._sockets: list[socket.socket] = []
+        self._turn: Turn | None = None
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        try:
+            (self._open_socketcan if kind == "socketcan" else self._open_udp)(channel, cob_ids)
+        except OSError as error:
+            self.close()
+            raise RigError(f"{spec}: {error.strerror}") from error
+        except BaseException:
+            self.close()
+            raise
+        self._prepare(KINDS[kind], cob_ids)
+
+    def __enter__(self) -> RawBus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def error_frames(self) -> int:
+        return int(self.port.words[_ERROR_FRAMES])
+
+    @property
+    def overflows(self) -> int:
+        return int(self.port.words[_IN_KERNEL] + self.port.words[_IN_CONTROLLER])
+
+    @property
+    def dropped(self) -> int:
+        return int(self.port.words[_DROPPED])
+
+    @property
+    def unsent(self) -> int:
+        return int(self.port.words[_UNSENT])
+
+    def wake(self) -> None:
+        """Make the `receive_frame` that waits, or the next one, return WOKEN."""
+        with contextlib.suppress(BlockingIOError):  # full: it will wake anyway
+            os.eventfd_write(self._wake, 1)
+
+    def explain_failure(self, status: int) -> RigError:
+        """The error behind the status FAILED or NO_TURN that the last call returned."""
+        number = int(self.port.words[_ERROR])
+        if status == NO_TURN and self._turn is not None:
+            return self._turn.explain_failure(number)
+        return RigError(f"{self.spec}: {os.strerror(number)}")
+
+    def close(self) -> None:
+        """Give the bus back. No thread may be using the port any more."""
+        for each in self._sockets:
+            each.close()
+        if self._turn is not None:
+            self._turn.close()
+        if self._wake >= 0:
+            os.close(self._wake)
+        self._sockets, self._turn, self._wake = [], None, -1
+
+    def _open_socketcan(self, channel: str, cob_ids: Sequence[int] | None) -> None:
+        require_interface(channel)
+        raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self._sockets.append(raw)
+        if cob_ids is not None:
+            exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
+            filters = b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids)
+            raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, filters)
+        else:
+            raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", 0x1FFFFFFF))
+        set_receive_options(raw)
+        raw.bind((channel,))
+        self.port.words[_RX] = self.port.words[_TX] = raw.fileno()
+
+    def _open_udp(self, group: str, cob_ids: Sequence[int] | None) -> None:
+        tx = udp.open_sender()
+        self._sockets.append(tx)
+        rx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sockets.append(rx)
+        attach_filter(rx, tx.getsockname()[1], cob_ids)
+        set_receive_options(rx)
+        udp.join_group(rx, group, udp.PORT)
+        tx.connect((group, udp.PORT))
+        self._turn = Turn(group, udp.PORT)
+        self.port.words[_RX], self.port.words[_TX] = rx.fileno(), tx.fileno()
+        self.port.words[_TURN] = self._turn.identifier
+        _prepare_datagram(self.port)
+
+    def _prepare(self, kind: int, cob_ids: Sequence[int] | None) -> None:
+        """Fill in what is the same for both kinds of bus."""
+        words, halves, octets = self.port
+        words[_KIND], words[_LATEST] = kind, time.monotonic_ns()
+        halves[_POLL // 4: _POLL // 4 + 4] = words[_RX], _POLLIN, self._wake, _POLLIN
+        allowed = np.zeros(0x800, np.uint8)
+        allowed[slice(None) if cob_ids is None else list(cob_ids)] = 1
+        octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
+
+
+def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None) -> RawBus:
+    """Open `socketcan:INTERFACE` or `udp_multicast[:GROUP]` for compiled loops; see `RawBus`."""
+    return RawBus(spec, cob_ids)
+
+
+def can_open(spec: str) -> bool:
+    """Whether compiled loops can use this bus; the others are for python-can, in soft real time."""
+    return spec.partition(":")[0] in KINDS and sys.byteorder == "little" and sys.platform == "linux"
+
+
+def set_receive_options(raw: socket.socket) -> None:
+    """A large receive buffer (beyond the system's limit where the rights allow), the kernel's time and its losses."""
+    try:
+        raw.setsockopt(_SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+    except OSError:
+        raw.setsockopt(_SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    raw.setsockopt(_SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    raw.setsockopt(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
+
+
+def attach_filter(raw: socket.socket, own_port: int, cob_ids: Sequence[int] | None) -> None:
+    """A socket filter (classic BPF): no datagram from `own_port`, and of python-can's layout only these COB-IDs.
+
+    A datagram of another layout passes; it is decoded by whoever reads it.
+    """
+    load_half, load_byte, load_word = 0x28, 0x30, 0x20  # at an absolute place, counted from the UDP header
+    equal, at_least, always, give = 0x15, 0x35, 0x05, 0x06
+    accept, drop = 0xFFFFFFFF, 0
+    program = [(load_half, 0, 0, 0), (equal, 0, 1, own_port), (give, 0, 0, drop)]
+    if cob_ids is not None and len(cob_ids) <= 64:
+        text = [(8, 0x8BA97469), (8 + 20, 0xAE617262), (8 + 31, 0x6E5F6964)]  # map of 11, "ti.."; "arb..", "n_id"
+        for place, word in text:
+            program += [(load_word, 0, 0, place), (equal, 1, 0, word), (give, 0, 0, accept)]
+        program += [(load_byte, 0, 0, 8 + 35),  # the identifier itself, or 0xCC and a byte, or 0xCD and two
+                    (at_least, 0, 6, 0x80),
+                    (equal, 0, 2, 0xCC), (load_byte, 0, 0, 8 + 36), (always, 0, 0, 3),
+                    (equal, 1, 0, 0xCD), (give, 0, 0, accept), (load_half, 0, 0, 8 + 36)]
+        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id), (give, 0, 0, accept))]
+        program.append((give, 0, 0, drop))
+    else:
+        program.append((give, 0, 0, accept))
+    steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))
+    code = (c_char * len(steps)).from_buffer(steps)
+    raw.setsockopt(_SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(program), addressof(code)))
+
+
+def _make_port() -> Port:
+    """The memory, with the addresses that the kernel's structures hold."""
+    words = np.zeros((_OUT + _OUT_SIZE) // 8, np.int64)
+    port = Port(words, words.view(np.int32), words.view(np.uint8))
+    base = words.ctypes.data
+    # struct msghdr: name, its length, vectors, their number, control data, its length, flags
+    words[_MESSAGE // 8: _MESSAGE // 8 + 7] = 0, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
+    words[_VECTOR // 8: _VECTOR // 8 + 2] = base + _IN, _IN_SIZE
+    words[_LIMIT // 8: _LIMIT // 8 + 2] = TURN_LIMIT_NS // 1_000_000_000, TURN_LIMIT_NS % 1_000_000_000
+    for place, operations in ((_TAKE, TAKE), (_GIVE, GIVE)):
+        octets = operations.view(np.uint8)
+        port.octets[place: place + octets.size] = octets
+    return port
+
+
+def _prepare_datagram(port: Port) -> None:
+    """Lay out python-can's datagram of a frame with an identifier of two bytes; `encode_datagram` fills it in."""
+    message = can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8)))
+    data = pack_message(message)
+    identifier, payload = data.index(b"\xcd\x07\xff") + 1, data.index(bytes(message.data))
+    tail = data[payload + 8:]
+    port.words[_ID_AT], port.words[_LENGTH_AT] = identifier, data.index(b"\xa3dlc") + 4
+    port.words[_DATA_AT], port.words[_TAIL] = payload, len(tail)
+    port.octets[_OUT: _OUT + len(data)] = np.frombuffer(data, np.uint8)
+    port.octets[_OUT + _OUT_SIZE - len(tail): _OUT + _OUT_SIZE] = np.frombuffer(tail, np.uint8)
