@@ -33,7 +33,7 @@ def draw_signals(trace: Trace) -> str:
     if calm:
         values["close"] = error
     panels = [panel for panel in PANELS if panel[0] in values and not np.isnan(values[panel[0]]).all()]
-    heights = [1.7] * len(panels) + [0.15 * len(trace.checks) + 0.25] * bool(trace.checks)
+    heights = [1.7] * len(panels) + [0.15 * len(trace.sequence_checks) + 0.25] * bool(trace.sequence_checks)
     with rc_context(STYLE):
         figure, axes = _stack_panels(heights)
         for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
@@ -52,7 +52,7 @@ def draw_signals(trace: Trace) -> str:
                     foot = ax.get_xaxis_transform()
                     ax.text(t0, 0.03, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
-        if trace.checks:
+        if trace.sequence_checks:
             _draw_checks(axes[-1], trace)
         axes[-1].set_xlabel("time from the start of the main phase [s]")
         axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
@@ -153,7 +153,7 @@ def _draw_checks(ax: Axes, trace: Trace) -> None:
     """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
     first, last = float(trace.t[0]), float(trace.t[-1])
     room, span = 0.005 * (last - first), last - first
-    for row, check in enumerate(trace.checks):
+    for row, check in enumerate(trace.sequence_checks):
         t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
         if math.isnan(check.t0) and math.isnan(check.value):
             x, side, colour, name = first + room, "left", RED, f"{check.name}: not measured"
@@ -167,6 +167,6 @@ def _draw_checks(ax: Axes, trace: Trace) -> None:
             else:
                 x, side, colour = t0 + room, "left", "white"
         ax.text(x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True).set_in_layout(False)
-    ax.set_ylim(len(trace.checks) - 0.4, -0.6)
+    ax.set_ylim(len(trace.sequence_checks) - 0.4, -0.6)
     ax.set_yticks([])
     ax.set_ylabel("checks")

@@ -47,7 +47,8 @@ def build_run_report(trace: Trace) -> Report:
         verdict=word, mood=MOODS.get(word, "neutral"),
         sentence=reason or ("Every check passed." if trace.checks else "The trace has no checks."),
         facts=_list_facts(trace), notes=_list_notes(trace),
-        sections=[Section("Checks", _tabulate_checks(trace.checks)),
+        sections=[Section("Checks", _tabulate_checks(trace.sequence_checks)),
+                  Section("Protocol", _tabulate_protocol(trace.protocol_checks)),
                   Section("Signals", [_draw_signals(trace)]),
                   Section("Cycle timing", _show_timing(trace), medium=Medium.PAGE),
                   Section("Events", _tabulate_events(trace.events)),
@@ -59,7 +60,8 @@ def _list_facts(trace: Trace) -> list[tuple[str, str]]:
     main = int((trace.phase == 1).sum())
     facts = [("main phase", f"{main * trace.period:.3f} s, {main} cycles")]
     if trace.checks:
-        facts.append(("checks passed", f"{sum(check.passed for check in trace.checks)} of {len(trace.checks)}"))
+        facts += [(name, f"{sum(check.passed for check in checks)} of {len(checks)}") for name, checks in (
+            ("checks passed", trace.sequence_checks), ("protocol checks passed", trace.protocol_checks)) if checks]
     named = ((name, trace.provenance.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host"))
     return [*facts, *((name, text) for name, text in named if text)]
 
@@ -104,6 +106,19 @@ def _tabulate_checks(checks: tuple[Check, ...]) -> list[Item]:
     if any(check.detail for check in checks):
         columns.append(Column("remark"))
         rows = [[*row, Cell(check.detail, "muted")] for row, check in zip(rows, checks, strict=True)]
+    return [Table(columns, rows)]
+
+
+def _tabulate_protocol(checks: tuple[Check, ...]) -> list[Item]:
+    """The protocol checks, which have no window: the whole run is judged."""
+    if not checks:
+        return []
+    columns = [Column("protocol check"), Column(""), Column("measured", align="right"),
+               Column("limits", align="right"), Column("unit"), Column("remark", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = [
+        [check.name, Cell("pass", "good") if check.passed else Cell("FAIL", "bad"),
+         Cell(_format_value(check), is_strong=True), format_limits(check.low, check.high),
+         "" if check.unit == "1" else check.unit, Cell(check.detail, "muted")] for check in checks]
     return [Table(columns, rows)]
 
 

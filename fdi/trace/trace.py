@@ -69,6 +69,11 @@ class Check(NamedTuple):
     t1: float  # s
     detail: str
 
+    @property
+    def is_protocol(self) -> bool:
+        """Whether it is one of the protocol checks, which every run makes."""
+        return self.kind == "protocol"
+
 
 class Timing(NamedTuple):
     """When each cycle ran: columns of shape (cycles,), wall-clock seconds."""
@@ -123,6 +128,16 @@ class Trace:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @property
+    def sequence_checks(self) -> tuple[Check, ...]:
+        """The checks of the sequence, each over a window of the run."""
+        return tuple(check for check in self.checks if not check.is_protocol)
+
+    @property
+    def protocol_checks(self) -> tuple[Check, ...]:
+        """The checks that every run makes of the controller's behaviour on the bus."""
+        return tuple(check for check in self.checks if check.is_protocol)
 
     @classmethod
     def read(cls, path: str | Path, *, all: bool = False) -> Trace:

@@ -70,6 +70,7 @@ class Master:
         self.on_state: Callable[[int, int], None] = lambda node, state: None
         self.on_lost: Callable[[int], None] = lambda node: None
         self.on_back: Callable[[int], None] = lambda node: None
+        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
         self.on_rival: Callable[[int], None] = lambda cob_id: None
         self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
         self.silent = False  # a fault: no heartbeat of ours
@@ -120,7 +121,10 @@ class Master:
         if self._services.get(frame.cob_id) != len(frame.data):
             return
         if frame.cob_id in self._watch.cob_ids:
-            self._watch.receive(Frame(self.wire.clock.now(), frame.cob_id, frame.data))
+            now = self.wire.clock.now()
+            self._watch.receive(Frame(now, frame.cob_id, frame.data))
+            if frame.data[0] != NmtState.INITIALISING:  # not a boot-up
+                self.on_heartbeat(frame.cob_id - 0x700, frame.t_ns if self._stamped else now)
         self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 
     def tick(self) -> None:
@@ -188,6 +192,14 @@ class Master:
         """Send an NMT command to all nodes."""
         self._state = state
         self.network.nmt.send_command(specifier)
+
+    def read_gains(self) -> Gains | None:
+        """The gains of the controller (object 0x2110); None if it does not have them."""
+        sdo = self._nodes[CONTROLLER].sdo
+        try:
+            return Gains(*(float(sdo[GAINS][sub].raw) for sub in range(1, len(Gains._fields) + 1)))
+        except (SdoAbortedError, SdoCommunicationError, KeyError):
+            return None
 
     def errors(self) -> list[int]:
         """Nodes whose last EMCY has an error register."""

@@ -1,4 +1,4 @@
-"""The signals of all cycles as columns, for the verdict: 104 bytes per cycle, so that an hour fits in memory."""
+"""The signals of all cycles as columns, for the verdict: 120 bytes per cycle, so that an hour fits in memory."""
 from __future__ import annotations
 
 from array import array
@@ -9,7 +9,7 @@ from plant.segments import Array
 from rig.recorder import Signals, Timing
 
 _FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response",
-           "feedback_response", "valve_response", "execution")
+           "feedback_response", "valve_response", "execution", "control", "status")
 
 
 class History:
@@ -25,7 +25,7 @@ class History:
         """Append one cycle."""
         self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
                               timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
-                              timing.execution))
+                              timing.execution, row.control, row.status))
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""

@@ -22,6 +22,7 @@ from rig.run.participants import open_wire
 from rig.run.priority import name_scheduler, raise_priority, suspend_garbage_collection
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.protocol import judge_protocol
 
 
 def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
@@ -61,12 +62,13 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
 
 
 def judge_run(job: Job, session: Session) -> list[CheckResult]:
-    """Judge the main phase by the checks of the sequence."""
+    """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks."""
     main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    return evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
-                           sequence.fault_starts())
+    results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
+                              sequence.fault_starts())
+    return [*results, *judge_protocol(session.read_protocol_record(), sequence.protocol)]
 
 
 @contextlib.contextmanager

@@ -17,17 +17,31 @@ from plant.segments import RATE
 from rig.device.nmt import NmtState
 from rig.network.clock import WallClock
 from rig.network.codec import Control
-from rig.network.master import HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, Master
-from rig.network.wire import Wire
+from rig.network.master import CONTROLLER, HEARTBEAT, HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, PLANT, Master
+from rig.network.wire import EmbeddedWire, Wire
 from rig.nodes import firmware
-from rig.nodes.scenario import FORCE_RESOLUTION
+from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.loop import CycleInput, CycleLoop
+from rig.run.probe import (
+    AFTER,
+    BEFORE,
+    FIRST_STEPS,
+    LAST_STEPS,
+    PROBES,
+    find_on_time,
+    has_firmware_effects,
+    has_no_answers,
+    list_inputs,
+    make_probe_scenario,
+    read_rows,
+)
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import GuardWatch
+from rig.sequences.protocol import Emergency, ProtocolRecord, Rows
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
@@ -56,11 +70,19 @@ class Session:
         self.loop: CycleLoop | None = None
         self.events: list[SessionEvent] = []
         self.history = History()
+        self._probes: list[History] = []  # played before set-up
+        self._after = History()  # the probe after clean-up
+        self._is_probing = False  # before set-up: nothing that happens there ends the run
+        self._emergencies: list[Emergency] = []
+        self._heartbeats: dict[int, list[int]] = {node: [] for node in (CONTROLLER, PLANT)}  # ns
+        self._gains: firmware.Gains | None = None  # object 0x2110 of the controller, if it has it
+        self._is_embedded = isinstance(wire, EmbeddedWire)
+        self._begun_ns = 0  # when the nodes were started for the run
         self.aborted = ""  # why main ended early
         self.interrupted = False
         self.safe = False  # no current from here on, until clean-up
         self._powered = True  # clean-up may use current
-        self._playing = True  # until the nodes are stopped by us
+        self._playing = False  # from the start of the nodes until the nodes are stopped by us
         self._demand = 0.0  # m, of the last cycle
         self._operational: set[int] = set()
         self._edges = sorted(self._faults.edges)
@@ -69,6 +91,7 @@ class Session:
         self._master.on_frame = recorder.frame
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
+        self._master.on_heartbeat = lambda node, t_ns: self._heartbeats[node].append(t_ns)
         self._master.on_lost = self._handle_silence
         self._master.on_rival = lambda cob_id: self._handle_trouble(
             "bus", f"another node sends 0x{cob_id:03X}, a frame of node {NODE} {NAMES[NODE]}")
@@ -86,24 +109,82 @@ class Session:
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """Record a complete cycle (called by the loop)."""
+        if signals.phase in (BEFORE, AFTER):
+            (self._probes[-1] if signals.phase == BEFORE else self._after).add(signals, timing)
+            return
         self.history.add(signals, timing)
         self.recorder.cycle(t_ns, signals, timing)
 
     def bring_up(self) -> None:
-        """Reset, configure and start the nodes.
+        """Reset, configure and start the nodes; play the probes first.
 
         Raises:
             BusError: a node does not answer or refuses.
         """
-        job = self.job
         self.log_event("INFO", "phase", "bring-up")
+        if self.job.sequence.protocol.probe:
+            self._play_probes()
+        self._start_nodes(self.scenario)
+        self.loop = self._make_loop(self._faults)
+        for times in self._heartbeats.values():
+            times.clear()
+        self._begun_ns, self._playing = self._clock.now(), True
+
+    def _start_nodes(self, scenario: Scenario) -> None:
+        """Reset, configure and start the nodes. Raises BusError."""
+        job = self.job
         self._master.reset()
         gains = firmware.read_gains(job.model) if job.controller == "builtin" else None
+        if self._gains is None:
+            self._gains = gains or self._master.read_gains()
         patient = not job.realtime and isinstance(self._clock, WallClock)
-        self._master.configure(self.scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
+        self._master.configure(scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
-        self.loop = CycleLoop(self._master, self._faults, self, job.period_ns, job.realtime)
+
+    def _make_loop(self, faults: Schedule) -> CycleLoop:
+        return CycleLoop(self._master, faults, self, self.job.period_ns, self.job.realtime)
+
+    def _play_probes(self) -> None:
+        """Play the probes before set-up, each after a reset of the nodes. Raises BusError."""
+        scenario = make_probe_scenario(self.scenario)
+        self._is_probing = True
+        for _ in range(PROBES):
+            self._start_nodes(scenario)
+            self._probes.append(History())
+            self.loop = self._make_loop(Schedule(scenario.plan, scenario.model.values))
+            for step in list_inputs(FIRST_STEPS, BEFORE, 0.0):
+                self.loop.cycle(step)
+                if has_no_answers(self._probes[-1]):
+                    break
+            self.loop.finish()
+            self.loop = None
+        self._is_probing = False
+
+    def _play_last_probe(self) -> None:
+        """Play the probe after clean-up, if the controller is still in control."""
+        assert self.loop is not None
+        if self.safe or self.aborted or not self.job.sequence.protocol.probe:
+            return
+        for step in list_inputs(LAST_STEPS, AFTER, self._demand):
+            self.loop.cycle(step)
+
+    def read_protocol_record(self) -> ProtocolRecord:
+        """All that the protocol checks of this run are judged by."""
+        job, model = self.job, self.job.model
+        seconds = job.period_ns * 1e-9
+
+        def read(history: History, faults: Schedule | None = None) -> Rows:
+            return read_rows(history, find_on_time(history, faults, job.realtime, seconds))
+
+        return ProtocolRecord(
+            run=read(self.history, self._faults), probes=[read(probe) for probe in self._probes if len(probe)],
+            after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
+            heartbeats={NAMES[node]: [t_ns * 1e-9 for t_ns in times] for node, times in self._heartbeats.items()},
+            heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9), heartbeat_period=HEARTBEAT * 1e-3,
+            current_limit=model["controller.current_limit"] if self._gains is None else self._gains.current_limit,
+            gains=None if has_firmware_effects(model) else self._gains, realtime=job.realtime,
+            is_response_judged=job.realtime and not self._is_embedded)
 
     def run_phases(self) -> None:
         """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
@@ -114,6 +195,7 @@ class Session:
             try:
                 self._powered = self._restore_nodes()
                 self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
+                self._play_last_probe()
                 self.loop.finish()
             finally:
                 self._playing = False
@@ -170,6 +252,9 @@ class Session:
 
     def _handle_trouble(self, kind: str, what: str) -> None:
         """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""
+        if self._is_probing:
+            self.log_event("WARN", kind, f"{what} (in a probe)")
+            return
         self.log_event("ERROR", kind, what)
         if not self.safe:
             self.safe = True
@@ -178,6 +263,8 @@ class Session:
             self._abort("abort", what)
 
     def _emcy(self, node: int, error: EmcyError) -> None:
+        if self._playing or self._is_probing:
+            self._emergencies.append(Emergency(self.loop.k if self.loop and self._playing else -1, node, error.code))
         if error.code & 0xFF00 == 0:
             left = "an error is gone, others stand" if error.register else "no error any more"
             self.log_event("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
@@ -207,6 +294,6 @@ class Session:
 
     def _main_time(self) -> float:
         """The time now, s of main; negative before main."""
-        if self.loop is None:
+        if self.loop is None or self._is_probing:
             return -self._plan.start / RATE
         return (self.loop.k - self._plan.start) / RATE

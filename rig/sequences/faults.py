@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plant.effects import CATALOGUE
 from plant.errors import InputError
@@ -288,6 +289,16 @@ class Schedule:
             if 0 <= cycle - first < len(hit) and hit[cycle - first]:
                 return action
         return None
+
+    def find_disturbed(self, cycles: int) -> NDArray[np.bool_]:
+        """Of the first `cycles` those in which a fault acts on a cyclic frame, and the one after each."""
+        disturbed = np.zeros(cycles + 1, bool)
+        for first, hit, _ in (layer for layers in self._frames.values() for layer in layers):
+            at = first + np.flatnonzero(np.frombuffer(hit, np.uint8))
+            at = at[at < cycles]
+            disturbed[at] = disturbed[at + 1] = True
+        found: NDArray[np.bool_] = disturbed[:cycles]
+        return found
 
     def is_heartbeat_alive(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) sends its heartbeat."""

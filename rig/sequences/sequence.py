@@ -24,6 +24,7 @@ from rig.sequences.checks import Check, ResponseWithin
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
 from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
+from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.run_data import MAIN
 from rig.sequences.tables import Place
 
@@ -60,6 +61,7 @@ class Sequence:
     guards: tuple[Guard, ...] = ()
     ends: Literal["completed", "safe_state"] = "completed"
     model: ModelChoice = ModelChoice()
+    protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)
     files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV files, by name in source

@@ -152,7 +152,7 @@ def _send_states(rr: Any, stream: rr.RecordingStream, trace: Trace) -> None:
           {text: SECTIONS[kind] for _, kind, text in sections})
     for node in sorted({state.node for state in trace.nmt}):
         _send_lane(rr, stream, f"3 node {node} NMT", [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
-    for number, check in enumerate(trace.checks, 1):
+    for number, check in enumerate(trace.sequence_checks, 1):
         _send_check_lane(rr, stream, number, check, trace)
 
 
@@ -239,7 +239,8 @@ def _build_blueprint(rr: Any, trace: Trace) -> Any:
                                      columns=columns),
                      rrb.TextDocumentView(origin="/log/provenance", name="Provenance"))
     states = rrb.StateTimelineView(origin="/states", name=LANES, time_view=linked)
-    lanes = 5 + len({state.node for state in trace.nmt}) + len(trace.checks)  # 5: three more, a time axis and a title
+    nodes = {state.node for state in trace.nmt}
+    lanes = 5 + len(nodes) + len(trace.sequence_checks)  # 5: three more, a time axis and a title
     share = min(max(LANE_HEIGHT * lanes, LANES_SHARE[0]), LANES_SHARE[1])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*plots[:half]), rrb.Vertical(*plots[half:]),

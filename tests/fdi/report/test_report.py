@@ -115,8 +115,9 @@ def test_an_aborted_run_says_why_and_what_is_missing(aborted: Path) -> None:
 def test_a_real_run_has_a_report(preflight: Path) -> None:
     page = (preflight / "report.html").read_text(encoding="utf-8")
     text = " ".join(_Page(page).text.split())
-    assert text.startswith("PASS · Preflight") and "17 of 17" in text and "missing" not in text.split("Signals")[0]
-    assert page.count('<td class="is-good">pass</td>') == 17
+    assert text.startswith("PASS · Preflight") and "17 of 17" in text and "12 of 12" in text
+    assert "missing samples" not in text.split("Signals")[0]
+    assert page.count('<td class="is-good">pass</td>') == 29
     assert "section main: rest" in text.replace("section", "section ").replace("  ", " ")
 
 

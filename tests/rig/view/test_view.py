@@ -88,9 +88,9 @@ def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[flo
     for node in (2, 3):
         states = lanes.pop(f"3_node_{node}_NMT")
         assert [word for _, word in states] == ["boot-up", "operational"] and states[-1][0] < 0
-    assert len(lanes) == len(trace.checks) == 17
-    for (lane, ((t0, word), (t1, end))), check in zip(sorted(lanes.items()), trace.checks, strict=True):
-        assert lane[:5] == f"5.{trace.checks.index(check) + 1:02}_" and end == ""
+    assert len(lanes) == len(trace.sequence_checks) == 17
+    for (lane, ((t0, word), (t1, end))), check in zip(sorted(lanes.items()), trace.sequence_checks, strict=True):
+        assert lane[:5] == f"5.{trace.sequence_checks.index(check) + 1:02}_" and end == ""
         assert (t0, t1) == pytest.approx((check.t0, check.t1)) and str(word).startswith(f"PASS {check.value:.4g}")
 
 
@@ -101,7 +101,7 @@ def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, lis
     for event, (_, text) in zip(trace.events, events, strict=True):
         assert f"{event.kind}: {event.text}" in str(text)
     texts = [str(text) for _, text in rows["/log/checks"]]
-    assert len(texts) == 17 and all(any(f"PASS {c.name}: {c.value:.4g}" in text for text in texts)
+    assert len(texts) == len(trace.checks) == 29 and all(any(f"PASS {c.name}: {c.value:.4g}" in text for text in texts)
                                     for c in trace.checks)
     assert "- sequence: Preflight" in str(rows["/log/provenance"][0][1])
 

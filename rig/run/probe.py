@@ -1,0 +1,83 @@
+"""The probes: short plays before and after a sequence that show what its own cycles cannot.
+
+In a sequence the control word leaves ACTIVE only where demand and position agree, so a firmware that ignores it sends
+next to no current there either. A probe asks for a position 1 mm away while the control word is not ACTIVE, then steps
+the demand while it is. It is played twice before set-up, each time after a reset, on the healthy plant in its initial
+state: the two must be answered alike. The reset that follows brings plant and controller back to the same state, so
+the rows of the sequence are those of a run without probes. After clean-up the control word leaves ACTIVE once more.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from plant.effects import CATALOGUE
+from plant.model import Model
+from rig.network.codec import Control
+from rig.nodes.scenario import Scenario
+from rig.run.history import History
+from rig.run.loop import CycleInput
+from rig.sequences.faults import Plan, Schedule
+from rig.sequences.protocol import Mask, Rows
+
+BEFORE, AFTER = 3, 4  # phase numbers, beside those of set-up, main and clean-up; the log has their frames only
+PROBES = 2  # before set-up
+DISTANCE = 1e-3  # m: from the position to the demand while the control word is not ACTIVE
+_STEP = 0.5e-3  # m: while it is; far below the current limit
+_MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
+
+
+class Step(NamedTuple):
+    """Some cycles with the same command; `demand` in m from where the ram is meant to be."""
+
+    control: int
+    demand: float
+    cycles: int
+
+
+FIRST_STEPS = (
+    Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
+    Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, _STEP, 3), Step(0, DISTANCE, 8),
+)
+LAST_STEPS = (Step(0, DISTANCE, 8),)
+
+
+def list_inputs(steps: tuple[Step, ...], phase: int, demand: float) -> list[CycleInput]:
+    """The cycles of a probe at the position `demand`, m."""
+    return [CycleInput(phase, demand + step.demand, 0.0, int(step.control)) for step in steps
+            for _ in range(step.cycles)]
+
+
+def make_probe_scenario(scenario: Scenario) -> Scenario:
+    """The plant of a run in its initial state, without faults and loads."""
+    return Scenario(scenario.model, Plan(stop=0), (), scenario.seed)
+
+
+def has_firmware_effects(model: Model) -> bool:
+    """Whether effects act inside the reference firmware, which then does not follow its gains."""
+    acting = (CATALOGUE[name] for name in model.effects)
+    return any(effect.firmware and effect.acts(model.values) for effect in acting)
+
+
+def has_no_answers(probe: History) -> bool:
+    """Whether the last cycles were all without a drive frame."""
+    last = probe.column("cor")[-_MISSED_LIMIT:]
+    return len(last) == _MISSED_LIMIT and bool(np.isnan(last).all())
+
+
+def read_rows(history: History, on_time: Mask) -> Rows:
+    """The rows of a history as the protocol checks see them."""
+    return Rows(on_time=on_time, **{name: history.column(name) for name in Rows._fields if name != "on_time"})
+
+
+def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float) -> Mask:
+    """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came, and no injected fault
+    touched a frame of this cycle or the one before it."""
+    on_time: Mask = ~np.isnan(history.column("xj"))
+    if realtime:
+        late = history.column("lateness") > 0.1 * period
+        on_time &= ~late & ~np.append(late[1:], False)
+    if faults is not None:
+        on_time &= ~faults.find_disturbed(len(on_time))
+    return on_time

@@ -1,0 +1,361 @@
+"""Protocol checks: what every controller must do on the bus, judged in every run whatever the sequence.
+
+They need the rows of the run, the rows of the probes (rig/run/probe.py), heartbeat and EMCY times. Pure functions: no
+bus, no clock. docs/sequences.md lists the checks and their default limits.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite, nan
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.controller import Loop, compute_current
+from plant.errors import InputError
+from plant.segments import RATE, Array, Second
+from rig.device.emcy import EmcyCode
+from rig.network.codec import Control, Flags, Status
+from rig.sequences.check import CheckResult
+
+Mask = NDArray[np.bool_]
+Whole = NDArray[np.int64]
+KIND = "protocol"  # of the check results
+CONTROLLER = 2
+DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lists them
+    2: frozenset({EmcyCode.RESET, EmcyCode.COMMUNICATION, EmcyCode.HEARTBEAT_LOST, EmcyCode.PDO_TOO_SHORT,
+                  EmcyCode.PDO_TOO_LONG, EmcyCode.SYNC_LENGTH, EmcyCode.RPDO_TIMEOUT}),
+    3: frozenset({EmcyCode.RESET, EmcyCode.SOFTWARE, EmcyCode.COMMUNICATION, EmcyCode.HEARTBEAT_LOST,
+                  EmcyCode.PDO_TOO_SHORT, EmcyCode.PDO_TOO_LONG, EmcyCode.SYNC_LENGTH, EmcyCode.RPDO_TIMEOUT}),
+}
+_LEVELS, _READY = int(Control.ACTIVE), int(Status.READY)
+LARGEST_FROZEN_CHANGE = 100e-6  # m: fifty times the noise of the position sensor
+_BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
+_LONGEST_PAUSE = 3.0  # heartbeat periods: then a node counts as silent
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolLimits:
+    """Limits of the protocol checks: the table `protocol` of a sequence.
+
+    status: time in which status word and zero current follow the control word. missing: share of the cycles whose
+    drive frame may be missing, late or of another cycle (default: none in lockstep, 0.001 in real time). response_*:
+    from SYNC to the drive frame, in real time. heartbeat: tolerance of the median heartbeat period. gain: tolerance of
+    the loop's gain, 1. emcy: codes of node 2 allowed beyond the documented ones. probe: whether to run the probes.
+    """
+
+    status: Second = 2e-3
+    missing: Annotated[float | None, "share of the cycles"] = None
+    response_p50: Second = 0.5e-3
+    response_p99: Second = 0.9e-3
+    response_max: Second = 1e-3
+    heartbeat: Second = 0.01
+    gain: Annotated[float, "share"] = 0.1
+    emcy: tuple[int, ...] = ()
+    probe: bool = True
+
+    def __post_init__(self) -> None:
+        for key in ("status", "response_p50", "response_p99", "response_max", "heartbeat"):
+            value = getattr(self, key)
+            _require(0 < value <= 1, key, f"above 0 and at most 1 s, not {value:g}")
+        _require(self.missing is None or 0 <= self.missing <= 1, "missing", "a share of the cycles from 0 to 1")
+        _require(0 < self.gain < 1, "gain", f"a share above 0 and below 1, not {self.gain:g}")
+        _require(all(0 < code <= 0xFFFF for code in self.emcy), "emcy", "EMCY codes from 1 to 0xFFFF")
+
+
+def _require(holds: bool, key: str, expected: str) -> None:
+    if not holds:
+        raise InputError("protocol", key, expected)
+
+
+class Rows(NamedTuple):
+    """Consecutive cycles as columns, SI; NaN: no frame with this cycle's number.
+
+    `on_time`: the bench delivered the cycle and the next one on time and no injected fault touches its frames, so a
+    missing drive frame is the controller's.
+    """
+
+    com: Array
+    xj: Array
+    cor: Array
+    control: Array
+    status: Array
+    flags: Array
+    response: Array
+    on_time: Mask
+
+
+class Emergency(NamedTuple):
+    """An EMCY frame; `cycle` is the row of the run, negative before the first."""
+
+    cycle: int
+    node: int
+    code: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolRecord:
+    """All that the protocol checks are judged by.
+
+    `gains`: those of object 0x2110, if the controller has them and follows them. `is_response_judged`: real time, and
+    the controller is not in the rig's own process. `heartbeats`: times in s, by the name of the node; `heard`: first
+    and last time at which heartbeats could have been received.
+    """
+
+    run: Rows
+    probes: Sequence[Rows] = ()
+    after: Rows | None = None
+    emergencies: Sequence[Emergency] = ()
+    heartbeats: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    heard: tuple[float, float] = (0.0, 0.0)
+    heartbeat_period: Second = 0.1
+    current_limit: float = nan
+    gains: object | None = None
+    realtime: bool = False
+    is_response_judged: bool = False
+
+    @property
+    def stretches(self) -> list[Rows]:
+        """All rows, in stretches of consecutive cycles."""
+        return [*self.probes, self.run, *([self.after] if self.after is not None else [])]
+
+
+def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> list[CheckResult]:
+    """The protocol checks of a run, in the order of the table."""
+    results = [_judge_idle_current(record, limits), _judge_largest_current(record), _judge_status(record, limits),
+               *_judge_drive_frames(record, limits), _judge_frozen(record)]
+    if len(record.probes) > 0:
+        results += _judge_probes(record, limits)
+    if record.is_response_judged:
+        results += _judge_response(record, limits)
+    results += _judge_heartbeats(record, limits)
+    results.append(_judge_emergencies(record, limits))
+    return results
+
+
+def _make_result(name: str, signal: str, value: float, unit: str, low: float = nan, high: float = nan,
+                 detail: str = "") -> CheckResult:
+    slack = 1e-9  # of the limit: a value in mA is a multiple of a count in A
+    passed = isfinite(value) and not (value < low * (1 - slack) or value > high * (1 + slack))  # no NaN limit is passed
+    return CheckResult(name, KIND, signal, value, unit, low, high, passed, nan, nan, detail)
+
+
+def _judge_idle_current(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
+    """Largest current in cycles whose control word, and those of the grace time before it, are not ACTIVE."""
+    grace = round(limits.status * RATE)
+    values = [np.abs(rows.cor[find_idle(rows.control, grace)]) for rows in record.stretches]
+    largest, detail = _find_largest(np.concatenate(values))
+    return _make_result("no current unless ACTIVE", "current", largest * 1e3, "mA", high=0.0, detail=detail)
+
+
+def find_idle(control: Array, grace: int) -> Mask:
+    """Cycles whose control word is not ACTIVE and was not in the `grace` cycles before; none is before the first."""
+    active = control.astype(int) & _LEVELS == _LEVELS
+    recent = active.copy()
+    for back in range(1, min(grace, len(active) - 1) + 1):
+        recent[back:] |= active[:-back]
+    idle: Mask = ~recent
+    return idle
+
+
+def _find_largest(values: Array) -> tuple[float, str]:
+    known = values[~np.isnan(values)]
+    return (float(known.max()), f"{len(known)} cycles") if len(known) else (nan, "no drive frame came")
+
+
+def _judge_largest_current(record: ProtocolRecord) -> CheckResult:
+    largest, detail = _find_largest(np.concatenate([np.abs(rows.cor) for rows in record.stretches]))
+    limit = record.current_limit * 1e3
+    detail = "" if isfinite(largest) else detail
+    return _make_result("current within its limit", "current", largest * 1e3, "mA", high=limit, detail=detail)
+
+
+def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
+    """How old the control word is that the status word confirms, at worst."""
+    faulty = _find_faulty(record)
+    ages = [measure_status_ages(rows, faulty if rows is record.run else None) for rows in record.stretches]
+    oldest = max((int(age.max()) for age in ages if len(age)), default=-1)
+    value = nan if oldest < 0 else oldest * 1e3 / RATE
+    return _make_result("status word follows the control word", "status word", value, "ms", high=limits.status * 1e3,
+                        detail="no drive frame came" if oldest < 0 else "")
+
+
+def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
+    """Cycles since the control word last was as the status word says; for a status that it never was, since the start.
+
+    Cycles without a drive frame are left out. In `faulty` cycles the controller has announced a fault, and a status
+    word without READY and levels is right as well.
+    """
+    control, status = rows.control.astype(int), rows.status.astype(int) & (_LEVELS | _READY)
+    expected = find_expected_status(control)
+    matches = status == expected
+    if faulty is not None:
+        matches |= faulty & (status & _READY == 0) & (status & _LEVELS == 0)
+    answered = ~np.isnan(rows.cor)
+    ages = np.zeros(len(status), int)
+    if not (matches | ~answered).all():
+        last: dict[int, int] = {}
+        for k, (wanted, is_like, said) in enumerate(zip(expected.tolist(), matches.tolist(), status.tolist(),
+                                                        strict=True)):
+            last[wanted] = k
+            ages[k] = 0 if is_like else k - last.get(said, -1)
+    found: Whole = ages[answered]
+    return found
+
+
+def find_expected_status(control: Whole) -> Whole:
+    """The status word of a sound controller: ready, and the levels of the control word, which build on each other."""
+    levels = control & _LEVELS
+    expected: Whole = np.where(levels & (levels + 1) == 0, levels, 0) | _READY
+    return expected
+
+
+def _find_faulty(record: ProtocolRecord) -> Mask:
+    """Cycles of the run in which the controller may be in fault: from its EMCY until it is reset."""
+    control = record.run.control.astype(int)
+    faulty = np.zeros(len(control), bool)
+    resets = np.flatnonzero(control & int(Control.RESET))
+    for emergency in record.emergencies:
+        if emergency.node == CONTROLLER and emergency.code & 0xFF00:
+            later = resets[resets > emergency.cycle]
+            end = int(later[0]) + 1 if len(later) else len(control)
+            faulty[max(0, emergency.cycle - _BEFORE_EMCY):end] = True
+    return faulty
+
+
+def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+    """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle."""
+    allowed = (0.001 if record.realtime else 0.0) if limits.missing is None else limits.missing
+    wrong = missing = cycles = 0
+    for rows in record.stretches:
+        flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
+        is_wrong = rows.on_time & (flags & int(Flags.DRIVE_LATE) != 0)
+        is_missing = rows.on_time & ~is_wrong & (np.isnan(rows.cor) | (flags & int(Flags.DRIVE_MISSING) != 0))
+        wrong, missing, cycles = wrong + int(is_wrong.sum()), missing + int(is_missing.sum()), cycles + int(
+            rows.on_time.sum())
+    for name, count in (("drive frames of another cycle", wrong), ("drive frames missing or late", missing)):
+        value = 100 * count / cycles if cycles else 0.0
+        yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
+
+
+def _judge_frozen(record: ProtocolRecord) -> CheckResult:
+    """How far the position error moved while the current of the closed loop stood still."""
+    change = measure_frozen(record.run)
+    return _make_result("current follows the error", "current", change * 1e6, "um", high=LARGEST_FROZEN_CHANGE * 1e6)
+
+
+def measure_frozen(rows: Rows) -> float:
+    """Largest change of the sensed position error, m, over cycles with one and the same current.
+
+    Only cycles in which control and status word say ACTIVE, and not those at the current limit, that is within 2 % of
+    the largest current of the run.
+    """
+    is_limited = np.abs(rows.cor) >= 0.98 * np.nanmax(np.abs(rows.cor), initial=0.0)
+    closed = (rows.control.astype(int) & rows.status.astype(int) & _LEVELS == _LEVELS) & ~is_limited
+    error = rows.com - rows.xj
+    stays = closed[1:] & closed[:-1] & (rows.cor[1:] == rows.cor[:-1]) & ~np.isnan(error[1:] + error[:-1])
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))
+    ranges = [float(np.ptp(error[first:last + 1])) for first, last in edges.reshape(-1, 2) if last - first > 1]
+    return max(ranges, default=0.0)
+
+
+def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+    """Answer to the demand step of the probe, and whether a reset makes the controller forget."""
+    first = record.probes[0]
+    delay, detail = measure_step_delay(first)
+    yield _make_result("delay of the answer to a step", "current", delay, "ms", high=0.0, detail=detail)
+    if record.gains is not None:
+        gain, detail = measure_gain(first, record.gains)
+        tolerance = 100 * limits.gain
+        yield _make_result("gain against 0x2110", "current", 100 * gain, "%", 100 - tolerance, 100 + tolerance, detail)
+    if len(record.probes) > 1:
+        difference, detail = measure_difference(record.probes)
+        yield _make_result("same answers after a reset", "current", difference * 1e3, "mA", high=0.0, detail=detail)
+
+
+def _find_active(rows: Rows) -> Whole:
+    active: Whole = np.flatnonzero(rows.control.astype(int) & _LEVELS == _LEVELS)
+    return active
+
+
+def measure_step_delay(probe: Rows) -> tuple[float, str]:
+    """Time from the demand step to the first answer that follows it in the same direction, ms, and a remark.
+
+    An answer follows when the current has changed by a fifth of the largest change since the step.
+    """
+    active = _find_active(probe)
+    steps = active[1:][np.diff(probe.com[active]) != 0]
+    if not len(steps):
+        return nan, "the probe ended before its step"
+    k = int(steps[0])
+    change = (probe.cor[k:active[-1] + 1] - probe.cor[k - 1]) * np.sign(probe.com[k] - probe.com[k - 1])
+    if np.isnan(change).any():
+        return nan, "a drive frame is missing at the step"
+    if change.max() <= 0.0:
+        return nan, "the current does not follow the demand"
+    return float(np.flatnonzero(change >= 0.2 * change.max())[0]) * 1e3 / RATE, ""
+
+
+def measure_gain(probe: Rows, gains: object) -> tuple[float, str]:
+    """Current in the ACTIVE cycles of a probe over that of the documented law with these gains, 1, and a remark."""
+    active = _find_active(probe)
+    loop, wanted = Loop(), []
+    for demand, position in zip(probe.com[active], probe.xj[active], strict=True):
+        current, loop = compute_current(loop, float(demand), float(position), gains)
+        wanted.append(current)
+    law, cor = np.array(wanted), probe.cor[active]
+    if np.isnan(law + cor).any():
+        return nan, "frames of the probe are missing"
+    return (float(law @ cor / (law @ law)), "") if law.any() else (nan, "the gains are zero")
+
+
+def measure_difference(probes: Sequence[Rows]) -> tuple[float, str]:
+    """Largest difference of the current between probes that see the same demand and the same plant, A, and a remark."""
+    first, *others = probes
+    largest = 0.0
+    for other in others:
+        if len(other.cor) != len(first.cor) or np.isnan(other.cor - first.cor).any():
+            return nan, "a drive frame of the probes is missing"
+        apart = np.flatnonzero(first.xj != other.xj)  # after the first difference the positions follow the currents
+        same = int(apart[0]) if len(apart) else len(first.cor)
+        if same:
+            largest = max(largest, float(np.abs(other.cor - first.cor)[:same].max()))
+    return largest, ""
+
+
+def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+    """From SYNC to the drive frame, in cycles that the bench delivered on time."""
+    values = np.concatenate([rows.response[rows.on_time] for rows in record.stretches])
+    known = values[~np.isnan(values)] * 1e6
+    measures: dict[str, tuple[Callable[[Array], float], float]] = {
+        "p50": (lambda x: float(np.percentile(x, 50)), limits.response_p50),
+        "p99": (lambda x: float(np.percentile(x, 99)), limits.response_p99),
+        "max": (lambda x: float(x.max()), limits.response_max)}
+    for name, (measure, limit) in measures.items():
+        value, detail = (measure(known), f"{len(known)} cycles") if len(known) else (nan, "no drive frame came")
+        yield _make_result(f"response time, {name}", "drive", value, "us", high=limit * 1e6, detail=detail)
+
+
+def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+    """Median heartbeat period of each node; a run shorter than three periods says nothing about it."""
+    begin, end = record.heard
+    period, tolerance = record.heartbeat_period, limits.heartbeat
+    if end - begin < _LONGEST_PAUSE * period:
+        return
+    for node, times in record.heartbeats.items():
+        gaps = np.diff(np.asarray(times, float))
+        value = 1e3 * float(np.median(gaps)) if len(gaps) else nan
+        detail = "" if len(gaps) else f"{len(times)} heartbeats in {end - begin:.3g} s"
+        low, high = (round(1e3 * (period + sign * tolerance), 6) for sign in (-1, 1))
+        yield _make_result(f"heartbeat period, {node}", "heartbeat", round(value, 6), "ms", low, high, detail)
+
+
+def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
+    """How many EMCY frames carry a code that is not documented for their node."""
+    allowed = {node: codes | (frozenset(limits.emcy) if node == CONTROLLER else frozenset())
+               for node, codes in DOCUMENTED_EMCY.items()}
+    strange = [e for e in record.emergencies if e.code not in allowed.get(e.node, frozenset())]
+    said = ", ".join(dict.fromkeys(f"node {e.node} 0x{e.code:04X}" for e in strange[:5]))
+    return _make_result("undocumented EMCY codes", "EMCY", float(len(strange)), "1", high=0.0, detail=said)

@@ -1,0 +1,97 @@
+"""The protocol checks of every run: each faulty controller fails the check that is meant for it, a sound one none.
+
+The sequence has no checks of its own.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import firmware_variants as variants
+import pytest
+from firmware_variants import Variant
+from short_sequences import job, play
+
+from fdi.report.run_report import build_run_report
+from fdi.trace.trace import Trace
+from rig.run import participants
+from rig.run.outcome import Outcome
+
+HOLD = 'title = "Holds"\nmain = [{ kind = "hold", time = 0.4 }]\n'
+MOVE = """
+title = "Moves"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [
+  { kind = "hold", time = 0.05 }, { kind = "step", to = 4e-3, time = 0.15 }, { kind = "ramp", to = 0.0, time = 0.15 },
+]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.05 }]
+"""
+IDLE, LIMIT, STATUS = "no current unless ACTIVE", "current within its limit", "status word follows the control word"
+NUMBER, MISSING = "drive frames of another cycle", "drive frames missing or late"
+DELAY, GAIN, RESET = "delay of the answer to a step", "gain against 0x2110", "same answers after a reset"
+FROZEN, HEARTBEAT, EMCY = "current follows the error", "heartbeat period, controller", "undocumented EMCY codes"
+
+
+def play_with(make: type[Variant], folder: Path, monkeypatch: pytest.MonkeyPatch, text: str = HOLD,
+              seed: int = 0) -> Outcome:
+    """A run with that controller in place of the reference firmware."""
+    monkeypatch.setattr(participants, "Firmware", make)
+    return play(job(text, seed=seed), folder)
+
+
+def failures(outcome: Outcome) -> set[str]:
+    """The protocol checks that failed."""
+    return {check.name for check in outcome.checks if check.kind == "protocol" and not check.passed}
+
+
+@pytest.mark.parametrize(("make", "name"), [
+    (variants.CycleLate, NUMBER), (variants.StaleNumber, NUMBER), (variants.StuckNumber, NUMBER),
+    (variants.OldCurrent, DELAY), (variants.NoOutput, DELAY), (variants.Saturated, DELAY),
+    (variants.WrongSign, GAIN), (variants.GainLow, GAIN), (variants.GainHigh, GAIN),
+    (variants.OneOfFifty, MISSING),
+    (variants.IgnoresControl, IDLE), (variants.IgnoresSwitchOff, IDLE),
+    (variants.AlwaysActive, STATUS), (variants.NeverReady, STATUS), (variants.SlowStatus, STATUS),
+    (variants.NoHeartbeat, HEARTBEAT), (variants.HalfTheHeartbeats, HEARTBEAT),
+    (variants.NotANumber, LIMIT), (variants.Leaks, RESET), (variants.StrangeEmcy, EMCY),
+])  # fmt: skip
+def test_a_faulty_controller_fails_while_it_holds_a_position(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                             make: type[Variant], name: str) -> None:
+    outcome = play_with(make, tmp_path, monkeypatch)
+    assert name in failures(outcome) and outcome.status == 1
+
+
+@pytest.mark.parametrize(("make", "name"), [(variants.Frozen, FROZEN), (variants.FrozenCurrent, FROZEN),
+                                            (variants.BeyondLimit, LIMIT)])
+def test_what_shows_only_in_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: type[Variant],
+                                   name: str) -> None:
+    outcome = play_with(make, tmp_path, monkeypatch, MOVE)
+    assert name in failures(outcome) and outcome.status == 1
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_sound_controller_never_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    outcome = play_with(variants.Sound, tmp_path, monkeypatch, MOVE if seed % 2 else HOLD, seed)
+    assert outcome.verdict == "PASS" and failures(outcome) == set()
+    assert [check.name for check in outcome.checks] == [
+        IDLE, LIMIT, STATUS, NUMBER, MISSING, FROZEN, DELAY, GAIN, RESET, HEARTBEAT, "heartbeat period, plant", EMCY]
+
+
+def test_they_stand_in_a_section_of_their_own(tmp_path: Path) -> None:
+    play(job(), tmp_path)
+    trace = Trace.read(tmp_path, all=True)
+    assert [check.name for check in trace.sequence_checks] == ["overshoot", "no emergency"]
+    sections = {section.title: section for section in build_run_report(trace).sections}
+    assert len(sections["Checks"].items[0].rows) == 2  # type: ignore[union-attr]
+    assert len(sections["Protocol"].items[0].rows) == len(trace.protocol_checks) == 12  # type: ignore[union-attr]
+
+
+def test_limits_of_the_sequence_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lenient = HOLD + "[protocol]\nmissing = 0.03\ngain = 0.4\nemcy = [0x6000]\nstatus = 6e-3\nheartbeat = 0.2\n"
+    for make in (variants.OneOfFifty, variants.GainLow, variants.SlowStatus, variants.HalfTheHeartbeats):
+        assert failures(play_with(make, tmp_path, monkeypatch, lenient)) == set(), make
+    assert EMCY not in failures(play_with(variants.StrangeEmcy, tmp_path, monkeypatch, lenient))
+
+
+def test_without_probes(tmp_path: Path) -> None:
+    outcome = play(job(HOLD + "[protocol]\nprobe = false\n"), tmp_path)
+    names = [check.name for check in outcome.checks]
+    assert outcome.verdict == "PASS" and IDLE in names and not {DELAY, GAIN, RESET} & set(names)

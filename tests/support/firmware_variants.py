@@ -1,0 +1,268 @@
+"""Faulty controllers: the reference firmware behind a layer that spoils what it hears or says, one fault each.
+
+The layer works on frames alone, so a variant is a fault as seen on the bus and not one of a particular implementation.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from plant import Model
+from rig.network import codec
+from rig.network.codec import Command, Drive, Feedback
+from rig.network.frame import Frame, Send
+from rig.nodes.firmware import Firmware
+
+CURRENT_LIMIT = 8e-3  # A
+_HEARTBEAT = 0x702
+
+
+class Variant:
+    """A sound controller; variants override what differs. `command` and `feedback` are the last ones on the bus."""
+
+    def __init__(self, send: Send, model: Model | None = None) -> None:
+        self.bus = send
+        self.command, self.feedback = Command(0.0, 0, 0), Feedback(0.0, 0.0)
+        self.answers = 0  # drive frames so far
+        self.firmware = Firmware(self._transmit, model=model)
+
+    def receive(self, frame: Frame) -> None:
+        if frame.cob_id == codec.COMMAND:
+            self.command = codec.unpack_command(frame.data)
+        elif frame.cob_id == codec.FEEDBACK:
+            self.feedback = codec.unpack_feedback(frame.data)
+        elif frame.cob_id == 0x000 and frame.data[0] in (129, 130):
+            self.reset()
+        self.firmware.receive(self.hear(frame))
+
+    def tick(self, t_ns: int) -> None:
+        self.firmware.tick(t_ns)
+
+    def hear(self, frame: Frame) -> Frame:
+        """What the controller hears of a frame."""
+        return frame
+
+    def reset(self) -> None:
+        """An NMT reset came."""
+
+    def answer(self, drive: Drive) -> Drive | None:
+        """What it says in place of a sound answer; None: nothing."""
+        return drive
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        if cob_id == codec.DRIVE:
+            self.answers += 1
+            said = self.answer(codec.unpack_drive(data))
+            if said is not None:
+                self.bus(cob_id, codec.pack_drive(*said))
+        elif not self.swallows(cob_id, data):
+            self.bus(cob_id, data)
+
+    def swallows(self, cob_id: int, data: bytes) -> bool:
+        """Whether another frame than the drive frame is not sent."""
+        return False
+
+
+class Sound(Variant):
+    pass
+
+
+class CycleLate(Variant):
+    """The answer to a cycle comes in the next one, with its own cycle number."""
+
+    _kept: Drive | None = None
+
+    def answer(self, drive: Drive) -> Drive | None:
+        said, self._kept = self._kept, drive
+        return said
+
+
+class OldCurrent(Variant):
+    """The current is that of the cycle before; status word and cycle number are right."""
+
+    _current = 0.0
+
+    def answer(self, drive: Drive) -> Drive:
+        said, self._current = drive._replace(current=self._current if drive.current else 0.0), drive.current
+        return said
+
+
+class StaleNumber(Variant):
+    """The cycle number is that of the cycle before, all else is right."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(cycle=(drive.cycle - 1) & 0xFFFF)
+
+
+class StuckNumber(Variant):
+    """From some time on the cycle number stands still for two cycles in a hundred."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(cycle=drive.cycle // 50 * 50) if drive.cycle % 50 == 1 else drive
+
+
+class Frozen(Variant):
+    """The whole answer but its cycle number stands still from cycle 120 on."""
+
+    _last: Drive | None = None
+
+    def answer(self, drive: Drive) -> Drive:
+        if drive.cycle < 120 or self._last is None:
+            self._last = drive
+        return self._last._replace(cycle=drive.cycle)
+
+
+class FrozenCurrent(Frozen):
+    """The current stands still from cycle 120 on, while the control word is ACTIVE."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(current=super().answer(drive).current) if drive.status & 7 == 7 else drive
+
+
+class NoOutput(Variant):
+    """Never any current."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(current=0.0)
+
+
+class WrongSign(Variant):
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(current=-drive.current)
+
+
+class _Gain(Variant):
+    factor = 1.0
+
+    def answer(self, drive: Drive) -> Drive:
+        wanted = self.factor * drive.current
+        return drive._replace(current=max(-CURRENT_LIMIT, min(CURRENT_LIMIT, wanted)))
+
+
+class GainLow(_Gain):
+    factor = 0.7
+
+
+class GainHigh(_Gain):
+    factor = 1.3
+
+
+class OneOfFifty(Variant):
+    """One drive frame in fifty is not sent."""
+
+    def answer(self, drive: Drive) -> Drive | None:
+        return None if self.answers % 50 == 0 else drive
+
+
+class IgnoresControl(Variant):
+    """The loop is always closed; the status word follows the control word all the same."""
+
+    def hear(self, frame: Frame) -> Frame:
+        if frame.cob_id != codec.COMMAND:
+            return frame
+        return frame._replace(data=codec.pack_command(self.command.position, 7, self.command.cycle))
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(status=self.command.control & 7 | 8)
+
+
+class IgnoresSwitchOff(IgnoresControl):
+    """Once ACTIVE, the loop stays closed."""
+
+    _was_active = False
+
+    def hear(self, frame: Frame) -> Frame:
+        self._was_active |= self.command.control == 7
+        return super().hear(frame) if self._was_active else frame
+
+    def reset(self) -> None:
+        self._was_active = False
+
+
+class AlwaysActive(Variant):
+    """The status word says ACTIVE in any case."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(status=0xF)
+
+
+class NeverReady(Variant):
+    """The status word never says READY."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(status=drive.status & 7)
+
+
+class SlowStatus(Variant):
+    """The status word follows five cycles later."""
+
+    def __init__(self, send: Send, model: Model | None = None) -> None:
+        self._queue = [8] * 5
+        super().__init__(send, model)
+
+    def answer(self, drive: Drive) -> Drive:
+        self._queue.append(drive.status)
+        return drive._replace(status=self._queue.pop(0))
+
+
+class NoHeartbeat(Variant):
+    """Boot-up, and then no heartbeat."""
+
+    def swallows(self, cob_id: int, data: bytes) -> bool:
+        return cob_id == _HEARTBEAT and data != b"\0"
+
+
+class HalfTheHeartbeats(Variant):
+    """Every second heartbeat is not sent."""
+
+    _count = 0
+
+    def swallows(self, cob_id: int, data: bytes) -> bool:
+        self._count += cob_id == _HEARTBEAT
+        return cob_id == _HEARTBEAT and data != b"\0" and self._count % 2 == 0
+
+
+class NotANumber(Variant):
+    """NaN becomes the smallest INT32 when a C program casts it; here from cycle 120 on."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(current=-2.0**31 * codec.CURRENT) if drive.cycle >= 120 else drive
+
+
+class Saturated(Variant):
+    """The current is at its limit while the control word is ACTIVE."""
+
+    def answer(self, drive: Drive) -> Drive:
+        return drive._replace(current=CURRENT_LIMIT) if drive.status & 7 == 7 else drive
+
+
+class BeyondLimit(Variant):
+    """The current is not limited."""
+
+    def answer(self, drive: Drive) -> Drive:
+        wanted = 3.8 * (self.command.position - self.feedback.position)
+        return drive._replace(current=wanted) if drive.status & 7 == 7 else drive
+
+
+class Leaks(Variant):
+    """An integral part that neither a reset nor the control word clears."""
+
+    _integral = 0.0
+
+    def answer(self, drive: Drive) -> Drive:
+        if drive.status & 7 != 7:
+            return drive
+        self._integral += 1e-3 * drive.current
+        return drive._replace(current=drive.current + self._integral)
+
+
+class StrangeEmcy(Variant):
+    """An EMCY of a code that is not documented, taken back at once."""
+
+    def answer(self, drive: Drive) -> Drive:
+        if drive.cycle == 120:
+            self.bus(0x082, bytes.fromhex("0060010000000000"))
+            self.bus(0x082, bytes.fromhex("0000000000000000"))
+        return drive
+
+
+Make = Callable[..., Variant]
