@@ -31,14 +31,14 @@ class VirtualClock:
 
 
 class WallClock:
-    """The machine's monotonic clock; 0 when it is created."""
+    """The machine's monotonic clock; 0 when it is created. `origin_ns` is that moment on CLOCK_MONOTONIC."""
 
     def __init__(self) -> None:
-        self._start = time.monotonic_ns()
+        self.origin_ns = time.monotonic_ns()
 
     def now(self) -> int:
         """Time since the clock was created, ns."""
-        return time.monotonic_ns() - self._start
+        return time.monotonic_ns() - self.origin_ns
 
     def sleep_until(self, t_ns: int) -> None:
         """Sleep until `t_ns`. CPython sleeps to an absolute deadline, so a long run does not drift."""

@@ -6,7 +6,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -20,6 +20,9 @@ _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40  # asm-generic/socket.h
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
+_FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
+_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
+_INVERTED, _IDENTIFIER = 0x20000000, 0x7FF
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 
@@ -35,6 +38,7 @@ class Link:
         self._bus, self._clock = bus, clock
         self._in_controller = self._in_kernel = 0  # where frames overflowed
         self._socket: socket.socket | None = None
+        self._left_out: frozenset[int] = frozenset()
         if isinstance(bus, SocketcanBus):
             self._socket = bus.socket
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
@@ -71,6 +75,15 @@ class Link:
         except OSError as error:
             raise RigError(f"{self._bus.channel_info}: {error.strerror}") from error
 
+    def leave_out(self, cob_ids: Collection[int]) -> None:
+        """Frames with these COB-IDs are no longer received (another socket does); an empty collection: all are."""
+        self._left_out = frozenset(cob_ids)
+        if self._socket is not None:
+            exact = _IDENTIFIER | _EXTENDED | _REMOTE
+            others = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(cob_ids)]
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(others)))
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(others) or _FILTER.pack(0, 0))
+
     def close(self) -> None:
         """Give the bus back."""
         self._bus.shutdown()
@@ -83,7 +96,7 @@ class Link:
                 self.error_frames += 1
             elif message.is_extended_id or message.is_remote_frame or message.is_fd:
                 self.dropped += 1
-            else:
+            elif message.arbitration_id not in self._left_out:
                 frames.append(Frame(self._clock(), message.arbitration_id, bytes(message.data)))
             message = self._bus.recv(0)
         return frames

@@ -632,6 +632,13 @@ def _make_port() -> Port:
     return port
 
 
+def make_closed_port() -> Port:
+    """A port of no bus: every call fails. To compile a loop before its bus is open."""
+    port = _make_port()
+    port.words[_RX] = port.words[_TX] = -1
+    return port
+
+
 def _prepare_datagram(port: Port) -> None:
     """Lay out python-can's datagram of a frame with an identifier of two bytes; `encode_datagram` fills it in."""
     message = can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8)))

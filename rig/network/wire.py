@@ -88,6 +88,7 @@ class LinkWire:
 
     def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
         self.clock: Clock = clock
+        self._wall = clock
         self.link, self._grace = link, grace
         self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _ignore_frame
@@ -100,7 +101,7 @@ class LinkWire:
             left = end - self.clock.now()
             if left <= 0:
                 return False
-            self._poll(min(left * 1e-9, 0.05))
+            self.poll(min(left * 1e-9, 0.05))
         return True
 
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
@@ -111,15 +112,26 @@ class LinkWire:
 
     def run_until(self, t_ns: int) -> None:
         """See `Wire`."""
-        self._poll(0.0)
+        self.poll(0.0)
         while (left := t_ns - self.clock.now()) > 0:
-            self._poll(left * 1e-9)
+            self.poll(left * 1e-9)
 
     def close(self) -> None:
         """See `Wire`."""
         self.link.close()
 
-    def _poll(self, timeout: float) -> None:
+    @property
+    def origin_ns(self) -> int:
+        """Zero of the wire's clock on CLOCK_MONOTONIC, ns."""
+        return self._wall.origin_ns
+
+    @property
+    def grace_ns(self) -> int:
+        """How late an answer may be in lockstep, ns."""
+        return round(self._grace * 1e9)
+
+    def poll(self, timeout: float) -> None:
+        """Pass on the frames that are waiting; if there are none, wait up to `timeout` seconds for the first."""
         for frame in self.link.poll(timeout):
             self.receive(frame)
 

@@ -1,4 +1,6 @@
-"""The cycle of the bench: command, SYNC, answers, row. The only loop, for every bus and both paces.
+"""The cycle of the bench: command, SYNC, answers, row. This loop is Python, for every bus and both paces.
+
+SocketCAN and the UDP bus have a compiled one as well (hard_loop.py), which gives the same rows.
 
 Lockstep: the next cycle begins when this one's frames are in. Real time: it begins when it is due; due times are a
 fixed grid, and a cycle that is late by whole periods drops the due times it has missed (and counts them) instead of
@@ -7,6 +9,7 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from math import nan
 from typing import NamedTuple, Protocol
 
@@ -15,6 +18,7 @@ from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
 from rig.recorder import Signals, Timing
+from rig.run.priority import name_scheduler
 from rig.sequences.faults import Delay, Schedule
 
 _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
@@ -37,8 +41,53 @@ class CycleInput(NamedTuple):
     control: int  # control word
 
 
+class Loop(Protocol):
+    """What the session needs of a cycle loop. A loop may run behind the inputs that it was given (`waiting`)."""
+
+    kind: str  # "soft" or "hard" real time
+
+    @property
+    def k(self) -> int:
+        """The cycle to come."""
+
+    @property
+    def queued(self) -> int:
+        """The cycle of the input that `cycle` takes next."""
+
+    @property
+    def overruns(self) -> int:
+        """Due times missed, and cycles late by more than half a period."""
+
+    @property
+    def scheduler(self) -> str:
+        """How the kernel schedules the thread of the cycle; empty before it has run."""
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began."""
+
+    def cycle(self, step: CycleInput) -> None:
+        """Run one cycle, or queue it; cycles that are complete go to the log."""
+
+    def override_control(self, word: int) -> None:
+        """Use this control word in all cycles already queued, from the next one on."""
+
+    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
+        """Wait until all inputs are taken; False when `stop()` came true before."""
+
+    def hold(self, phase: int) -> float:
+        """Discard the inputs not yet taken and repeat the last one under `phase`; return its demand, m."""
+
+    def finish(self) -> None:
+        """Play what is queued, wait for the answers of the last cycle and log it."""
+
+    def close(self) -> None:
+        """Give back what the loop holds, whatever happened."""
+
+
 class CycleLoop:
-    """Runs cycles one by one and passes each to `log` when it is complete."""
+    """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
+
+    kind = "soft"
 
     def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire
@@ -51,17 +100,43 @@ class CycleLoop:
         self._t_ns = self._wire.clock.now() + period_ns  # when the cycle under way, or to come, is due
         self._sync = 0
         self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
+        self._demand = 0.0  # m, of the last cycle
         read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
         master.on_cyclic.update(read)
+
+    @property
+    def queued(self) -> int:
+        """See `Loop`: nothing is queued here."""
+        return self.k
+
+    @property
+    def scheduler(self) -> str:
+        """See `Loop`."""
+        return name_scheduler()
 
     def now(self) -> int:
         """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
         return self._wire.clock.now() if self._realtime else self._t_ns
 
-    def cycle(self, step: CycleInput) -> Signals | None:
-        """One cycle; returns the row of the cycle before, which it closes."""
+    def override_control(self, word: int) -> None:
+        """See `Loop`; nothing is queued here."""
+
+    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
+        """See `Loop`; nothing is queued here."""
+        return True
+
+    def hold(self, phase: int) -> float:
+        """See `Loop`; nothing is queued here, and the next cycle follows at once."""
+        return self._demand
+
+    def close(self) -> None:
+        """See `Loop`; nothing to give back."""
+
+    def cycle(self, step: CycleInput) -> None:
+        """One cycle; the cycle before, which it closes, goes to the log."""
         lateness = self._wait_until_due()
-        closed = self._close()
+        self._close()
+        self._demand = step.demand
         master, k = self._master, self.k
         began = self._wall.now()
         row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
@@ -79,12 +154,11 @@ class CycleLoop:
         master.tick()
         self.k += 1
         self._t_ns += self._period
-        return closed
 
-    def finish(self) -> Signals | None:
+    def finish(self) -> None:
         """Wait for the answers of the last cycle and close it."""
         self._wait_until_due()
-        return self._close()
+        self._close()
 
     def _wait_until_due(self) -> int:
         """The next cycle is due; by how much it is late, ns. Lockstep is never late."""
@@ -153,11 +227,8 @@ class CycleLoop:
         """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
         return ((frame.t_ns if self._realtime else self._wall.now()) - self._sync) * 1e-9
 
-    def _close(self) -> Signals | None:
+    def _close(self) -> None:
         """The cycle under way is over: the next SYNC is due."""
-        if self._open is None:
-            return None
-        t_ns, row, timing = self._open
-        self._open = None
-        self._log.cycle(t_ns, row, timing)
-        return row
+        if self._open is not None:
+            complete, self._open = self._open, None
+            self._log.cycle(*complete)

@@ -2,18 +2,19 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 SWITCH_INTERVAL = 50e-6  # s
 LOOP_PRIORITY = 20  # of 99: above the desktop, below the kernel's own threads
 
 
 @contextlib.contextmanager
-def raise_priority() -> Iterator[None]:
+def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     """Run the calling thread under SCHED_FIFO where that is allowed; restore its priority afterwards.
 
     The process's other threads (the recorder) get the lowest real-time priority: while one of them holds the
@@ -21,13 +22,53 @@ def raise_priority() -> Iterator[None]:
     """
     others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
     raised = [thread for thread in others if thread is not None and _set_fifo(thread, 1)]
-    raised += [0] if _set_fifo(0, LOOP_PRIORITY) else []
+    raised += [0] if _set_fifo(0, priority) else []
     try:
         yield
     finally:
         for thread in raised:
             with contextlib.suppress(OSError):  # it has ended meanwhile
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+
+
+@contextlib.contextmanager
+def enter_loop_thread() -> Iterator[str]:
+    """Give the calling thread the loop's priority and, where there are two CPUs or more, the last one for itself.
+
+    The process's other threads get the other CPUs until the end. Yields the name of the scheduler that was granted.
+    """
+    _set_fifo(0, LOOP_PRIORITY)
+    cpus = list_cpus()
+    others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
+    moved = [thread for thread in others if thread is not None and len(cpus) > 1 and _set_cpus(thread, cpus[:-1])]
+    if len(cpus) > 1:
+        _set_cpus(0, cpus[-1:])
+    try:
+        yield name_scheduler()
+    finally:
+        for thread in [0, *moved]:
+            _set_cpus(thread, cpus)
+
+
+@contextlib.contextmanager
+def lock_memory() -> Iterator[bool]:
+    """Keep the pages of this process in memory once they are there, so that the loop meets no page fault.
+
+    Yields whether the machine allows it (root, or RLIMIT_MEMLOCK unlimited).
+    """
+    library = ctypes.CDLL(None)
+    current, future, on_fault = 1, 2, 4  # sys/mman.h
+    is_locked = library.mlockall(current | future | on_fault) == 0
+    try:
+        yield is_locked
+    finally:
+        if is_locked:
+            library.munlockall()
+
+
+def list_cpus() -> list[int]:
+    """The CPUs that this thread may use."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 
 
 @contextlib.contextmanager
@@ -51,6 +92,14 @@ def _set_fifo(thread: int, priority: int) -> bool:
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError):
+        return False
+    return True
+
+
+def _set_cpus(thread: int, cpus: Collection[int]) -> bool:
+    try:
+        os.sched_setaffinity(thread, cpus)
+    except (AttributeError, OSError):  # not Linux; or the thread has ended
         return False
     return True
 

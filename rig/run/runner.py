@@ -13,13 +13,15 @@ from fdi.progress import Progress
 from plant import Actuator, Columns, InputError
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
+from rig.network.raw_bus import can_open
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
+from rig.run.hard_loop import compile_cycle
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.outcome import Outcome, summarise_timing
 from rig.run.participants import open_wire
-from rig.run.priority import name_scheduler, raise_priority, suspend_garbage_collection
+from rig.run.priority import LOOP_PRIORITY, lock_memory, name_scheduler, raise_priority, suspend_garbage_collection
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.protocol import judge_protocol
@@ -33,6 +35,8 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
     """
     if job.plant != "external":  # here, where an effect that cannot be compiled is still reported as bad input
         Actuator(job.scenario.model).warm()
+    if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
+        compile_cycle(job.realtime)
     with lock_folder(folder), open_wire(job) as wire, open_recorder(job, folder) as recorder:
         session = Session(job, wire, recorder, progress, stop)
         progress("bring-up", 0.0)
@@ -41,10 +45,13 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         stopwatch = WallClock()
         with contextlib.ExitStack() as rights:
             if job.realtime:
-                rights.enter_context(raise_priority())
+                is_hard = session.loop.kind == "hard"  # then Python only has to keep up; the cycle's thread is above it
+                rights.enter_context(raise_priority(1 if is_hard else LOOP_PRIORITY))
+                rights.enter_context(lock_memory())
                 rights.enter_context(suspend_garbage_collection())
             scheduled = name_scheduler()
             session.run_phases()
+            scheduled = session.loop.scheduler or scheduled
         spent = stopwatch.now() * 1e-9
         loop = session.loop
         history = session.history

@@ -6,6 +6,7 @@ every other sequence ends main.
 """
 from __future__ import annotations
 
+import bisect
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -23,9 +24,10 @@ from rig.nodes import firmware
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
+from rig.run.hard_loop import open_loop
 from rig.run.history import History
 from rig.run.job import Job
-from rig.run.loop import CycleInput, CycleLoop
+from rig.run.loop import CycleInput, Loop
 from rig.run.probe import (
     AFTER,
     BEFORE,
@@ -67,7 +69,7 @@ class Session:
         self._plan = self.scenario.plan
         self._faults = Schedule(self._plan, self.scenario.model.values)
         self._watch = GuardWatch(job.sequence.guards)
-        self.loop: CycleLoop | None = None
+        self.loop: Loop | None = None
         self.events: list[SessionEvent] = []
         self.history = History()
         self._probes: list[History] = []  # played before set-up
@@ -86,6 +88,8 @@ class Session:
         self._demand = 0.0  # m, of the last cycle
         self._operational: set[int] = set()
         self._edges = sorted(self._faults.edges)
+        self._agenda: list[tuple[int, str, str, str]] = []  # events of cycles that are queued: cycle, level, kind, text
+        self._unjudged: list[Signals] = []  # rows that the guards have not seen
         self._clock = wire.clock
         self._master = Master(wire, self.now, job.realtime)
         self._master.on_frame = recorder.frame
@@ -103,16 +107,31 @@ class Session:
 
     def log_event(self, level: str, kind: str, text: str) -> None:
         """Record an event of the run."""
-        t_ns = self.now()
-        self.events.append(SessionEvent(self._main_time(), level, kind, text))
-        self.recorder.put(t_ns, Event(level, kind, text))
+        self._record_event(self.now(), SessionEvent(self._main_time(), level, kind, text))
+
+    def _record_event(self, t_ns: int, event: SessionEvent) -> None:
+        bisect.insort(self.events, event, key=lambda other: other.t)
+        self.recorder.put(t_ns, Event(event.level, event.kind, event.text))
+
+    def _announce(self, level: str, kind: str, text: str) -> None:
+        """Record an event of the next cycle that is given to the loop, when that cycle is played."""
+        assert self.loop is not None
+        if self.loop.queued <= self.loop.k:
+            self.log_event(level, kind, text)
+        else:
+            self._agenda.append((self.loop.queued, level, kind, text))
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """Record a complete cycle (called by the loop)."""
         if signals.phase in (BEFORE, AFTER):
             (self._probes[-1] if signals.phase == BEFORE else self._after).add(signals, timing)
             return
+        while self._agenda and self._agenda[0][0] <= signals.cycle:
+            cycle, *words = self._agenda.pop(0)
+            self._record_event(t_ns, SessionEvent(self._main_time(cycle), *words))
         self.history.add(signals, timing)
+        if self._watch and signals.phase != CLEANUP:
+            self._unjudged.append(signals)
         self.recorder.cycle(t_ns, signals, timing)
 
     def bring_up(self) -> None:
@@ -142,8 +161,8 @@ class Session:
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
 
-    def _make_loop(self, faults: Schedule) -> CycleLoop:
-        return CycleLoop(self._master, faults, self, self.job.period_ns, self.job.realtime)
+    def _make_loop(self, faults: Schedule) -> Loop:
+        return open_loop(self._master, faults, self, self.job.bus, self.job.period_ns, self.job.realtime)
 
     def _play_probes(self) -> None:
         """Play the probes before set-up, each after a reset of the nodes. Raises BusError."""
@@ -153,12 +172,16 @@ class Session:
             self._start_nodes(scenario)
             self._probes.append(History())
             self.loop = self._make_loop(Schedule(scenario.plan, scenario.model.values))
-            for step in list_inputs(FIRST_STEPS, BEFORE, 0.0):
-                self.loop.cycle(step)
-                if has_no_answers(self._probes[-1]):
-                    break
-            self.loop.finish()
-            self.loop = None
+            try:
+                for step in list_inputs(FIRST_STEPS, BEFORE, 0.0):
+                    self.loop.cycle(step)
+                    if has_no_answers(self._probes[-1]):
+                        self.loop.hold(BEFORE)
+                        break
+                self.loop.finish()
+            finally:
+                self.loop.close()
+                self.loop = None
         self._is_probing = False
 
     def _play_last_probe(self) -> None:
@@ -166,6 +189,7 @@ class Session:
         assert self.loop is not None
         if self.safe or self.aborted or not self.job.sequence.protocol.probe:
             return
+        self.loop.wait_until_played(lambda: bool(self.aborted))
         for step in list_inputs(LAST_STEPS, AFTER, self._demand):
             self.loop.cycle(step)
 
@@ -190,15 +214,19 @@ class Session:
         """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
         assert self.loop is not None
         try:
-            self._run(SETUP, self._setup) and self._run(MAIN, self._main)
+            if self._run(SETUP, self._setup) and self._run(MAIN, self._main):
+                self.loop.wait_until_played(self._must_end)
         finally:
             try:
+                self._demand = self.loop.hold(CLEANUP)
+                self._agenda = [event for event in self._agenda if event[0] < self.loop.queued]
                 self._powered = self._restore_nodes()
                 self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
                 self._play_last_probe()
                 self.loop.finish()
             finally:
                 self._playing = False
+                self.loop.close()
                 self._master.stop()
                 self.log_event("INFO", "phase", "end")
 
@@ -214,36 +242,42 @@ class Session:
             return 0
         if phase == CLEANUP and self.safe and i == 0:
             return int(Control.RESET)
-        started = self.loop.k if self.loop else 0  # without set-up main is where it is enabled
+        started = self.loop.queued if self.loop else 0  # without set-up main is where it is enabled
         return int(_ENABLING_STEPS[started]) if started < len(_ENABLING_STEPS) else int(Control.ACTIVE)
 
     def _run(self, phase: int, profile: Profile) -> bool:
         """The cycles of one phase; False when it was ended early."""
         assert self.loop is not None
-        self.log_event("INFO", "phase", PHASES[phase])
+        self._announce("INFO", "phase", PHASES[phase])
         for section in profile.sections:
-            self.log_event("INFO", "section", f"{PHASES[phase]}: {section.name}")
+            self._announce("INFO", "section", f"{PHASES[phase]}: {section.name}")
             shown = section.name if phase == MAIN else PHASES[phase]
             for i in range(section.start, section.stop):
                 self._announce_faults()
                 self._demand = float(profile.command[i])
-                load = self.scenario.force[self.loop.k] * FORCE_RESOLUTION if phase == MAIN else 0.0
-                closed = self.loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
-                if self.loop.k % 50 == 0:
+                load = self._find_load(self.loop.queued) if phase == MAIN else 0.0
+                self.loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
+                if self.loop.queued % 50 == 0:
                     self._progress(shown, self.loop.k / max(self._plan.stop, self.loop.k))
-                if phase != CLEANUP and self._must_end(closed):
+                if phase != CLEANUP and self._must_end():
                     return False
         return True
 
-    def _must_end(self, row: Signals | None) -> bool:
+    def _find_load(self, cycle: int) -> float:
+        """Force on the ram from the scenario in a cycle, N."""
+        return float(self.scenario.force[cycle] * FORCE_RESOLUTION) if cycle < len(self.scenario.force) else 0.0
+
+    def _must_end(self) -> bool:
         if self._stop() and not self.aborted:
             self.interrupted = True
             self._abort("operator", "stopped by the operator")
-        if row is not None and self._watch:
+        rows, self._unjudged = self._unjudged, []
+        for row in rows:
             passed = self._watch.find_passed({"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12,
                                               "xs": row.xs, "load": row.load, "error": row.com - row.xj})
             if passed:
                 self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
+                break
         return bool(self.aborted)
 
     def _abort(self, kind: str, why: str) -> None:
@@ -258,6 +292,8 @@ class Session:
         self.log_event("ERROR", kind, what)
         if not self.safe:
             self.safe = True
+            if self.loop:
+                self.loop.override_control(0)
             self.log_event("WARN", "safe_state", f"no current from here on: {what}")
         if self.job.sequence.ends != "safe_state" and not self.aborted:
             self._abort("abort", what)
@@ -287,13 +323,12 @@ class Session:
 
     def _announce_faults(self) -> None:
         assert self.loop is not None
-        while self._edges and self._edges[0].cycle <= self.loop.k:
+        while self._edges and self._edges[0].cycle <= self.loop.queued:
             edge = self._edges.pop(0)
             level, word = ("WARN", "begins") if edge.begins else ("INFO", "ends")
-            self.log_event(level, "fault", f"{edge.label} {word}")
+            self._announce(level, "fault", f"{edge.label} {word}")
 
-    def _main_time(self) -> float:
-        """The time now, s of main; negative before main."""
-        if self.loop is None or self._is_probing:
-            return -self._plan.start / RATE
-        return (self.loop.k - self._plan.start) / RATE
+    def _main_time(self, cycle: int | None = None) -> float:
+        """The time of a cycle, by default now, s of main; negative before main."""
+        now = self.loop.k if self.loop and not self._is_probing else 0
+        return ((now if cycle is None else cycle) - self._plan.start) / RATE

@@ -1,0 +1,353 @@
+"""The hard cycle loop: the rig's cycle runs compiled, on a socket of its own; the rest of the rig stays in Python.
+
+It takes the place of `CycleLoop` on SocketCAN and the UDP bus, in both paces. In real time a thread without the
+interpreter lock plays a queue of inputs, which Python fills about a second ahead: the command profile is known. In
+lockstep Python calls the same compiled code once a cycle. PDOs and SYNC use the loop's socket; NMT, SDO, heartbeats and
+EMCY use the wire's socket, in the main thread. The log gets the frames of both in the order of their times.
+
+The queue does not delay a reaction: `override_control` changes the control word of what is queued, `hold` discards it.
+"""
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import cache
+from math import nan
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+
+from plant.compile import compile_function
+from plant.errors import RigError
+from rig.network import codec
+from rig.network.frame import Frame
+from rig.network.master import Master
+from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
+from rig.network.wire import LinkWire
+from rig.recorder import Signals, Timing
+from rig.run import hard_cycle as hc
+from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
+from rig.run.priority import enter_loop_thread, list_cpus
+from rig.sequences.faults import Delay, Schedule
+
+_RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
+_US = 1000  # ns
+
+
+def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, period_ns: int, realtime: bool) -> Loop:
+    """The cycle loop for a bus: the hard one where compiled code can use the bus, else `CycleLoop`.
+
+    Raises:
+        RigError: the bus cannot be opened.
+    """
+    if can_open(bus) and isinstance(master.wire, LinkWire):
+        return HardLoop(master, faults, log, open_raw_bus(bus, _RECEIVED), period_ns, realtime)
+    return CycleLoop(master, faults, log, period_ns, realtime)
+
+
+@cache
+def compile_cycle(realtime: bool) -> Any:
+    """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
+    play = compile_function(hc.play_realtime if realtime else hc.play_lockstep)
+    port, buffers = make_closed_port(), hc.make_buffers(1, 1, 1, 1)
+    play(port, buffers) if realtime else play(port, buffers, 0)  # fails at once, on a bus that is not there
+    return play
+
+
+class HardLoop:
+    """Cycles in compiled code; the interface is that of `CycleLoop`. Call `close` when done.
+
+    Raises RigError from `cycle`, `serve` and `finish` when the bus is gone.
+    """
+
+    kind = "hard"
+
+    def __init__(self, master: Master, faults: Schedule, log: CycleObserver, bus: RawBus, period_ns: int,
+                 realtime: bool, ahead: int = 1000) -> None:
+        """`ahead`: cycles that Python queues in real time; a stall of Python up to that length does no harm."""
+        wire = master.wire
+        assert isinstance(wire, LinkWire)
+        self._master, self._wire, self._bus = master, wire, bus
+        self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
+        self._ahead = ahead if realtime else 1
+        self._origin = wire.origin_ns
+        self._play = compile_cycle(realtime)
+        self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100)
+        self._words = self._buffers.words
+        self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
+        self._thread: threading.Thread | None = None
+        self._status = hc.WAITING
+        self._idle_phase = 0
+        self._pending: tuple[int, Signals, Timing] | None = None  # lockstep: a row that the next cycle hands out
+        self._k = 0
+        self._frames: list[tuple[int, Frame]] = []  # of both sockets, until everything before them is known
+        self._came_at: int | None = None  # wall time of the service frame under way
+        self._last_t_ns = 0
+        self.scheduler = ""
+        self._write_frame, master.on_frame = master.on_frame, self._keep_frame
+        self._receive, wire.receive = wire.receive, self._receive_service
+        wire.link.leave_out(_RECEIVED)
+        self._warm_up()
+        self._t_ns = wire.clock.now() + period_ns  # lockstep: time of the cycle under way or to come
+
+    # ------------------------------------------------------------------------------------ what the session sees
+
+    @property
+    def k(self) -> int:
+        """The cycle to come."""
+        return int(self._words[hc.CYCLES]) if self._realtime else self._k
+
+    @property
+    def queued(self) -> int:
+        """The cycle of the input that `cycle` takes next."""
+        return self.k + self.waiting
+
+    @property
+    def waiting(self) -> int:
+        """Inputs that are queued and not yet taken."""
+        return int(self._words[hc.TAIL] - self._words[hc.HEAD])
+
+    @property
+    def overruns(self) -> int:
+        """Due times missed, late cycles, and cycles for which no input was queued."""
+        return int(self._words[hc.OVERRUNS])
+
+    @property
+    def underruns(self) -> int:
+        """Cycles for which no input was queued; they repeat the last one."""
+        return int(self._words[hc.UNDERRUNS])
+
+    def now(self) -> int:
+        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
+        return self._wire.clock.now() if self._realtime else self._t_ns
+
+    def cycle(self, step: CycleInput) -> None:
+        """Queue one cycle; in lockstep, run it. Complete cycles go to the log."""
+        self._push(step)
+        if not self._realtime:
+            self._run_one()
+            return
+        if self._thread is None:
+            self._start_thread()
+        while self.waiting >= self._ahead:
+            self.serve()
+
+    def serve(self) -> None:
+        """Real time: receive what the other nodes send and log the cycles that are complete; takes up to a period."""
+        near = self.waiting <= 2  # the end of the queue: the next input must come within a period
+        self._wire.poll(self._period * (0.1e-9 if near else 1e-9))
+        self._drain()
+        self._tick()
+        if self._thread is not None and not self._thread.is_alive():
+            self._check_status()
+
+    def override_control(self, word: int) -> None:
+        """Use this control word in all cycles already queued, from the next one on."""
+        self._words[hc.OVERRIDE] = word
+        self._words[hc.OVERRIDE_LIMIT] = self._words[hc.TAIL]
+
+    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
+        """Wait until all inputs are taken; False when `stop()` came true before.
+
+        The queue may then run empty: until the next input the last one is repeated.
+        """
+        self._words[hc.MAY_IDLE_AT] = self._words[hc.TAIL]
+        while self.waiting:
+            self.serve()
+            if stop():
+                return False
+        return True
+
+    def hold(self, phase: int) -> float:
+        """Discard the inputs not yet taken; until the next input the last one is repeated, logged under `phase`.
+
+        Returns its demand, m.
+        """
+        self._idle_phase = phase
+        self._words[hc.CANCEL_WANTED] += 1
+        while self._is_running() and self._words[hc.CANCEL_DONE] != self._words[hc.CANCEL_WANTED]:
+            self.serve()
+        if not self._is_running():
+            self._words[hc.TAIL] = self._words[hc.HEAD]
+            self._words[hc.CANCEL_DONE] = self._words[hc.CANCEL_WANTED]
+        return self._inputs[self._words[hc.POSITION] % len(self._inputs)].demand if self.k else 0.0
+
+    def finish(self) -> None:
+        """Play what is queued, wait for the answers of the last cycle and log it."""
+        self._words[hc.FINISH] = 1
+        while self._is_running():
+            self.serve()
+        if self._thread is not None:
+            self._check_status()
+        self._drain()
+        self._log_pending()
+
+    def close(self) -> None:
+        """End the thread at the end of its cycle and give the bus back."""
+        self._words[hc.CANCEL_WANTED] += 1
+        self._words[hc.FINISH] = 1
+        if self._thread is not None:
+            self._thread.join()
+        self._bus.close()
+        self._wire.link.leave_out(())
+        try:
+            self._drain()
+        finally:
+            self._release_frames(2**63)
+            self._master.on_frame, self._wire.receive = self._write_frame, self._receive
+
+    # ------------------------------------------------------------------------------------ towards the cycle
+
+    def _push(self, step: CycleInput) -> None:
+        action = self._faults.frame("command", self.queued)
+        delay = 0 if action is None else action.ns if isinstance(action, Delay) else hc.LOST
+        position = int(self._words[hc.TAIL])
+        self._inputs[position % len(self._inputs)] = step
+        queue = self._buffers.inputs
+        queue[position % len(queue)] = codec.raw_position(step.demand), step.control, delay
+        self._words[hc.TAIL] = position + 1
+
+    def _run_one(self) -> None:
+        """Lockstep: one cycle, with the services meanwhile, so that Ctrl-C and EMCYs are not kept waiting."""
+        self._log_pending()
+        self._master.silent = not self._faults.is_heartbeat_alive("rig", self._k)
+        status = hc.WAITING
+        while status == hc.WAITING:
+            status = self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US)
+            self._wire.poll(0.0)
+        if status < 0:
+            raise self._bus.explain_failure(status)
+        self._drain()
+        self._master.tick()
+        self._k += 1
+        self._t_ns += self._period
+
+    def _start_thread(self) -> None:
+        words = self._words
+        words[hc.DUE] = self._origin + self._wire.clock.now() + 20 * self._period
+        self._thread = threading.Thread(target=self._run_thread, name="cycle", daemon=True)
+        self._thread.start()
+
+    def _run_thread(self) -> None:
+        with enter_loop_thread() as self.scheduler:
+            self._status = self._play(self._bus.port, self._buffers)
+
+    def _is_running(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _check_status(self) -> None:
+        if self._status < 0:
+            raise self._bus.explain_failure(self._status)
+        if self._status == hc.WAITING:
+            raise RigError("internal error: the cycle thread ended by itself")
+
+    def _warm_up(self) -> None:
+        """Set the cycle's times, and play some cycles without sending: code and memory are then in place."""
+        words, period = self._words, self._period
+        words[hc.PERIOD], words[hc.GRACE] = period, _US
+        words[hc.SPINS_ALWAYS] = len(list_cpus()) > 1
+        words[hc.LEAD], words[hc.SPIN] = min(200 * _US, period // 4), min(80 * _US, period // 8)
+        words[hc.DRY] = 1
+        for _ in range(10):
+            self._push(CycleInput(0, 0.0, 0.0, 0))
+            words[hc.DUE] = self._origin + self._wire.clock.now() + period
+            if not self._realtime:
+                self._play(self._bus.port, self._buffers, words[hc.DUE])
+        words[hc.FINISH] = 1
+        if self._realtime:
+            self._play(self._bus.port, self._buffers)
+        kept = {each: int(words[each]) for each in (hc.PERIOD, hc.LEAD, hc.SPIN, hc.SPINS_ALWAYS)}
+        words[:] = 0
+        for each, value in kept.items():
+            words[each] = value
+        words[hc.GRACE], words[hc.MAY_IDLE_AT] = self._wire.grace_ns, -1
+
+    # ------------------------------------------------------------------------------------ from the cycle
+
+    def _tick(self) -> None:
+        self._master.silent = not self._faults.is_heartbeat_alive("rig", self.k)
+        self._master.tick()
+
+    def _drain(self) -> None:
+        """Log the cycles and frames that are complete."""
+        words, buffers = self._words, self._buffers
+        until = int(words[hc.COMPLETE_UNTIL])  # first: what is added meanwhile waits for the next time
+        first, last = int(words[hc.FRAMES_READ]), int(words[hc.FRAMES])
+        for t_ns, head, data in _read_ring(buffers.frames, first, last):
+            raw = (data & 0xFFFFFFFFFFFFFFFF).to_bytes(8, "little")[:head >> 12 & 15]
+            self._take_frame(t_ns - self._origin, head & 0x7FF, raw, bool(head >> 16))
+        words[hc.FRAMES_READ] = last
+        self._release_frames(until - self._origin if self._realtime else 2**63)
+        first, last = int(words[hc.ROWS_READ]), int(words[hc.ROWS])
+        for row in _read_ring(buffers.rows, first, last):
+            words[hc.ROWS_READ] += 1
+            self._take_row(row)
+
+    def _take_frame(self, t_ns: int, cob_id: int, data: bytes, is_sent: bool) -> None:
+        frame = Frame(t_ns, cob_id, data)
+        if cob_id in (codec.SYNC, codec.COMMAND) and not is_sent:
+            self._receive_service(frame)  # the master reports a second rig
+        else:
+            self._frames.append((t_ns, frame if self._realtime else Frame(self._t_ns, cob_id, data)))
+
+    def _receive_service(self, frame: Frame) -> None:
+        self._came_at = frame.t_ns
+        try:
+            self._receive(frame)
+        finally:
+            self._came_at = None
+
+    def _keep_frame(self, frame: Frame) -> None:
+        """A frame that the master received or sent."""
+        self._frames.append((self._wire.clock.now() if self._came_at is None else self._came_at, frame))
+
+    def _release_frames(self, until_ns: int) -> None:
+        """Write the frames up to that time, in the order of their times."""
+        self._frames.sort(key=itemgetter(0))
+        count = 0
+        for t_ns, frame in self._frames:
+            if t_ns > until_ns:
+                break
+            count += 1
+            if frame.t_ns < self._last_t_ns:  # the kernel's clock was set, or two sockets differ by a microsecond
+                frame = Frame(self._last_t_ns, frame.cob_id, frame.data)
+            self._last_t_ns = frame.t_ns
+            self._write_frame(frame)
+        del self._frames[:count]
+
+    def _take_row(self, row: list[int]) -> None:
+        step = self._inputs[row[hc.INPUT] % len(self._inputs)]
+        phase = self._idle_phase if row[hc.INPUT_HELD] and self._idle_phase else step.phase
+        came = row[hc.ANSWERS]
+        has_xj, has_xs, has_cor = came & hc.XJ_CAME, came & hc.XS_CAME, came & hc.COR_CAME
+        signals = Signals(
+            row[hc.CYCLE], phase, codec.position(codec.raw_position(step.demand)),
+            codec.position(row[hc.XJ]) if has_xj else nan, codec.current(row[hc.COR]) if has_cor else nan,
+            codec.pressure(row[hc.P12]) if has_xj else nan, codec.spool(row[hc.XS]) if has_xs else nan,
+            step.load, row[hc.WORD], row[hc.STATUS] if has_cor else 0, row[hc.FLAGS] if has_xs else 0)
+        timing = Timing(
+            row[hc.CYCLE], bool(row[hc.OVERRUN]), row[hc.LATENESS] * 1e-9 if self._realtime else 0.0,
+            row[hc.DRIVE_AT] * 1e-9 if has_cor else nan, row[hc.COMPLETE_AT] * 1e-9 if came == hc.ALL_CAME else nan,
+            row[hc.FEEDBACK_AT] * 1e-9 if has_xj else nan, row[hc.VALVE_AT] * 1e-9 if has_xs else nan,
+            row[hc.EXECUTION] * 1e-9)
+        if self._realtime:
+            self._log.cycle(row[hc.DUE_AT] - self._origin, signals, timing)
+        else:
+            self._pending = self._t_ns, signals, timing
+
+    def _log_pending(self) -> None:
+        """Lockstep: the next cycle hands a row out, as in `CycleLoop`, so that guards act in the same cycle."""
+        if self._pending is not None:
+            pending, self._pending = self._pending, None
+            self._log.cycle(*pending)
+
+
+def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[int]]:
+    """Entries `first` to `last` - 1 of a ring."""
+    start, stop = first % len(ring), last % len(ring)
+    if first == last:
+        return []
+    rows = ring[start:stop] if start < stop else np.concatenate((ring[start:], ring[:stop]))
+    values: list[list[int]] = rows.tolist()
+    return values
