@@ -25,7 +25,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"}}
 # Inside fdi and rig: the folders, and single modules, that each folder may import beside itself. All may import SHARED.
 SHARED = {"fdi.output", "fdi.progress", "fdi.sources", "fdi.thresholds"}
-BENCH = {f"rig.{part}" for part in ("network", "device", "nodes", "run", "sequences", "recorder", "view", "doctor")}
+BENCH = {f"rig.{part}" for part in ("network", "device", "nodes", "firmware", "run", "sequences", "recorder", "view",
+                                    "doctor")}
 ESTIMATOR = {"fdi.trace", "fdi.estimation", "fdi.comparison"}
 FOLDER_MAY_IMPORT = {
     **{module: set() for module in SHARED},

@@ -75,6 +75,7 @@ class SdoServer:
         self._open: int | None = None  # command specifier of the segments expected
         self._buffer = bytearray()
         self._announced: int | None = None  # bytes
+        self._fixed = 0  # bytes of the object, 0: any number
         self._toggle = 0
 
     def receive(self, frame: Frame) -> None:
@@ -124,12 +125,13 @@ class SdoServer:
             length = 4 - (command >> 2 & 3) if announced else size or 4
             self._download(*self._object, data[4 : 4 + length])
             return
+        self._fixed = size
         if announced:
             self._announced = int.from_bytes(data[4:], "little")
-            if self._announced > _LARGEST:
-                raise SdoAbort(Abort.MEMORY)
             if size and self._announced != size:
                 raise SdoAbort(Abort.TOO_LONG if self._announced > size else Abort.TOO_SHORT)
+            if self._announced > _LARGEST:
+                raise SdoAbort(Abort.MEMORY)
         self._open = _DOWNLOAD_SEGMENT
 
     def _begin_upload(self) -> bytes:
@@ -162,8 +164,8 @@ class SdoServer:
         return bytes((toggle | (7 - len(part)) << 1 | last,)) + part
 
     def _check_length(self, last: bool) -> None:
-        length = len(self._buffer)
-        if length > (_LARGEST if self._announced is None else self._announced):
-            raise SdoAbort(Abort.MEMORY if self._announced is None else Abort.TOO_LONG)
+        length, known = len(self._buffer), self._fixed or self._announced
+        if length > (_LARGEST if known is None else known):
+            raise SdoAbort(Abort.MEMORY if known is None else Abort.TOO_LONG)
         if last and self._announced is not None and length < self._announced:
             raise SdoAbort(Abort.TOO_SHORT)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import hashlib
 import os
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,7 @@ class Turn:
     def __init__(self, group: str, port: int) -> None:
         self._where = f"udp_multicast {group}:{port}"
         name = f"eha-rig {group} {port}".encode()
-        self._key = int.from_bytes(hashlib.sha256(name).digest()[:4], "little") & 0x7FFFFFFF
+        self._key = zlib.crc32(name) & 0x7FFFFFFF  # rig/firmware/turn.c calculates the same
         self._library = ctypes.CDLL(None, use_errno=True)
         self.identifier = self._join()
 

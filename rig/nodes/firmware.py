@@ -23,6 +23,7 @@ GAINS = 0x2110
 # As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
 _RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
 _LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
+_CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
 LOST_AFTER = 3  # SYNCs in a row without feedback
 
 
@@ -76,8 +77,12 @@ class Firmware:
             self._lost = False
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        """Reject NaN and infinite gains: they would produce a NaN current."""
-        if index == GAINS and not isfinite(struct.unpack("<d", data)[0]):
+        """Reject NaN and infinite gains (they would produce a NaN current), a negative limit and a period of 0."""
+        if index != GAINS:
+            return
+        value = struct.unpack("<d", data)[0]
+        is_limit, is_period = sub == _CURRENT_LIMIT, sub == _PERIOD
+        if not isfinite(value) or (is_limit and value < 0.0) or (is_period and value <= 0.0):
             raise SdoAbort(Abort.VALUE)
 
     def _trip(self, node: int = 0) -> None:

@@ -24,7 +24,7 @@ _EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the att
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One run. `plant` and `controller`: "builtin", "external", or for the plant "auto"."""
+    """One run. `plant` and `controller`: "builtin", "external", for the plant "auto", for the controller "c"."""
 
     sequence: Sequence
     model: Model

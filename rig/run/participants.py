@@ -10,6 +10,7 @@ from functools import partial
 
 from plant import InputError, Model
 from plant.effects import CATALOGUE
+from rig.firmware.build import build_controller
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
@@ -39,15 +40,19 @@ def open_wire(job: Job) -> Iterator[Wire]:
             an effect in the firmware.
         BusError: an external node does not answer.
     """
-    if job.controller == "external" and find_firmware_parameters(job.model):
-        raise InputError("--controller", "external", f"a model without effects in the firmware, which is not ours "
-                                                     f"then: not {', '.join(find_firmware_parameters(job.model))}")
+    if job.controller != "builtin" and find_firmware_parameters(job.model):
+        raise InputError("--controller", job.controller, f"a model without effects in the firmware, which only the "
+                                                         f"builtin one has: not "
+                                                         f"{', '.join(find_firmware_parameters(job.model))}")
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
-        if "external" in (job.controller, job.plant):
+        if job.controller != "builtin" or job.plant == "external":
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
         yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
         return
+    if job.controller == "c":
+        require_firmware_bus(job.bus)
+        build_controller()  # now, where an error is still reported before anything is on the bus
     clock = WallClock()
     timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
     wire = LinkWire(Link(open_can(job.bus), clock.now), clock, timeout)
@@ -68,7 +73,7 @@ def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> Non
         there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, BOOT_TIMEOUT)
         if wanted == "external" and not there:
             raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
-        if node == CONTROLLER and wanted == "builtin" and there:
+        if node == CONTROLLER and wanted != "external" and there:
             raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
         if not there:
             children.append(_start_node(job, NAMES[node]))
@@ -87,6 +92,12 @@ def _stop_processes(children: Sequence[Child]) -> None:
             child.wait()
 
 
+def require_firmware_bus(bus: str) -> None:
+    """Refuse a bus for which the C firmware has no port. Raises InputError."""
+    if bus.partition(":")[0] not in ("socketcan", "udp_multicast"):
+        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP] for --controller c")
+
+
 def find_firmware_parameters(model: Model) -> dict[str, float]:
     """The parameters of the effects at work in a model's firmware."""
     acting = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].firmware]
@@ -98,6 +109,9 @@ def _start_node(job: Job, name: str) -> Child:
 
     It has its own session, so that Ctrl-C reaches the rig alone: clean-up needs its plant.
     """
+    if name == NAMES[CONTROLLER] and job.controller == "c":
+        words = [str(build_controller()), job.bus, "--parent", str(os.getpid())]
+        return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     effects = [word for path in job.effects for word in ("--effects", str(path))]
     if name == NAMES[CONTROLLER]:  # all else about the model comes by SDO
         for parameter, value in find_firmware_parameters(job.model).items():

@@ -153,7 +153,7 @@ class Session:
         """Reset, configure and start the nodes. Raises BusError."""
         job = self.job
         self._master.reset()
-        gains = firmware.read_gains(job.model) if job.controller == "builtin" else None
+        gains = firmware.read_gains(job.model) if job.controller != "external" else None
         if self._gains is None:
             self._gains = gains or self._master.read_gains()
         patient = not job.realtime and isinstance(self._clock, WallClock)

@@ -1,14 +1,24 @@
 """One device on an embedded bus, opposite a hand-made master: a test is a script of frames."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+
+from c_device import CDevice
 
 from dbc import EDS
 from rig.device import Device, NmtCommand
 from rig.network.bus import EmbeddedBus
-from rig.network.frame import Frame
+from rig.network.frame import Frame, Send
 
 MS = 1_000_000  # ns
+IMPLEMENTATIONS: dict[str, Callable[[int, Path, Send], Device | CDevice]] = {"python": Device, "c": CDevice}
+chosen = "python"  # set by the fixture `implementation`
+
+
+def make_device(node_id: int, eds: Path, send: Send) -> Device | CDevice:
+    """A CANopen slave in the language that is under test."""
+    return IMPLEMENTATIONS[chosen](node_id, eds, send)
 
 
 class Rack:
@@ -19,7 +29,7 @@ class Rack:
         self.heard: list[tuple[int, bytes]] = []
         self.bus = EmbeddedBus()
         self._send = self.bus.attach(self._hear)
-        self.device = self.bus.add(lambda send: Device(node, eds or EDS[node], send))
+        self.device = self.bus.add(lambda send: make_device(node, eds or EDS[node], send))
         if boot:
             self.wait(0)
             self.take()

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from c_device import CFirmware
+
 from plant import Model
 from rig.network import codec
 from rig.network.bus import EmbeddedBus
@@ -13,7 +15,9 @@ from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 
 MS = 1_000_000  # ns
-AnyNode = Emulator | Firmware
+AnyNode = Emulator | Firmware | CFirmware
+FIRMWARES: dict[str, type[Firmware] | type[CFirmware]] = {"python": Firmware, "c": CFirmware}
+chosen = "python"  # the firmware of `FirmwareDesk`; a fixture of the firmware's tests sets it
 
 
 class Desk:
@@ -100,10 +104,10 @@ class PlantDesk(Desk):
 class FirmwareDesk(Desk):
     """The reference firmware, fed with commands and feedback."""
 
-    node: Firmware
+    node: Firmware | CFirmware
 
     def __init__(self, model: Model | None = None) -> None:
-        super().__init__(lambda send: Firmware(send, model=model))
+        super().__init__(lambda send: FIRMWARES[chosen](send, model=model))
         self.k = 0
         self.nmt(1)
 

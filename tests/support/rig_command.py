@@ -73,7 +73,8 @@ def nodes_on(where: str) -> list[int]:
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 words = (entry / "cmdline").read_bytes().split(b"\0")
-                if b"node" in words and where.encode() in words and entry.name != str(os.getpid()):
+                is_node = b"node" in words or b"/controller-" in words[0]  # in Python, or the C firmware
+                if is_node and where.encode() in words and entry.name != str(os.getpid()):
                     found.append(int(entry.name))
     return found
 

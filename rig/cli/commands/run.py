@@ -28,8 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="virtual: the embedded bus in this process (default); or socketcan:can0, udp_multicast, ...")
     add("--pace", choices=("lockstep", "realtime"), default=None,
         help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time")
-    add("--controller", choices=("builtin", "external"), default=None,
-        help="firmware of node 2: the reference firmware (builtin, default), or your own on the bus (external)")
+    add("--controller", choices=("builtin", "c", "external"), default=None,
+        help="firmware of node 2: the reference firmware in Python (builtin, default) or in C (c: compiled and started "
+             "here), or your own on the bus (external)")
     add("--plant", choices=("auto", "builtin", "external"), default=None,
         help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)")
     add("--max-overruns", type=float, default=None, metavar="FRACTION",
@@ -50,6 +51,8 @@ def run_command(args: argparse.Namespace) -> int:
 
     job = read_job(args.source, args) if args.source else build_job(args)
     bus, why = choose_bus(job.bus if args.source and args.bus == "auto" else args.bus)
+    if job.controller == "c" and bus == "embedded" and args.bus == "auto":
+        bus, why = "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
     job = replace_settings(job, bus=bus)
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
     with (PageWriter(in_background=not job.realtime) as pages, catch_signals() as is_to_stop,

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 
 import canopen
 import pytest
+from device_bench import make_device
 
 from dbc import EDS
-from rig.device import Device, NmtState
+from rig.device import NmtState
 from rig.network.bus import EmbeddedBus
 from rig.network.frame import Frame
 
@@ -39,7 +40,7 @@ class Bench:
         bus = EmbeddedBus()
         self.master = Master(bus)
         self.remotes = {n: self.master.add_node(n, str(EDS[n])) for n in (2, 3)}
-        self.devices = {n: bus.add(lambda send, n=n: Device(n, EDS[n], send)) for n in (2, 3)}  # type: ignore[misc]
+        self.devices = {n: bus.add(lambda send, n=n: make_device(n, EDS[n], send)) for n in (2, 3)}  # type: ignore[misc]
         self._bus = bus
         self.wait(0)
 

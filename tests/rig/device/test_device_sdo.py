@@ -137,6 +137,15 @@ def test_unannounced_download_is_bounded() -> None:
     assert download(rack, "102200", bytes((1 << 20) + 7), announce=False) == abort("102200", Abort.MEMORY)
 
 
+def test_unannounced_download_is_bounded_by_the_object() -> None:
+    """The byte after the last one of a REAL64 ends the transfer, not the last segment."""
+    rack = Rack(2)
+    ask(rack, "20 102101 00000000")
+    assert ask(rack, "00 01020304050607").startswith("20")
+    assert ask(rack, "1a 08090000000000") == abort("102101", Abort.TOO_LONG)
+    assert ask(rack, "1d 08000000000000") == abort("102101", Abort.COMMAND)
+
+
 def test_application_may_refuse() -> None:
     rack = Rack(3)
 

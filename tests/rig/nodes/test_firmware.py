@@ -1,11 +1,13 @@
 """The reference firmware by scripts of frames: when current flows, how a fault is taken back, and that its law is the
-one the model has.
+one the model has. All tests run on the firmware in Python and on the one in C.
 """
 from __future__ import annotations
 
 import struct
 
+import node_bench
 import pytest
+from c_device import skip_without_compiler
 from node_bench import FirmwareDesk
 
 from plant.controller import Loop, compute_current
@@ -16,6 +18,15 @@ from rig.nodes.firmware import GAINS, LOST_AFTER, Gains
 
 ACTIVE, RESET = int(Control.ACTIVE), int(Control.RESET)
 GIVEN = Gains(2.0, 30.0, 1e-3, 8e-3, 1e-3)
+
+
+@pytest.fixture(params=list(node_bench.FIRMWARES), autouse=True)
+def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The language of the firmware."""
+    if request.param == "c":
+        skip_without_compiler()
+    monkeypatch.setattr(node_bench, "chosen", request.param)
+    return str(request.param)
 
 
 def lose_feedback(desk: FirmwareDesk) -> None:
@@ -137,3 +148,15 @@ def test_a_gain_must_be_a_number(value: float) -> None:
     desk = FirmwareDesk()
     assert set_gain(desk, 1, value) == Abort.VALUE
     assert desk.cycle(ACTIVE, 1e-3) is not None
+
+
+@pytest.mark.parametrize(("sub", "value", "is_taken"), [
+    (4, -1e-3, False), (4, 0.0, True), (5, 0.0, False), (5, -1e-3, False), (5, 5e-324, True),
+])
+def test_a_negative_limit_and_a_period_of_zero_are_refused(sub: int, value: float, is_taken: bool) -> None:
+    desk = FirmwareDesk()
+    assert set_gain(desk, 3, 1.0) == 0  # with a derivative part the period is divided by
+    assert set_gain(desk, sub, value) == (0 if is_taken else Abort.VALUE)
+    desk.nmt(128)
+    desk.nmt(1)
+    assert [desk.cycle(ACTIVE, 1e-3 * k) is not None for k in range(3)] == [True] * 3

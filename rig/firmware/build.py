@@ -1,0 +1,70 @@
+"""Compiles the reference firmware; the program is kept under a hash of its sources and of the compiler."""
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from plant.compile import find_cache_folder
+from plant.errors import InputError, RigError
+
+FOLDER = Path(__file__).parent
+# Without fused multiply-add, so that the control law gives the bits of plant/controller.py.
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-pedantic")
+
+
+def build_controller() -> Path:
+    """The controller for SocketCAN and the project's UDP bus as a program of this machine, compiled if necessary.
+
+    Raises:
+        InputError: no C compiler is installed.
+        RigError: the compiler reports an error.
+    """
+    return build_program("controller", sorted(FOLDER.glob("*.c")), FLAGS)
+
+
+def build_program(name: str, sources: Sequence[Path], flags: Sequence[str]) -> Path:
+    """Compile and link C `sources` (headers: this folder and theirs) to a program or library in the cache folder.
+
+    Raises:
+        InputError: no C compiler is installed.
+        RigError: the compiler reports an error.
+    """
+    compiler = find_compiler()
+    folders = [FOLDER, *{source.parent for source in sources}]
+    files = sorted({*sources, *(path for folder in folders for path in folder.glob("*.h"))})
+    digest = hashlib.sha256(repr((compiler, Path(compiler).stat().st_mtime_ns, flags)).encode())
+    for path in files:
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    program = find_cache_folder() / f"{name}-{digest.hexdigest()[:16]}"
+    if not program.exists():
+        program.parent.mkdir(parents=True, exist_ok=True)
+        _compile(compiler, [*flags, *(f"-I{folder}" for folder in folders), *map(str, sources)], program)
+    return program
+
+
+def find_compiler() -> str:
+    """The path of the C compiler. Raises InputError if there is none."""
+    for name in ("gcc", "cc", "clang"):
+        if found := shutil.which(name):
+            return found
+    raise InputError("--controller", "c", "a C compiler to build the firmware with: apt-get install gcc libc6-dev")
+
+
+def _compile(compiler: str, words: Sequence[str], program: Path) -> None:
+    """Run the compiler; the finished program takes its name in one step, because two runs may build at once."""
+    handle, unfinished = tempfile.mkstemp(prefix=f"{program.name}.", dir=program.parent)
+    os.close(handle)
+    try:
+        done = subprocess.run([compiler, *words, "-o", unfinished, "-lm"], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
+            raise RigError(f"{compiler}: {(lines or ['no message'])[0]}")
+        Path(unfinished).chmod(0o755)
+        Path(unfinished).replace(program)
+    finally:
+        Path(unfinished).unlink(missing_ok=True)

@@ -1,0 +1,20 @@
+/* One classical CAN data frame with an 11-bit identifier, and where the frames of a node go. */
+#ifndef FRAME_H
+#define FRAME_H
+
+#include <stdint.h>
+
+struct frame {
+    int64_t t_ns; /* time of reception by the port's clock */
+    uint16_t cob_id;
+    uint8_t length; /* bytes of data, 0..8 */
+    uint8_t data[8];
+};
+
+/* The way out of a node: `send` puts one frame on the bus; `context` is the port's own. */
+struct output {
+    void (*send)(void *context, uint16_t cob_id, const uint8_t *data, uint8_t length);
+    void *context;
+};
+
+#endif

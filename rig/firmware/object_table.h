@@ -1,0 +1,78 @@
+/* Objects of node 2, generated from dbc/node2.eds by object_table.py: do not edit. */
+#ifndef OBJECT_TABLE_H
+#define OBJECT_TABLE_H
+
+#include "dictionary.h"
+
+/* positions in the table and in the values, OBJECT_(index)_(sub-index) */
+enum {
+    OBJECT_1000_00,
+    OBJECT_1001_00,
+    OBJECT_1003_00,
+    OBJECT_1003_01,
+    OBJECT_1003_02,
+    OBJECT_1003_03,
+    OBJECT_1003_04,
+    OBJECT_1003_05,
+    OBJECT_1003_06,
+    OBJECT_1003_07,
+    OBJECT_1003_08,
+    OBJECT_1005_00,
+    OBJECT_1006_00,
+    OBJECT_1008_00,
+    OBJECT_1009_00,
+    OBJECT_100A_00,
+    OBJECT_1014_00,
+    OBJECT_1016_00,
+    OBJECT_1016_01,
+    OBJECT_1017_00,
+    OBJECT_1018_00,
+    OBJECT_1018_01,
+    OBJECT_1018_02,
+    OBJECT_1018_03,
+    OBJECT_1018_04,
+    OBJECT_1029_00,
+    OBJECT_1029_01,
+    OBJECT_1200_00,
+    OBJECT_1200_01,
+    OBJECT_1200_02,
+    OBJECT_1400_00,
+    OBJECT_1400_01,
+    OBJECT_1400_02,
+    OBJECT_1401_00,
+    OBJECT_1401_01,
+    OBJECT_1401_02,
+    OBJECT_1600_00,
+    OBJECT_1600_01,
+    OBJECT_1600_02,
+    OBJECT_1600_03,
+    OBJECT_1601_00,
+    OBJECT_1601_01,
+    OBJECT_1601_02,
+    OBJECT_1800_00,
+    OBJECT_1800_01,
+    OBJECT_1800_02,
+    OBJECT_1A00_00,
+    OBJECT_1A00_01,
+    OBJECT_1A00_02,
+    OBJECT_1A00_03,
+    OBJECT_2100_00,
+    OBJECT_2101_00,
+    OBJECT_2102_00,
+    OBJECT_2103_00,
+    OBJECT_2104_00,
+    OBJECT_2105_00,
+    OBJECT_2110_00,
+    OBJECT_2110_01,
+    OBJECT_2110_02,
+    OBJECT_2110_03,
+    OBJECT_2110_04,
+    OBJECT_2110_05,
+    OBJECT_6040_00,
+    OBJECT_6041_00,
+    OBJECT_COUNT
+};
+
+extern const struct object OBJECT_TABLE[OBJECT_COUNT];
+
+#endif

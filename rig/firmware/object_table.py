@@ -1,0 +1,61 @@
+"""Writes the firmware's object table (object_table.h, object_table.c) from the EDS of node 2.
+
+    python -m rig.firmware.object_table
+
+A test compares the two files with the EDS, so they cannot differ from it unnoticed.
+"""
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from dbc import EDS
+from rig.device.dictionary import Dictionary, Entry, Value
+
+FOLDER = Path(__file__).parent
+_KINDS = {"f": "KIND_REAL", "d": "KIND_REAL", **dict.fromkeys("bhiq", "KIND_SIGNED")}
+
+
+def write_object_table(node: int = 2) -> dict[str, str]:
+    """The two C files, name to text, for the EDS of `node`. Raises InputError for an EDS that cannot be read."""
+    entries = sorted(Dictionary(EDS[node], node).entries.items())
+    header = [
+        f"/* Objects of node {node}, generated from dbc/node{node}.eds by object_table.py: do not edit. */",
+        "#ifndef OBJECT_TABLE_H", "#define OBJECT_TABLE_H", "", '#include "dictionary.h"', "",
+        "/* positions in the table and in the values, OBJECT_(index)_(sub-index) */", "enum {",
+        *(f"    {_name_position(*key)}," for key, _ in entries), "    OBJECT_COUNT", "};", "",
+        "extern const struct object OBJECT_TABLE[OBJECT_COUNT];", "", "#endif", "",
+    ]  # fmt: skip
+    source = ["/* Generated, see object_table.h. */", '#include "object_table.h"', "",
+              "const struct object OBJECT_TABLE[OBJECT_COUNT] = {"]  # fmt: skip
+    for key, entry in entries:
+        source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry)},"]
+    return {"object_table.h": "\n".join(header), "object_table.c": "\n".join([*source, "};", ""])}
+
+
+def _name_position(index: int, sub: int) -> str:
+    return f"OBJECT_{index:04X}_{sub:02X}"
+
+
+def _write_entry(index: int, sub: int, entry: Entry) -> str:
+    is_text = isinstance(entry.default, bytes)
+    kind = "KIND_TEXT" if is_text else _KINDS.get(entry.code, "KIND_UNSIGNED")
+    flags = {"READABLE": entry.readable, "WRITABLE": entry.writable, "MAPPABLE": entry.mappable,
+             "HAS_LOW_LIMIT": entry.low is not None, "HAS_HIGH_LIMIT": entry.high is not None}
+    words = " | ".join(name for name, is_set in flags.items() if is_set) or "0"
+    text = f'"{entry.default.decode("ascii")}"' if isinstance(entry.default, bytes) else "NULL"
+    length = len(entry.default) if isinstance(entry.default, bytes) else 0
+    return (f"{{0x{index:04X}, 0x{sub:02X}, {kind}, {struct.calcsize('<' + entry.code)}, {words}, "
+            f"{_write_bits(entry.code, entry.default)}, {entry.low or 0}, {entry.high or 0}, {text}, {length}}}")
+
+
+def _write_bits(code: str, value: Value) -> str:
+    """The bits of a number as an unsigned integer constant."""
+    if isinstance(value, bytes):
+        return "0"
+    return f"0x{int.from_bytes(struct.pack('<' + code, value), 'little'):X}u" + ("ll" if code in "dqQ" else "")
+
+
+if __name__ == "__main__":
+    for name, text in write_object_table().items():
+        (FOLDER / name).write_text(text)

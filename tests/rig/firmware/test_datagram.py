@@ -1,0 +1,77 @@
+"""The datagrams of the C firmware's UDP port are python-can's: read what it packs, pack what it reads."""
+from __future__ import annotations
+
+import ctypes
+
+import can
+import pytest
+from c_device import CFrame, load_library, skip_without_compiler
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+settings.register_profile("unhurried", deadline=None)  # the first call may compile, and the machine may be busy
+settings.load_profile("unhurried")
+frames = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))
+
+
+@pytest.fixture(autouse=True)
+def compiler() -> None:
+    """These tests need the firmware compiled."""
+    skip_without_compiler()
+    load_library()
+
+
+def unpack(data: bytes) -> tuple[int, bytes] | None:
+    """COB-ID and data that the firmware reads from a datagram; None for what it leaves out."""
+    frame = CFrame()
+    exact = (ctypes.c_uint8 * len(data))(*data)  # reading beyond the end would be another object's memory
+    if not load_library().datagram_unpack(exact, ctypes.c_size_t(len(data)), ctypes.byref(frame)):
+        return None
+    return frame.cob_id, bytes(frame.data[: frame.length])
+
+
+@given(frames, st.booleans())
+def test_it_reads_what_python_can_packs(frame: tuple[int, bytes], is_named: bool) -> None:
+    cob_id, data = frame
+    message = can.Message(timestamp=1.5e9, arbitration_id=cob_id, data=data, is_extended_id=False,
+                          channel="239.0.0.1" if is_named else None)  # fmt: skip
+    assert unpack(pack_message(message)) == frame
+
+
+@given(frames)
+def test_python_can_reads_what_it_packs(frame: tuple[int, bytes]) -> None:
+    cob_id, data = frame
+    packed = (ctypes.c_uint8 * 256)()
+    load_library().datagram_pack.restype = ctypes.c_size_t
+    size = load_library().datagram_pack(
+        ctypes.byref(CFrame(0, cob_id, len(data), (ctypes.c_uint8 * 8)(*data))), packed)
+    message = unpack_message(bytes(packed[:size]), check=True)
+    assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (cob_id, data, False)
+
+
+@pytest.mark.parametrize("flags", [
+    {"is_extended_id": True}, {"is_remote_frame": True}, {"is_error_frame": True}, {"is_fd": True},
+])
+def test_it_leaves_out_other_frames(flags: dict[str, bool]) -> None:
+    message = can.Message(arbitration_id=0x182, **({"is_extended_id": False} | flags))
+    assert unpack(pack_message(message)) is None
+
+
+@given(st.binary(max_size=300))
+def test_foreign_bytes_are_no_frame_unless_python_can_reads_one(data: bytes) -> None:
+    unpack(data)
+
+
+@given(frames, st.integers(0, 200), st.integers(0, 255))
+def test_a_damaged_datagram_gives_at_most_a_frame_of_eight_bytes(frame: tuple[int, bytes], at: int, byte: int) -> None:
+    """Undefined behaviour ends the process, because the library is built with its sanitizer."""
+    packed = bytearray(pack_message(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False)))
+    packed[at % len(packed)] = byte
+    found = unpack(bytes(packed))
+    assert found is None or (found[0] <= 0x7FF and len(found[1]) <= 8)
+
+
+def test_a_datagram_that_was_cut_is_no_frame() -> None:
+    packed = pack_message(can.Message(arbitration_id=0x182, data=bytes(8), is_extended_id=False))
+    assert [cut for cut in range(len(packed)) if unpack(packed[:cut])] == []
