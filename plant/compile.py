@@ -7,13 +7,14 @@ so a changed effect is never served by stale code: numba's own cache looks at on
 """
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dis
 import hashlib
 import math
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -99,6 +100,23 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
             return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
         finally:
             settings.CACHE_DIR = before
+
+
+@contextlib.contextmanager
+def list_compilations() -> Iterator[list[str]]:
+    """An entry for each time that numba's compiler is entered while the context lasts, to compile or to load code."""
+    import numba.core.event
+
+    entries: list[str] = []
+
+    class Listener(numba.core.event.Listener):
+        def on_start(self, event: Any) -> None:
+            entries.append(str(event.data))
+
+        def on_end(self, event: Any) -> None: ...
+
+    with numba.core.event.install_listener("numba:compiler_lock", Listener()):
+        yield entries
 
 
 # no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only

@@ -13,6 +13,8 @@ from can.interfaces.socketcan import SocketcanBus
 
 from plant.errors import RigError
 from rig.network.frame import Frame
+from rig.network.raw_bus import attach_filter
+from rig.network.udp import LoopbackBus
 
 _CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
 _TIMESPEC = struct.Struct("@qq")
@@ -78,7 +80,9 @@ class Link:
     def leave_out(self, cob_ids: Collection[int]) -> None:
         """Frames with these COB-IDs are no longer received (another socket does); an empty collection: all are."""
         self._left_out = frozenset(cob_ids)
-        if self._socket is not None:
+        if isinstance(self._bus, LoopbackBus):
+            attach_filter(self._bus.receiver, self._bus.own_port, sorted(cob_ids), refuses=True)
+        elif self._socket is not None:
             exact = _IDENTIFIER | _EXTENDED | _REMOTE
             others = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(cob_ids)]
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(others)))

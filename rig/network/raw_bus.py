@@ -591,8 +591,9 @@ def set_receive_options(raw: socket.socket) -> None:
     raw.setsockopt(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
 
-def attach_filter(raw: socket.socket, own_port: int, cob_ids: Sequence[int] | None) -> None:
-    """A socket filter (classic BPF): no datagram from `own_port`, and of python-can's layout only these COB-IDs.
+def attach_filter(raw: socket.socket, own_port: int, cob_ids: Sequence[int] | None, refuses: bool = False) -> None:
+    """A socket filter (classic BPF): no datagram from `own_port`, and of python-can's layout only these COB-IDs, or, if
+    it `refuses`, all but these.
 
     A datagram of another layout passes; it is decoded by whoever reads it.
     """
@@ -608,8 +609,9 @@ def attach_filter(raw: socket.socket, own_port: int, cob_ids: Sequence[int] | No
                     (at_least, 0, 6, 0x80),
                     (equal, 0, 2, 0xCC), (load_byte, 0, 0, 8 + 36), (always, 0, 0, 3),
                     (equal, 1, 0, 0xCD), (give, 0, 0, accept), (load_half, 0, 0, 8 + 36)]
-        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id), (give, 0, 0, accept))]
-        program.append((give, 0, 0, drop))
+        named, others = (drop, accept) if refuses else (accept, drop)
+        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id), (give, 0, 0, named))]
+        program.append((give, 0, 0, others))
     else:
         program.append((give, 0, 0, accept))
     steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))

@@ -76,6 +76,16 @@ class LoopbackBus(can.BusABC):
     def fileno(self) -> int:
         return self._rx.fileno()
 
+    @property
+    def receiver(self) -> socket.socket:
+        """The socket that receives."""
+        return self._rx
+
+    @property
+    def own_port(self) -> int:
+        """The UDP port that this bus sends from."""
+        return int(self._own[1])
+
     def shutdown(self) -> None:
         super().shutdown()
         self._rx.close()

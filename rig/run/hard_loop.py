@@ -31,7 +31,7 @@ from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import Delay, Schedule
 
-_RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
+RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
 _US = 1000  # ns
 
 
@@ -42,7 +42,7 @@ def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, pe
         RigError: the bus cannot be opened.
     """
     if can_open(bus) and isinstance(master.wire, LinkWire):
-        return HardLoop(master, faults, log, open_raw_bus(bus, _RECEIVED), period_ns, realtime)
+        return HardLoop(master, faults, log, open_raw_bus(bus, RECEIVED), period_ns, realtime)
     return CycleLoop(master, faults, log, period_ns, realtime)
 
 
@@ -87,7 +87,7 @@ class HardLoop:
         self.scheduler = ""
         self._write_frame, master.on_frame = master.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
-        wire.link.leave_out(_RECEIVED)
+        wire.link.leave_out(RECEIVED)
         self._warm_up()
         self._t_ns = wire.clock.now() + period_ns  # lockstep: time of the cycle under way or to come
 

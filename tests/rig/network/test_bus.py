@@ -1,6 +1,7 @@
 """One set of tests for every back end, then what is particular to each."""
 from __future__ import annotations
 
+import select
 import socket
 import struct
 import time
@@ -17,6 +18,7 @@ from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
+from rig.network.udp import LoopbackBus
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
@@ -146,6 +148,33 @@ class TestEveryBus:
                 node.tick(0)
                 for frame in place.poll(0.0005):
                     node.receive(frame)
+
+
+class TestLeavingOut:
+    """A link leaves out the frames that another socket of its program receives."""
+
+    @pytest.mark.parametrize("bus_kind", ["virtual", "udp_multicast", "socketcan"], indirect=True)
+    def test_frames_are_left_out_and_taken_again(self, bus_kind: str) -> None:
+        identifiers = (0x000, 0x07F, 0x080, 0x0FF, 0x182, 0x183, 0x202, 0x7FF)
+        with stations(bus_kind, 2) as (sender, receiver):
+            assert isinstance(receiver, Link)
+            for left_out in ((0x080, 0x182, 0x000), (), (0x7FF, 0x07F), ()):
+                receiver.leave_out(left_out)
+                for cob_id in (*identifiers, 0x123):
+                    sender.send(cob_id, b"1")
+                expected = [cob_id for cob_id in identifiers if cob_id not in left_out]
+                assert [frame.cob_id for frame in gather(receiver, len(expected) + 1)] == [*expected, 0x123]
+            receiver.send(0x100, b"2")
+            assert gather(receiver, 1, timeout=0.05) == []
+
+    @only_udp
+    def test_the_kernel_drops_them(self, bus_kind: str) -> None:
+        """They wake nobody: nothing is there to be read."""
+        with stations(bus_kind, 2) as (sender, receiver):
+            assert isinstance(receiver, Link) and isinstance(receiver._bus, LoopbackBus)
+            receiver.leave_out([codec.SYNC])
+            sender.send(codec.SYNC, b"")
+            assert select.select([receiver._bus], [], [], 0.1)[0] == []
 
 
 class TestSocketcan:

@@ -1,0 +1,387 @@
+"""The compiled cycle on a real bus, against nodes that answer as the script says."""
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from math import isnan
+
+import pytest
+from bus_stations import spec
+
+from plant.compile import list_compilations
+from plant.errors import RigError
+from rig.network import codec
+from rig.network.bus import open_can
+from rig.network.clock import WallClock
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.network.master import Master
+from rig.network.raw_bus import open_raw_bus
+from rig.network.turn import Turn
+from rig.network.udp import PORT
+from rig.network.wire import LinkWire
+from rig.recorder import Signals, Timing
+from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
+from rig.run.loop import CycleInput
+from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
+
+PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
+raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
+
+
+class Nodes(threading.Thread):
+    """Plant and controller: three answers to each SYNC, the number of the cycle in each value. Keeps what it hears."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(daemon=True)
+        self.heard: list[Frame] = []
+        self.mute = False
+        self._command = self._syncs = 0
+        self._end = threading.Event()
+        self._link = Link(open_can(where), time.monotonic_ns)
+        self.start()
+
+    def run(self) -> None:
+        while not self._end.is_set():
+            for frame in self._link.poll(0.02):
+                self.heard.append(frame)
+                if frame.cob_id == codec.SYNC and not self.mute:
+                    k = self._syncs
+                    self._link.send(codec.FEEDBACK, codec.pack_feedback(k * 1e-6, k * 10.0))
+                    self._link.send(codec.VALVE_STATE, codec.pack_valve_state(k * 1e-9, 0, k))
+                    self._link.send(codec.DRIVE, codec.pack_drive(k * 1e-8, 15, k))
+                self._syncs += frame.cob_id == codec.SYNC
+
+    def close(self) -> None:
+        self._end.set()
+        self.join()
+        self._link.close()
+
+    def commands(self) -> list[codec.Command]:
+        return [codec.unpack_command(frame.data) for frame in self.heard if frame.cob_id == codec.COMMAND]
+
+    def order(self) -> list[str]:
+        """Commands and SYNCs as they were heard: c3 is the command of cycle 3."""
+        names, syncs = [], 0
+        for frame in self.heard:
+            if frame.cob_id == codec.SYNC:
+                names.append(f"s{syncs}")
+                syncs += 1
+            elif frame.cob_id == codec.COMMAND:
+                names.append(f"c{codec.unpack_command(frame.data).cycle}")
+        return names
+
+
+class Bench:
+    """A hard loop on a bus with nodes, and a log of all it says."""
+
+    def __init__(self, where: str, realtime: bool, faults: tuple[Fault, ...], ahead: int) -> None:
+        clock = WallClock()
+        self.where = where
+        self.nodes = Nodes(where)
+        self.wire = LinkWire(Link(open_can(where), clock.now), clock, 0.5)
+        self.rows: list[Signals] = []
+        self.timings: list[Timing] = []
+        self.times: list[int] = []
+        self.frames: list[Frame] = []
+        self.master = Master(self.wire, lambda: self.loop.now(), realtime)
+        self.master.on_frame = self.frames.append
+        schedule = Schedule(Plan(faults=faults, stop=1000))
+        bus = open_raw_bus(where, RECEIVED)
+        self.loop = HardLoop(self.master, schedule, self, bus, PERIOD, realtime, ahead)
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        self.times.append(t_ns)
+        self.rows.append(signals)
+        self.timings.append(timing)
+
+    def play(self, *cycles: int, control: int = 7, phase: int = 1) -> None:
+        """Give inputs whose demand is their number in 0.1 um."""
+        for k in cycles:
+            self.loop.cycle(CycleInput(phase, k * 1e-7, float(k), control))
+
+    def demands(self) -> list[int]:
+        return [round(row.com * 1e7) for row in self.rows]
+
+
+@contextmanager
+def bench(kind: str, realtime: bool, *faults: Fault, ahead: int = 50) -> Iterator[Bench]:
+    one = Bench(spec(kind), realtime, faults, ahead)
+    try:
+        yield one
+    finally:
+        one.loop.close()
+        one.nodes.close()
+        one.wire.close()
+
+
+paces = pytest.mark.parametrize("realtime", [False, True], ids=["lockstep", "realtime"])
+
+
+@raw_kinds
+@paces
+def test_a_row_holds_what_belongs_together(bus_kind: str, realtime: bool) -> None:
+    with bench(bus_kind, realtime) as one:
+        one.play(*range(30))
+        one.loop.finish()
+        assert [row.cycle for row in one.rows] == one.demands() == list(range(30))
+        assert all(later - earlier == PERIOD for earlier, later in pairwise(one.times)) or realtime
+        answered = [row for row in one.rows if not (isnan(row.xj) or isnan(row.xs) or isnan(row.cor))]
+        assert len(answered) == 30 or realtime  # a machine that stood still has lost some
+        for row in answered:
+            k = row.cycle
+            assert (row.xj, row.p12, row.xs, row.cor) == pytest.approx((k * 1e-6, k * 10.0, k * 1e-9, k * 1e-8))
+            assert (row.phase, row.load, row.control, row.status, row.flags) == (1, float(k), 7, 15, 0)
+        assert one.nodes.order()[:6] == ["c0", "s0", "c1", "s1", "c2", "s2"]
+        assert all(timing.execution > 0 for timing in one.timings)
+        for timing in (one.timings[row.cycle] for row in answered):
+            assert 0 < timing.feedback_response <= timing.valve_response <= timing.response <= timing.work
+
+
+@raw_kinds
+@paces
+def test_every_frame_reaches_the_log_once_and_in_order(bus_kind: str, realtime: bool) -> None:
+    """Those of the cycle, and those that the services send and receive on their own socket."""
+    with bench(bus_kind, realtime) as one:
+        other = Link(open_can(one.where), time.monotonic_ns)
+        one.master._beat.configure(1, one.wire.clock.now())
+        for k in range(30):
+            one.play(k)
+            other.send(0x123, bytes([k]))
+        one.loop.finish()
+        other.close()
+        time.sleep(0.1)
+        one.wire.poll(0.0)
+        one.loop.close()
+        assert all(earlier.t_ns <= later.t_ns for earlier, later in pairwise(one.frames))
+        logged = [(frame.cob_id, frame.data) for frame in one.frames]
+        assert [data[0] for cob_id, data in logged if cob_id == 0x123] == list(range(30))
+        heard = [(frame.cob_id, frame.data) for frame in one.nodes.heard]
+        for cob_id in (codec.COMMAND, codec.SYNC, 0x701):
+            mine = [data for each, data in logged if each == cob_id]
+            assert mine == [data for each, data in heard if each == cob_id] and mine
+        assert sum(cob_id == codec.DRIVE for cob_id, _ in logged) == 30
+
+
+@raw_kinds
+@paces
+def test_nothing_is_compiled_once_the_loop_is_made(bus_kind: str, realtime: bool) -> None:
+    with bench(bus_kind, realtime) as one, list_compilations() as entries:
+        one.play(*range(10))
+        one.loop.hold(2)
+        one.play(*range(10))
+        one.loop.finish()
+        assert entries == []
+        compile_cycle.cache_clear()
+        compile_cycle(realtime)
+        assert entries  # the listener hears
+
+
+@raw_kinds
+@paces
+def test_commands_lost_and_late(bus_kind: str, realtime: bool) -> None:
+    faults = (Lost(frame="command", start=0.001, end=0.002), Late(frame="command", start=0.003, end=0.004, delay=4e-3),
+              Late(frame="command", start=0.005, end=0.006, delay=25e-3))
+    with bench(bus_kind, realtime, *faults) as one:
+        one.play(*range(12))
+        one.loop.finish()
+        time.sleep(0.05)
+        order = one.nodes.order()
+        assert [name for name in order if name[0] == "s"] == [f"s{k}" for k in range(12)]
+        assert [name for name in order if name[0] == "c" and name not in ("c3", "c5")] == [
+            f"c{k}" for k in range(12) if k not in (1, 3, 5)]
+        assert order.index("s3") < order.index("c3") < order.index("s4")
+        assert order.index("s7") < order.index("c5") < order.index("s8")
+
+
+@raw_kinds
+def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str) -> None:
+    with bench(bus_kind, True, Silent(node="rig", start=0.010, end=0.030)) as one:
+        one.master._beat.configure(10, one.wire.clock.now())
+        one.play(*range(60))
+        one.loop.finish()
+        time.sleep(0.05)
+        syncs, beats = 0, set()
+        for frame in one.nodes.heard:
+            syncs += frame.cob_id == codec.SYNC
+            if frame.cob_id == 0x701:
+                beats.add(syncs)
+        assert min(beats) < 11 and max(beats) > 31 and not beats & set(range(13, 29))
+
+
+@raw_kinds
+def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
+    """And each such cycle counts as an overrun: the bench did not do what the sequence says."""
+    with bench(bus_kind, True, ahead=10) as one:
+        one.play(*range(5))
+        while one.loop.k < 12:
+            one.loop.serve()
+        one.play(20, 21)
+        one.loop.finish()
+        held = one.demands().count(4) - 1
+        assert one.demands() == [0, 1, 2, 3, *[4] * (held + 1), 20, 21] and held >= 7
+        assert [row.cycle for row in one.rows] == list(range(held + 7))
+        assert [k for k, timing in enumerate(one.timings) if timing.overrun][:7] == list(range(5, 12))
+        assert one.loop.underruns == held <= one.loop.overruns
+        assert {row.control for row in one.rows} == {7}
+
+
+@raw_kinds
+def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
+    with bench(bus_kind, True) as one:
+        one.play(*range(10))
+        assert one.loop.wait_until_played(lambda: False) and one.loop.waiting == 0
+        assert one.loop.hold(2) == pytest.approx(9e-7)
+        while one.loop.k < 14:
+            one.loop.serve()
+        one.play(30, phase=2)
+        one.loop.finish()
+        assert one.loop.underruns == 0
+        assert [row.phase for row in one.rows] == [1] * 10 + [2] * (len(one.rows) - 10)
+        assert one.demands()[-1] == 30 and set(one.demands()[10:-1]) == {9}
+
+
+@raw_kinds
+def test_hold_discards_what_is_queued(bus_kind: str) -> None:
+    """An abort: nothing of the rest is sent, and clean-up begins where the demand was."""
+    with bench(bus_kind, True, ahead=500) as one:
+        one.play(*range(400))
+        while one.loop.k < 5:
+            one.loop.serve()
+        demand = round(one.loop.hold(2) * 1e7)
+        assert 4 <= demand < 400
+        one.play(1000, phase=2)
+        one.loop.finish()
+        assert one.demands()[:demand + 1] == list(range(demand + 1))
+        assert set(one.demands()[demand + 1:-1]) <= {demand} and one.demands()[-1] == 1000
+        assert {row.phase for row in one.rows[demand + 1:]} == {2}
+        assert one.loop.underruns == 0
+        time.sleep(0.05)
+        assert max(round(command.position * 1e7) for command in one.nodes.commands()[:-1]) == demand
+
+
+@raw_kinds
+def test_the_control_word_is_overridden_in_the_next_cycle(bus_kind: str) -> None:
+    with bench(bus_kind, True, ahead=100) as one:
+        one.play(*range(60))
+        while one.loop.k < 5:
+            one.loop.serve()
+        one.loop.override_control(0)
+        now = one.loop.k
+        one.play(60, 61, control=3)
+        one.loop.finish()
+        words = [row.control for row in one.rows]
+        first = words.index(0)
+        assert now <= first <= now + 1
+        assert words == [7] * first + [0] * (60 - first) + [3, 3]
+        time.sleep(0.05)
+        assert [command.control for command in one.nodes.commands()] == words
+
+
+@only_udp
+def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
+    """The turn to send on the bus is held for 5 periods: no burst follows, and the grid stays."""
+    with bench(bus_kind, True) as one:
+        turn = Turn(one.where.partition(":")[2], PORT)
+        one.play(*range(20))
+        while one.loop.k < 5:
+            one.loop.serve()
+        turn.take()
+        time.sleep(5.2 * PERIOD * 1e-9)
+        turn.give()
+        turn.close()
+        one.loop.finish()
+        steps = [(later - earlier) / PERIOD for earlier, later in pairwise(one.times)]
+        assert all(step == round(step) >= 1 for step in steps) and max(steps) >= 4
+        late = [k for k, timing in enumerate(one.timings) if timing.lateness > 0.5 * PERIOD * 1e-9]
+        assert late and all(one.timings[k].overrun for k in late)
+        assert one.loop.overruns >= 4
+        assert [row.cycle for row in one.rows] == list(range(20))
+        sent = [frame.t_ns for frame in one.frames if frame.cob_id == codec.SYNC]
+        assert len(sent) == 20
+
+
+@raw_kinds
+@paces
+def test_what_does_not_come_is_missing(bus_kind: str, realtime: bool) -> None:
+    with bench(bus_kind, realtime) as one:
+        one.nodes.mute = True
+        one.play(0, 1)
+        one.loop.finish()
+        for row, timing in zip(one.rows, one.timings, strict=True):
+            assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
+            assert all(map(isnan, (timing.feedback_response, timing.valve_response)))
+
+
+@raw_kinds
+def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> None:
+    """Five cycles wait for half a second, the others for a tenth of that."""
+    with bench(bus_kind, False) as one:
+        one.nodes.mute = True
+        before = one.wire.clock.now()
+        one.play(*range(25))
+        assert one.wire.clock.now() - before < 10e9
+        one.nodes.mute = False
+        one.play(25)
+        one.loop.finish()
+        assert one.rows[-1].xj == pytest.approx(25e-6)
+
+
+@raw_kinds
+@paces
+def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtime: bool) -> None:
+    with bench(bus_kind, realtime) as one:
+        one.nodes.mute = True
+        stranger = Link(open_can(one.where), time.monotonic_ns)
+        for k in range(3):
+            for cob_id in (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE):
+                stranger.send(cob_id, bytes(7))
+            stranger.send(codec.DRIVE, codec.pack_drive(1e-3, 15, k + 77))
+            stranger.send(codec.VALVE_STATE, codec.pack_valve_state(1e-3, 0, k + 77))
+            one.play(k)
+        one.loop.finish()
+        stranger.close()
+        assert all(isnan(row.xj) and isnan(row.xs) and isnan(row.cor) for row in one.rows)
+
+
+@raw_kinds
+@paces
+def test_a_second_rig_is_told(bus_kind: str, realtime: bool) -> None:
+    with bench(bus_kind, realtime) as one:
+        rivals: list[int] = []
+        one.master.on_rival = rivals.append
+        one.play(0, 1)
+        rig = Link(open_can(one.where), time.monotonic_ns)
+        rig.send(codec.COMMAND, struct.pack("<iHH", 0, 7, 500))
+        rig.send(0x000, b"\x80\x00")
+        one.play(*range(2, 10))
+        one.loop.finish()
+        rig.close()
+        assert sorted(rivals) == [0x000, codec.COMMAND]
+
+
+@only_udp
+@paces
+def test_a_bus_that_fails_is_an_error_of_one_line(bus_kind: str, realtime: bool) -> None:
+    """Somebody removes the semaphores of the turn."""
+    with bench(bus_kind, realtime) as one:
+        turn = Turn(one.where.partition(":")[2], PORT)
+        one.play(0)
+        assert turn._library.semctl(turn.identifier, 0, 0) == 0
+        with pytest.raises(RigError, match="turn to send was lost") as caught:
+            one.play(*range(1, 200))
+        assert "\n" not in str(caught.value)
+
+
+def test_closing_ends_the_thread_whatever_is_queued() -> None:
+    before = threading.active_count()
+    with bench("udp_multicast", True, ahead=500) as one:
+        one.play(*range(400))
+        assert threading.active_count() > before
+    assert threading.active_count() == before
+    assert len(one.rows) < 400 and one.demands() == list(range(len(one.rows)))
