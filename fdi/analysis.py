@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fdi.foreign_code import load_effects_of_model
 from fdi.output import write_text
 from fdi.report.report import Figure, Medium, Report
 from fdi.trace.trace import Trace
@@ -195,7 +196,7 @@ def read_trace(path: str | Path) -> Trace:
 
 
 def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
-            signals: Sequence[str] | None = None) -> ComparisonResult:
+            signals: Sequence[str] | None = None, trust: bool = False) -> ComparisonResult:
     """Compare a model with a trace: how large the error is beside the noise floor, where, when and in which block.
 
     Args:
@@ -203,6 +204,7 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         model: a `Model`, a model file, or the name of a nominal plant.
         repeats: runs of the same command; they measure the noise floor.
         signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
         InputError: a trace, a model or a signal that cannot be used.
@@ -211,14 +213,14 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     from fdi.report.compare_report import build_comparison_report
 
     measured = _load_trace(trace)
-    comparison = compare_trace(measured, _load_model(model), [_load_trace(r) for r in repeats], signals,
+    comparison = compare_trace(measured, _load_model(model, trust), [_load_trace(r) for r in repeats], signals,
                                source=_name_trace(trace))
     return ComparisonResult(build_comparison_report(comparison), comparison)
 
 
 def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence[TraceOrPath] = (),
             holdout: TraceOrPath | None = None, signals: Sequence[str] | None = None, seed: int = 0,
-            effect_file: str | Path | None = None) -> ExplanationResult:
+            effect_file: str | Path | None = None, trust: bool = False) -> ExplanationResult:
     """Find the physical effect that a model lacks.
 
     Args:
@@ -229,6 +231,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
         signals: some of "xj", "p12", "xs"; default: all that the trace has.
         seed: of the simulated runs behind the p-values.
         effect_file: where to write the shape of the residual as an effect to edit.
+        trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
         InputError: a trace, a model or a signal that cannot be used.
@@ -236,7 +239,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     from fdi.discovery.explain_runs import explain_runs
     from fdi.report.explain_report import build_explanation_report
 
-    own_model = _load_model(model)
+    own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
     answer, pattern = explain_runs(runs, seed, effect_file)
     report = build_explanation_report(answer, _name_trace(trace), own_model.name, runs.sources, pattern=pattern,
@@ -246,7 +249,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
 
 def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPath = "eha", *,
                repeats: Sequence[TraceOrPath] = (), holdout: TraceOrPath | None = None,
-               signals: Sequence[str] | None = None) -> ModelResult:
+               signals: Sequence[str] | None = None, trust: bool = False) -> ModelResult:
     """Add an effect, or several in this order, to a model and fit everything; the file of a model keeps its ledger.
 
     Args:
@@ -256,6 +259,7 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
         repeats: runs of the same command, which are fitted as well.
         holdout: a run of another command that no fit sees.
         signals: some of "xj", "p12", "xs"; default: all that the trace has.
+        trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
         InputError: an effect that this model cannot take, or runs that cannot be used.
@@ -265,20 +269,22 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     from fdi.report.model_report import build_model_report
 
     effects = [effect] if isinstance(effect, str) else list(effect)
-    own_model, known = _load_model_file(model)
+    own_model, known = _load_model_file(model, trust)
     runs = _collect_runs(model_file.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
     command = f"fdi.add_effect({', '.join(map(repr, effects))})"
     update = add_effects(effects, runs, own_model, known, command)
     return ModelResult(build_model_report(update), update)
 
 
-def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None) -> DiagnosisResult:
+def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None,
+             trust: bool = False) -> DiagnosisResult:
     """Judge filter clogging and spool friction: levels, sizes with 95 % intervals, other deviations.
 
     Args:
         trace: a run of any command, or its file.
         model: the healthy unit: a `Model`, a model file, or "eha".
         bands: a file of `rig fdi --learn-bands`; default: the bands that come with the software.
+        trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
 
     Raises:
         InputError: a trace, a model or bands that cannot be used.
@@ -288,7 +294,7 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     from fdi.report.diagnosis_report import build_diagnosis_report
 
     known_bands = None if bands is None else load_bands(bands)
-    diagnosis = diagnose_trace(_load_trace(trace), _load_model(model), known_bands, source=_name_trace(trace))
+    diagnosis = diagnose_trace(_load_trace(trace), _load_model(model, trust), known_bands, source=_name_trace(trace))
     return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
 
 
@@ -304,17 +310,21 @@ def _name_trace(trace: TraceOrPath) -> str:
     return trace.provenance.get("source", "trace") if isinstance(trace, Trace) else str(trace)
 
 
-def _load_model(model: ModelOrPath) -> Model:
-    return model if isinstance(model, Model) else load_model(model)
+def _load_model(model: ModelOrPath, trust: bool) -> Model:
+    if isinstance(model, Model):
+        return model
+    load_effects_of_model(model, is_trusted=trust)
+    return load_model(model)
 
 
-def _load_model_file(model: ModelOrPath) -> tuple[Model, Provenance]:
+def _load_model_file(model: ModelOrPath, trust: bool) -> tuple[Model, Provenance]:
     """A model and where it comes from, which only a model file knows."""
     from fdi.discovery.model_file import Provenance, load_model_file
 
     if not isinstance(model, Model) and Path(model).is_file():
+        load_effects_of_model(model, is_trusted=trust)
         return load_model_file(Path(model))
-    return _load_model(model), Provenance()
+    return _load_model(model, trust), Provenance()
 
 
 def _collect_runs(model: Model, trace: TraceOrPath, repeats: Sequence[TraceOrPath], holdout: TraceOrPath | None,

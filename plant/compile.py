@@ -7,12 +7,15 @@ so a changed effect is never served by stale code: numba's own cache looks at on
 """
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import dis
 import hashlib
 import math
 import os
+import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -70,7 +73,24 @@ def find_cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=home):
             return home
     except OSError:
-        return Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}"
+        return _make_private_folder(Path(tempfile.gettempdir()) / f"eha-rig-{os.getuid()}")
+
+
+def _make_private_folder(path: Path) -> Path:
+    """A folder that only this user can write: code is loaded from it. Another one if somebody else has taken `path`."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    found = path.lstat()
+    is_private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return path if is_private else _make_folder_of_process()
+
+
+@cache
+def _make_folder_of_process() -> Path:
+    """A folder that is deleted when this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="eha-rig-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def rebind_names(function: Function, **names: Any) -> Function:

@@ -22,3 +22,12 @@ class InputError(RigError):
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         """As a worker process hands it on."""
         return type(self), (self.where, self.field, self.expected)
+
+
+def escape_control_characters(text: str) -> str:
+    r"""`text` with its control characters as in Python source: printed, they would command the terminal.
+
+    >>> escape_control_characters("a" + chr(27) + "[2Jb")
+    'a\\x1b[2Jb'
+    """
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -194,12 +194,14 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     """The tables of a TOML text.
 
     Raises:
-        InputError: not TOML (with the line).
+        InputError: not TOML (with the line), or nested too deeply.
     """
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(where, "", f"TOML ({error})") from None
+    except RecursionError:
+        raise InputError(where, "", "TOML with fewer levels of brackets") from None
 
 
 def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[Any]]) -> dict[str, float]:

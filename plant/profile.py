@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import csv
-import gzip
-import zlib
 from collections.abc import Iterator, Sequence
 from math import ceil, isfinite
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 
 from plant.errors import InputError
 from plant.segments import FARTHEST, LONGEST, RATE, STRONGEST, Array, Segment, require
+from plant.unpacking import UnpackingError, unpack_gzip
 
 SLACK = 0.01  # of a cycle: a time within it of a row is that row's
 _LARGEST = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and judged by whoever knows which
@@ -120,11 +119,16 @@ def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
 def _read_rows(data: bytes, where: object) -> Iterator[tuple[int, list[str]]]:
     """(line number, cells) of each row that is not blank."""
     try:
-        text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8-sig")
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        text = (unpack_gzip(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(where, "", "CSV text, plain or gzip-compressed") from error
+    except UnpackingError as error:
+        raise InputError(where, "", f"CSV text, plain or gzip-compressed ({error})") from error
     rows = csv.reader(text.splitlines())
-    return ((rows.line_num, row) for row in rows if row)
+    try:
+        yield from ((rows.line_num, row) for row in rows if row)
+    except csv.Error as error:
+        raise InputError(where, f"line {rows.line_num}", f"CSV ({error})") from error
 
 
 def _parse_numbers(rows: Iterator[tuple[int, list[str]]], picked: dict[str, int],

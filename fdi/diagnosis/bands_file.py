@@ -4,7 +4,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import tomllib
 from collections.abc import Container, Iterable, Mapping
 from functools import cache
 from importlib.resources import files
@@ -18,6 +17,7 @@ from fdi.diagnosis.bands import STEP_JUDGED_FROM, Bands, RampBand, StepBand, Wid
 from fdi.output import write_text
 from fdi.trace.sections import Section
 from plant.errors import InputError
+from plant.parameters import parse_toml
 
 Floats = NDArray[np.float64]
 
@@ -102,10 +102,7 @@ def parse_bands(content: str, where: object) -> Bands:
     Raises:
         InputError: text that is not TOML, or lacks a key.
     """
-    try:
-        table = tomllib.loads(content)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(where, "", f"TOML ({error})") from error
+    table = parse_toml(content, where)
     try:
         return _read_bands(table)
     except KeyError as error:

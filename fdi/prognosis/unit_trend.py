@@ -54,7 +54,7 @@ def read_points(path: Path) -> Gathered:
         axis = str(answer["axis"])
         if not all(math.isfinite(p.t) and all(e.low <= e.value <= e.high for e in p.sizes.values()) for p in points):
             raise ValueError("finite times, and sizes within their intervals")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(path, "", f"an answer of rig trend ({type(error).__name__}: {error})") from error
     if axis not in AXES or not points:
         raise InputError(path, "axis", f"one of {', '.join(AXES)} and at least one point")

@@ -25,6 +25,7 @@ INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
 STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
+    "text.parse_math": False,  # a name in a log may have a dollar sign
     "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
 DRAWN_UNITS = {"xj": ("um", 1e6), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}  # unit of an axis, and SI value to it
 LINE_COLUMNS = 1400  # a line is drawn by its extremes in this many columns; a page shows no more

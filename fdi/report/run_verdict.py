@@ -1,6 +1,7 @@
 """The verdict of a run in a word, and the reason in a line."""
 from __future__ import annotations
 
+import contextlib
 from typing import NamedTuple
 
 from fdi.trace.trace import Trace
@@ -23,7 +24,9 @@ def read_verdict(trace: Trace) -> Verdict:
     word, why = notes.get("verdict.verdict") or _judge_checks(trace), notes.get("verdict.why", "")
     if word == "INVALID_TIMING":
         late = notes.get("verdict.overruns") or str(int(trace.timing.overrun.sum()))
-        limit = f", more than {100 * float(notes['max_overruns']):g} %" if "max_overruns" in notes else ""
+        limit = ""
+        with contextlib.suppress(KeyError, ValueError):  # a log of another program may lack it
+            limit = f", more than {100 * float(notes['max_overruns']):g} %"
         lateness = f"the bench itself was late: {late} overruns in {len(trace)} cycles{limit}"
         return Verdict(word, f"{lateness}; {why}" if why else lateness)
     if word == "FAIL" and not why and failed:

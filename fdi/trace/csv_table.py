@@ -5,16 +5,18 @@ import csv
 import gzip
 import io
 import math
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
 from plant.plants import Plant, Table, Term, find_plant, list_plants
+from plant.unpacking import UnpackingError, limit_unpacked_size
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +46,9 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
             return CsvColumns(_combine_columns(sources, table), unknown, plant)
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
-    except (OSError, EOFError) as error:
+    except csv.Error as error:
+        raise InputError(path, "", f"a table of numbers ({error})") from error
+    except (OSError, EOFError, zlib.error, UnpackingError) as error:
         raise InputError(path, "", f"a readable file ({getattr(error, 'strerror', None) or error})") from error
 
 
@@ -62,10 +66,33 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
 
 
 def open_text(path: Path) -> io.TextIOBase:
-    """A text file, unpacked if it is a `.gz`."""
+    """A text file, unpacked if it is a `.gz`. Reading a `.gz` beyond its limit raises UnpackingError."""
     if path.suffix == ".gz":
-        return io.TextIOWrapper(gzip.open(path), encoding="utf-8-sig", newline="")
+        return io.TextIOWrapper(io.BufferedReader(_LimitedGzip(path)), encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")
+
+
+class _LimitedGzip(io.RawIOBase):
+    """The content of a gzip file, up to what `limit_unpacked_size` allows for a file of its size."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = gzip.open(path)  # noqa: SIM115 (closed by `close`)
+        self._left = limit_unpacked_size(path.stat().st_size)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise UnpackingError("it unpacks to more than a hundred times its size")
+        buffer[:len(data)] = data
+        return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
 
 
 def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],

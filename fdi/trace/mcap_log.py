@@ -5,31 +5,35 @@ read by protobuf's parser; the library's message iterator makes an object of eve
 """
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
-import zstandard
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
+from fdi.trace.chunk import BoundedFile, unpack_chunk
 from plant.errors import InputError
+from plant.unpacking import UnpackingError, limit_unpacked_size
 
 _NUMBERS = {  # protobuf types of fixed width: wire type and numpy type
     FieldDescriptorProto.TYPE_DOUBLE: (1, "<f8"),
     FieldDescriptorProto.TYPE_FIXED32: (5, "<u4"),
     FieldDescriptorProto.TYPE_BOOL: (0, "?"),
 }
+MOST_RECORDS = 1000  # attachments, and metadata records, of a log
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
@@ -45,40 +49,48 @@ class Log:
     metadata: Mapping[str, Mapping[str, str]]
     _chunks: tuple[ChunkIndex, ...]
 
-    def messages(self, *topics: str) -> Iterator[tuple[str, int, Any]]:
-        """(topic, time in ns, protobuf message) of the topics, by time; equal times in the order of the file."""
-        factory = DecoderFactory()
-        decode = {number: (c.topic, factory.decoder_for(c.message_encoding, self.schemas.get(c.schema_id)))
-                  for number, c in self.channels.items() if c.topic in topics}
-        out = []
-        with self.path.open("rb") as stream:
-            for index in self._chunks:
-                if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
-                    for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
-                        if channel in decode:
-                            out.append((time_ns, channel, data))
-        out.sort(key=lambda item: item[0])
-        for time_ns, channel, data in out:
-            topic, parse = decode[channel]
-            if parse is None:
-                raise InputError(self.path, topic, "protobuf messages")
-            yield topic, time_ns, parse(data)
+    def messages(self, *topics: str, most: int | None = None) -> Iterator[tuple[str, int, Any]]:
+        """(topic, time in ns, protobuf message) of the topics, by time; equal times in the order of the file.
+
+        `most`: no more than so many, the first ones in time.
+
+        Raises:
+            InputError: messages that are not protobuf or do not fit their schema, and chunks that are damaged.
+        """
+        with _report_damage(self.path, " and ".join(topics)):
+            factory = DecoderFactory()
+            decode = {number: (c.topic, factory.decoder_for(c.message_encoding, self.schemas.get(c.schema_id)))
+                      for number, c in self.channels.items() if c.topic in topics}
+            out = []
+            with self.path.open("rb") as stream:
+                for index in self._chunks:
+                    if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
+                        for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
+                            if channel in decode:
+                                out.append((time_ns, channel, data))
+            out.sort(key=lambda item: item[0])
+            for time_ns, channel, data in out[:most]:
+                topic, parse = decode[channel]
+                if parse is None:
+                    raise InputError(self.path, topic, "protobuf messages")
+                yield topic, time_ns, parse(data)
 
     def read_columns(self, topic: str) -> dict[str, NDArray[Any]]:
         """The messages of a topic by time, one array (messages,) per field, and `time_ns`, the log time in ns.
 
         Raises:
-            InputError: messages that are not protobuf, and chunks that are damaged.
+            InputError: messages that are not protobuf or do not fit their schema, and chunks that are damaged.
         """
-        columns = self._read_rows(topic)
-        if columns is not None:
-            return columns
-        messages = [(time_ns, message) for _, time_ns, message in self.messages(topic)]
-        if not messages:
-            return {"time_ns": np.empty(0, np.int64)}
-        names = [field.name for field in messages[0][1].DESCRIPTOR.fields]
-        return {"time_ns": np.array([time_ns for time_ns, _ in messages])} | {
-            name: np.array([getattr(message, name) for _, message in messages]) for name in names}
+        with _report_damage(self.path, topic):
+            columns = self._read_rows(topic)
+            if columns is not None:
+                return columns
+            messages = [(time_ns, message) for _, time_ns, message in self.messages(topic)]
+            if not messages:
+                return {"time_ns": np.empty(0, np.int64)}
+            names = [field.name for field in messages[0][1].DESCRIPTOR.fields]
+            return {"time_ns": np.array([time_ns for time_ns, _ in messages])} | {
+                name: np.array([getattr(message, name) for _, message in messages]) for name in names}
 
     def _read_rows(self, topic: str) -> dict[str, NDArray[Any]] | None:
         """The same for messages that all hold the same numbers in the same places; None if they do not."""
@@ -113,29 +125,65 @@ class Log:
                 for key, value in channel.metadata.items() if key.startswith("unit.")}
 
 
+@contextlib.contextmanager
+def _report_damage(path: Path, topic: str) -> Iterator[None]:
+    """Report whatever a damaged schema, index or message leads to as bad input."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # the parsers of schemas and messages raise many kinds
+        raise InputError(path, topic, f"sound messages ({type(error).__name__}: {error})") from error
+
+
 def open_log(path: Path) -> Log:
     """Read everything but the messages. Raises InputError for what is not a complete MCAP file."""
     try:
         with path.open("rb") as stream:
-            reader = SeekingReader(stream)
+            file = BoundedFile(stream)
+            reader = SeekingReader(cast(IO[bytes], file), record_size_limit=file.size)
             summary = reader.get_summary()
             if summary is None:
                 raise InputError(path, "", "a complete MCAP log; this one was cut short: rig recover")
+            _check_sizes(path, summary, file.size)
             attachments = {item.name: item.data for item in reader.iter_attachments()}
             metadata = {item.name: item.metadata for item in reader.iter_metadata()}
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
-    except (McapError, struct.error, ValueError, EOFError) as error:
+    except (McapError, struct.error, ValueError, EOFError, StopIteration) as error:
         raise InputError(path, "", "a complete MCAP log; if its writer died, rig recover brings it back") from error
     return Log(path, summary.schemas, summary.channels, attachments, metadata, tuple(summary.chunk_indexes))
 
 
-def _read_chunk(path: Path, stream: Any, index: ChunkIndex) -> bytes:
-    stream.seek(index.chunk_start_offset + 9)
+def _check_sizes(path: Path, summary: Summary, size: int) -> None:
+    """Refuse a log whose parts, as its summary declares them, are larger than a file of `size` bytes can hold.
+
+    Raises:
+        InputError: it names the declared size.
+    """
+    stored = sum(index.data_size for index in summary.attachment_indexes)
+    if stored > size:
+        raise InputError(path, "attachments", f"at most the {size} bytes of the file, not {stored}")
+    unpacked, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
+    if unpacked > most:
+        raise InputError(path, "chunks", f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked >> 20} MiB")
+    if len({index.chunk_start_offset for index in summary.chunk_indexes}) < len(summary.chunk_indexes):
+        raise InputError(path, "chunks", "each chunk once in the index")
+    for what, count in (("attachments", len(summary.attachment_indexes)), ("metadata", len(summary.metadata_indexes))):
+        if count > MOST_RECORDS:
+            raise InputError(path, what, f"at most {MOST_RECORDS} records, not {count}")
+
+
+def _read_chunk(path: Path, stream: BinaryIO, index: ChunkIndex) -> bytes:
+    """The records of a chunk, unpacked."""
     try:
-        data, size = get_chunk_data_stream(Chunk.read(ReadDataStream(stream)), validate_crc=True)
-        return data.read(size)
-    except (McapError, zstandard.ZstdError, ValueError, struct.error) as error:
+        file = BoundedFile(stream)
+        file.seek(index.chunk_start_offset + _RECORD.size)
+        chunk = Chunk.read(ReadDataStream(cast(IO[bytes], file)))
+        if chunk.uncompressed_size != index.uncompressed_size:
+            raise UnpackingError(f"the index declares {index.uncompressed_size} bytes, not {chunk.uncompressed_size}")
+        return unpack_chunk(chunk)
+    except (McapError, ValueError, struct.error, EOFError) as error:
         raise InputError(path, f"chunk at byte {index.chunk_start_offset}", f"sound data ({error})") from error
 
 
@@ -168,17 +216,18 @@ def _row_layout(schema: Schema | None) -> tuple[np.dtype[Any], dict[str, int]] |
     return dtype, tags
 
 
-def _message_offsets(stream: Any, index: ChunkIndex, channel: int) -> NDArray[np.int64]:
+def _message_offsets(stream: BinaryIO, index: ChunkIndex, channel: int) -> NDArray[np.int64]:
     """Where the messages of a channel begin in an unpacked chunk, from the message index behind it."""
-    stream.seek(index.message_index_offsets[channel])
-    _, length = _RECORD.unpack(stream.read(_RECORD.size))
-    pairs = np.frombuffer(stream.read(length)[6:], "<u8").reshape(-1, 2)
+    file = BoundedFile(stream)
+    file.seek(index.message_index_offsets[channel])
+    _, length = _RECORD.unpack(file.read(_RECORD.size))
+    pairs = np.frombuffer(file.read(length)[6:], "<u8").reshape(-1, 2)
     return pairs[:, 1].astype(np.int64)
 
 
 def _decode_rows(raw: bytes, offsets: NDArray[np.int64], dtype: np.dtype[Any]) -> NDArray[Any] | None:
     """The records at `offsets` of a chunk; None if one would end beyond it."""
-    if len(offsets) and offsets.max() + dtype.itemsize > len(raw):
+    if len(offsets) and (offsets.min() < 0 or offsets.max() > len(raw) - dtype.itemsize):
         return None
     places = offsets[:, None] + np.arange(dtype.itemsize)
     rows: NDArray[Any] = np.frombuffer(raw, np.uint8)[places].view(dtype)[:, 0]
@@ -197,3 +246,21 @@ def scan_messages(raw: bytes) -> Iterator[tuple[int, int, int, bytes]]:
             channel, _, time_ns, _ = _MESSAGE.unpack_from(raw, at + 9)
             yield channel, time_ns, at, raw[at + 31:at + 9 + length]
         at += 9 + length
+
+
+def read_declarations(raw: bytes) -> list[Schema | Channel]:
+    """The schemas and channels in an unpacked chunk.
+
+    Raises struct.error or EndOfFile for a chunk that ends within a record.
+    """
+    found: list[Schema | Channel] = []
+    at = 0
+    while at < len(raw):
+        opcode, length = _RECORD.unpack_from(raw, at)
+        body = ReadDataStream(BytesIO(raw[at + 9:at + 9 + length]))
+        if opcode == Opcode.SCHEMA:
+            found.append(Schema.read(body))
+        elif opcode == Opcode.CHANNEL:
+            found.append(Channel.read(body))
+        at += 9 + length
+    return found

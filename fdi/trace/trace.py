@@ -2,12 +2,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from fdi.trace.csv_table import read_csv, write_csv
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from plant.errors import InputError
+from plant.errors import InputError, escape_control_characters
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -26,6 +26,7 @@ REQUIRED = ("t", "com", "xj", "cor")
 OPTIONAL = ("p12", "xs", "load")
 UNITS = {name: signal.unit for name, signal in SIGNALS.items()}
 SETUP, MAIN, CLEANUP = 0, 1, 2
+MOST_MESSAGES = 100_000  # events of a log that are read: a node can send a thousand emergencies a second
 
 
 class Gap(NamedTuple):
@@ -88,6 +89,7 @@ class Timing(NamedTuple):
     execution: Floats
 
 
+R = TypeVar("R", Event, Nmt, Check)
 _NONE = np.empty(0)
 NO_TIMING = Timing(_NONE, _NONE, _NONE, _NONE, np.empty(0, bool), _NONE, _NONE, _NONE)
 
@@ -236,7 +238,7 @@ def _from_csv(path: Path) -> Trace:
 def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Gap]]:
     """Spread columns, shape (m,), over all cycles 0..rows[-1]: NaN where there is none; and the gaps, in rows."""
     n = int(rows[-1]) + 1
-    if n > 100 * len(rows) + 100_000:
+    if n > 10 * len(rows) + 1_000_000:  # the columns are as long as the numbers say, not as the file
         raise InputError(path, "t", f"gaps that leave more than {len(rows)} of {n} cycles")
     out = {}
     for name, values in columns.items():
@@ -257,6 +259,10 @@ def _make_trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **mo
 
 def _from_log(log: Log, everything: bool) -> Trace:
     signals, timing, rest = log.read_columns("/signals"), log.read_columns("/timing"), _read_messages(log)
+    _require_numbers(log, "/signals", signals, ("cycle", "phase", *REQUIRED[1:], *OPTIONAL))
+    _require_numbers(log, "/timing", timing, ("cycle", "lateness", "response", "work", "overrun"))
+    notes = [f"only the first {MOST_MESSAGES} messages of {name} were read"
+             for name, messages in rest.items() if len(messages) == MOST_MESSAGES]
     run = dict(log.metadata.get("run", {}))
     if not len(signals["time_ns"]):
         raise InputError(log.path, "/signals", "at least one cycle")
@@ -280,36 +286,72 @@ def _from_log(log: Log, everything: bool) -> Trace:
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
     return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
-                       units=dict(UNITS) | log.units("/signals"), attachments=log.attachments,
+                       units=dict(UNITS) | log.units("/signals"), attachments=log.attachments, notes=tuple(notes),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
-                       events=tuple(Event(seconds(t), m.level, m.kind, m.text) for t, m in rest["/events"]),
-                       nmt=tuple(Nmt(seconds(t), m.node, m.code, m.name) for t, m in rest["/nmt"]),
-                       checks=tuple(Check(*(getattr(m, name) for name in Check._fields)) for _, m in rest["/checks"]))
+                       events=tuple(_list_records(log, "/events", Event, rest, seconds)),
+                       nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),
+                       checks=tuple(_list_records(log, "/checks", Check, rest, seconds)))
+
+
+def _list_records(log: Log, topic: str, kind: type[R], rest: Mapping[str, Messages],
+                  seconds: Callable[[float], float]) -> Iterator[R]:
+    """The messages of a topic as records, at `seconds` of their log time where the record has a time.
+
+    Texts lose their control characters, which would command the terminal they are printed on.
+
+    Raises:
+        InputError: messages that lack a field, or have a text for a number or the reverse.
+    """
+    fields = get_type_hints(kind)
+    for time_ns, message in rest[topic]:
+        values: list[Any] = []
+        for name, expected in fields.items():
+            value = seconds(time_ns) if name == "t" else getattr(message, name, None)
+            if not isinstance(value, str | int | float) or isinstance(value, str) != (expected is str):
+                raise InputError(log.path, f"{topic}.{name}", f"a field of this name with a {expected.__name__}")
+            values.append(escape_control_characters(value) if isinstance(value, str) else value)
+        yield kind(*values)
+
+
+def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], names: Iterable[str]) -> None:
+    """Refuse messages that lack one of these fields, or have something else than a number in it.
+
+    Raises:
+        InputError: it names the field.
+    """
+    for name in names if len(columns["time_ns"]) else ():
+        if name not in columns or columns[name].ndim != 1 or columns[name].dtype.kind not in "bfiu":
+            raise InputError(log.path, f"{topic}.{name}", "a field of this name with a number")
 
 
 def _read_messages(log: Log) -> dict[str, Messages]:
-    """Events, NMT states and checks: the topics with few messages."""
-    found: dict[str, Messages] = {name: [] for name in ("/events", "/nmt", "/checks")}
-    for topic, time_ns, message in log.messages(*found):
-        found[topic].append((time_ns, message))
+    """Events, NMT states and checks: the topics with few messages; of each the first MOST_MESSAGES."""
+    found: dict[str, Messages] = {}
+    for name in ("/events", "/nmt", "/checks"):
+        found[name] = [(time_ns, message) for _, time_ns, message in log.messages(name, most=MOST_MESSAGES)]
     return found
 
 
 def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
     """The run's own figure, else the median over the cycles, to the microsecond."""
     try:
-        return float(run["period"])
+        period = float(run["period"])
     except KeyError:
-        return round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
-    except ValueError as error:
-        raise InputError(log.path, "metadata run.period", f"seconds, not {run['period']!r}") from error
+        period = round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
+    except ValueError:
+        period = math.nan
+    if not 1e-6 <= period <= 3600.0:  # nor NaN
+        said = run.get("period", str(period))
+        raise InputError(log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {said!r}")
+    return period
 
 
 def _collect_provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
     """The record `run` as it is; other metadata records with their name in front (`verdict.status`)."""
     more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
             for key, value in record.items()}
-    return {"source": log.path.name, **run, **more}
+    said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
+    return {"source": log.path.name, **said}
 
 
 def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:

@@ -157,8 +157,10 @@ def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Star
                            **more))
 
 
-def load_effects(path: Path) -> list[str]:
+def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     """Run a user's effect file; the names of the effects it registered.
+
+    `source` is its content where that has been read already; exactly these bytes run.
 
     Raises:
         InputError: unreadable, not Python, or it registers nothing.
@@ -170,7 +172,8 @@ def load_effects(path: Path) -> list[str]:
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # where annotations written as text are looked up
     try:  # not by an import: its .pyc cannot tell two edits within a second apart
-        exec(compile(path.read_bytes(), path, "exec", dont_inherit=True), module.__dict__)
+        code = path.read_bytes() if source is None else source
+        exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         raise InputError(path, "", f"a file that Python can run ({type(error).__name__}: {error})") from error
     new = [name for name, entry in CATALOGUE.items() if entry.file == path]

@@ -35,11 +35,11 @@ def load_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     """The model of --model, --set and --effects, with its provenance.
 
     Raises:
-        InputError: a file or a value that cannot be used.
+        InputError: a file or a value that cannot be used, or a model file with code that --trust does not allow.
     """
     from fdi.discovery.model_file import Provenance, load_model_file
 
-    options.load_user_effects([*args.effects, *options.find_effect_files(args.model, args.effects)])
+    options.load_chosen_effects(args, args.model)
     if args.model and Path(args.model).is_file():
         model, known = load_model_file(Path(args.model))
         return model.replace(options.parse_changes(args.set)), known
@@ -101,4 +101,5 @@ def format_arguments(args: argparse.Namespace, trace: str) -> str:
                            ("--model", [args.model]), ("--set", args.set), ("--effects", args.effects),
                            ("--signals", [args.signals])):
         words += [word for value in values if value for word in (option, str(value))]
+    words += ["--trust"] if args.trust else []
     return shlex.join(words)

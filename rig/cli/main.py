@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from plant.errors import RigError
+from plant.errors import RigError, escape_control_characters
 from rig.cli.command_list import HELP_OF_COMMAND, import_command
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h
@@ -108,7 +108,7 @@ def _discard_output() -> None:
 
 
 def _report_error(args: argparse.Namespace, message: str, status: int) -> int:
-    print(f"rig {args.command}: " + " ".join(message.split()), file=sys.stderr)
+    print(f"rig {args.command}: {escape_control_characters(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,14 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
         help="change a parameter of the model or of an effect, SI units (repeatable)")
     add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")
+    add_trust_option(parser)
     add_seed_option(parser)
+
+
+def add_trust_option(parser: argparse.ArgumentParser) -> None:
+    """Add --trust."""
+    parser.add_argument("--trust", action="store_true",
+                        help="run the code that a log or a model file brings along; it is listed first, with its hash")
 
 
 def add_seed_option(parser: argparse.ArgumentParser) -> None:
@@ -65,40 +73,65 @@ def load_chosen_model(args: argparse.Namespace) -> Model:
     """Load the model that --model, --set and --effects describe.
 
     Raises:
-        InputError: a file, name or value that is invalid.
+        InputError: a file, name or value that is invalid, or a model file with code that --trust does not allow.
     """
     from plant.model import load_model
 
-    load_user_effects([*args.effects, *find_effect_files(args.model, args.effects)])
+    load_chosen_effects(args, args.model)
     return load_model(args.model or "eha").replace(parse_changes(args.set))
 
 
-def find_effect_files(model: str | None, given: list[Path]) -> list[Path]:
-    """The effect files that a model file names, as far as they are found in this folder or beside the model file.
+def load_chosen_effects(args: argparse.Namespace, model: str | None) -> tuple[Path, ...]:
+    """Add the user's own effects to the catalogue: the files of --effects and, with --trust, those of a model file.
 
-    A file in `given` replaces one of the same name.
-    """
-    if model is None or not Path(model).is_file():
-        return []
-    from plant.parameters import read_toml
-
-    provenance = read_toml(Path(model)).get("provenance", {})
-    names = provenance.get("effect_files", []) if isinstance(provenance, dict) else []
-    files = [Path(name) for name in names if isinstance(name, str)]
-    places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
-    return [p for p in places if p is not None and p.name not in [g.name for g in given]]
-
-
-def load_user_effects(files: list[Path]) -> None:
-    """Add the user's own effects to the catalogue.
+    Returns:
+        All these files.
 
     Raises:
-        InputError: an invalid file, or two files of one name: a log stores them by name.
+        InputError: an invalid file, code that --trust does not allow, or two files of one name.
     """
+    load_user_effects(args.effects)
+    return (*args.effects, *load_effects_of_model(args, model))
+
+
+def load_effects_of_model(args: argparse.Namespace, model: str | None) -> tuple[Path, ...]:
+    """Add the effects of the files that a model file names to the catalogue, if --trust allows it.
+
+    Returns:
+        These files, without those that --effects replaces.
+
+    Raises:
+        InputError: an invalid file, code that --trust does not allow, or a file of the same name as another.
+    """
+    if model is None or not Path(model).is_file():
+        return ()
+    from fdi import foreign_code
+
+    files = foreign_code.load_effects_of_model(model, args.effects, is_trusted=args.trust)
+    require_different_names((*args.effects, *files))
+    return files
+
+
+def load_user_effects(files: Sequence[Path]) -> None:
+    """Add the effects of files that the user names to the catalogue.
+
+    Raises:
+        InputError: an invalid file, or two files of one name.
+    """
+    require_different_names(files)
     if files:
         from plant.effects import load_effects
 
-        for i, file in enumerate(files):
-            if file.name in [other.name for other in files[:i]]:
-                raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")
+        for file in files:
             load_effects(file)
+
+
+def require_different_names(files: Sequence[Path]) -> None:
+    """Refuse two effect files of one name: a log stores them by name.
+
+    Raises:
+        InputError: the second file of that name.
+    """
+    for i, file in enumerate(files):
+        if file.name in [other.name for other in files[:i]]:
+            raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")

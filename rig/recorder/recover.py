@@ -7,19 +7,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, cast
 
-import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import StreamReader
 
 from fdi.output import writable
-from fdi.trace.mcap_log import scan_messages
+from fdi.trace.chunk import BoundedFile, unpack_chunk
+from fdi.trace.mcap_log import read_declarations, scan_messages
 from plant.errors import InputError
+from plant.unpacking import UnpackingError, limit_unpacked_size
 from rig.recorder.container import McapFile
 
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError)
+_DAMAGE = (McapError, struct.error, ValueError, EOFError)
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def recover_log(path: Path, out: Path) -> Salvage:
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
     with source:
-        reading = _IntactRecords(source, path.stat().st_size)
+        reading = _IntactRecords(BoundedFile(source))
         records = iter(reading)
         first = next(records, None)
         if first is None:
@@ -65,31 +66,42 @@ def recover_log(path: Path, out: Path) -> Salvage:
 
 
 class _IntactRecords:
-    """Iterates over the sound records of a log up to where it ends; a damaged chunk in the middle is left out."""
+    """Iterates over the sound records of a log up to where it ends; a damaged chunk in the middle is left out.
 
-    def __init__(self, stream: BinaryIO, size: int) -> None:
-        self._stream, self._size = stream, size
+    A chunk is given as the records in it, unpacked.
+    """
+
+    def __init__(self, file: BoundedFile) -> None:
+        self._file = file
         self.reason = ""
         self.lost = 0  # bytes
 
-    def __iter__(self) -> Iterator[McapRecord]:
-        at = 0
+    def __iter__(self) -> Iterator[McapRecord | bytes]:
+        at, left = 0, limit_unpacked_size(self._file.size)
+        stream = cast(IO[bytes], self._file)
         try:
-            for record in StreamReader(self._stream, emit_chunks=True, record_size_limit=self._size).records:
-                start, at = at, self._stream.tell()
-                if isinstance(record, Chunk):
-                    try:
-                        breakup_chunk(record, validate_crc=True)
-                    except _DAMAGE as error:
-                        self.reason, self.lost = f"damaged chunk: {error}", self.lost + at - start
-                        continue
-                yield record
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=self._file.size).records:
+                start, at = at, self._file.tell()
+                if not isinstance(record, Chunk):
+                    yield record
+                    continue
+                left -= record.uncompressed_size
+                if left < 0:
+                    raise UnpackingError("the chunks declare too many bytes for a file of this size")
+                try:
+                    raw = unpack_chunk(record)
+                    _index_messages(raw)
+                    read_declarations(raw)
+                except _DAMAGE as error:
+                    self.reason, self.lost = f"damaged chunk: {error}", self.lost + at - start
+                else:
+                    yield raw
         except _DAMAGE as error:
             self.reason = self.reason or str(error) or "the file ends in mid run"
-            self.lost += self._size - at
+            self.lost += self._file.size - at
 
 
-def _write_salvage(records: Iterator[McapRecord], reading: _IntactRecords, out: Path) -> Salvage:
+def _write_salvage(records: Iterator[McapRecord | bytes], reading: _IntactRecords, out: Path) -> Salvage:
     file = McapFile(out, "eha-rig recover", [], [])
     names = []
     for record in records:
@@ -98,20 +110,19 @@ def _write_salvage(records: Iterator[McapRecord], reading: _IntactRecords, out: 
             file.write_attachment(record.name, record.media_type, record.data, record.log_time)
         elif isinstance(record, Metadata):
             file.write_metadata(record.name, record.metadata)
-        elif isinstance(record, Chunk):
-            for item in breakup_chunk(record) if not file.channels else ():
+        elif isinstance(record, bytes):
+            for item in read_declarations(record) if not file.channels else ():
                 _add_declaration(file, item)
-            stream, size = get_chunk_data_stream(record)
-            raw = stream.read(size)
-            index = _index_messages(raw)
+            index = _index_messages(record)
             if index:
-                file.write_chunk(raw, index)
+                file.write_chunk(record, index)
         else:
             _add_declaration(file, record)
     if reading.reason:
         file.write_metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
     counts = file.build_statistics()
-    cycles = sum(n for c, n in counts.channel_message_counts.items() if file.channels[c].topic == "/signals")
+    cycles = sum(n for c, n in counts.channel_message_counts.items()
+                 if c in file.channels and file.channels[c].topic == "/signals")
     file.finish()
     return Salvage(out, not reading.reason, counts.message_count, cycles,
                    (counts.message_end_time - counts.message_start_time) * 1e-9, tuple(names), reading.lost,

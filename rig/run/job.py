@@ -8,16 +8,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import dbc
+from fdi.foreign_code import Announce, ForeignCode, print_on_standard_error, require_trust
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import load_effects
 from plant.model import parse_model
 from plant.parameters import parse_toml
+from plant.segments import RATE
 from rig.nodes.scenario import Scenario
 from rig.sequences import Sequence
 
+PACES, PLANTS = ("lockstep", "realtime"), ("auto", "builtin", "external")
+CONTROLLERS = ("builtin", "c", "external")
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the attachments
 
@@ -66,36 +71,91 @@ class Job:
                 "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
 
 
-def read_job(path: Path) -> Job:
-    """Read the job that produced a log.
+def require_bench_cycle(model: Model, where: object) -> None:
+    """Refuse a model whose controller has another period than the cycle of the bench, 1 ms.
 
     Raises:
-        InputError: the file is no log of a run.
+        InputError: it names `where` the model comes from.
+    """
+    if model["controller.period"] != 1.0 / RATE:
+        raise InputError(where, "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
+
+
+def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> Job:
+    """Read the job that produced a log.
+
+    `is_trusted`: whether effect files in the log may run; `announce` gets a line about each before it runs.
+
+    Raises:
+        InputError: the file is no log of a run, a setting in it is impossible, or it brings code along that is not
+            trusted.
     """
     trace = Trace.read(path, all=True)
-    said = trace.provenance
-    bundle = _select_attachments(trace.attachments, _SEQUENCE_FOLDER)
-    if "model.toml" not in trace.attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
+    attachments, said = trace.attachments, trace.provenance
+    bundle = _select_attachments(attachments, _SEQUENCE_FOLDER)
+    if "model.toml" not in attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
-    effects = _write_effect_files(_select_attachments(trace.attachments, _EFFECT_FOLDER))
-    for effect in effects:
-        load_effects(effect)
-    model = parse_model(parse_toml(trace.attachments["model.toml"].decode(), "model.toml"), f"{path}:model.toml")
-    return Job(sequence=Sequence.from_bundle(bundle), model=model, seed=int(said["seed"]), bus=said["bus"],
-               pace=said["pace"], controller=said["controller"], plant=said["plant"], effects=effects,
-               max_overruns=float(said["max_overruns"]))
+    codes = [ForeignCode(name, content) for name, content in attachments.items() if name.startswith(_EFFECT_FOLDER)]
+    for name in (*(code.name for code in codes), *(_SEQUENCE_FOLDER + name for name in bundle if name[-5:] == ".toml")):
+        _require_file_name(path, name)
+    settings = _read_settings(path, said)
+    require_trust(path, codes, is_trusted=is_trusted, announce=announce)
+    effects = _load_effect_files(codes)
+    model = parse_model(parse_toml(_decode(path, "model.toml", attachments["model.toml"]), f"{path}: model.toml"),
+                        f"{path}: model.toml")
+    require_bench_cycle(model, f"{path}: model.toml")
+    return Job(sequence=Sequence.from_bundle(bundle), model=model, effects=effects, **settings)
 
 
 def _select_attachments(attachments: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
     return {name.removeprefix(prefix): data for name, data in attachments.items() if name.startswith(prefix)}
 
 
-def _write_effect_files(files: Mapping[str, bytes]) -> tuple[Path, ...]:
-    """Write user effects to files. They must outlive this call, because code is compiled from them later."""
-    if not files:
+def _require_file_name(log: Path, name: str) -> None:
+    """Refuse an attachment whose name, below its folder, cannot be that of a plain file on every machine."""
+    plain = name.partition("/")[2]
+    if not plain.isprintable() or "/" in plain or "\\" in plain or plain.startswith(".") or not 0 < len(plain) <= 100:
+        shown = name if len(name) <= 100 else f"{name[:100]}.. ({len(name)} characters)"
+        raise InputError(log, f"attachment {shown!r}", "the name of a file, without folders, of at most 100 characters")
+
+
+def _decode(log: Path, name: str, data: bytes) -> str:
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(log, f"attachment {name}", "text in UTF-8") from error
+
+
+def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
+    """The settings of a run from its metadata.
+
+    Raises:
+        InputError: a value that no run can have.
+    """
+    for name, known in (("pace", PACES), ("controller", CONTROLLERS), ("plant", PLANTS)):
+        if said[name] not in known:
+            raise InputError(log, f"metadata run.{name}", f"{' or '.join(known)}, not {said[name][:100]!r}")
+    if not said["seed"].isascii() or not said["seed"].isdigit() or len(said["seed"]) > 100:
+        raise InputError(log, "metadata run.seed", f"a whole number from 0, not {said['seed'][:100]!r}")
+    overruns = said["max_overruns"]
+    try:
+        share = float(overruns)
+    except ValueError:
+        share = -1.0
+    if not 0.0 <= share <= 1.0:  # nor NaN
+        raise InputError(log, "metadata run.max_overruns", f"a fraction from 0 to 1, not {overruns[:100]!r}")
+    return {"seed": int(said["seed"]), "bus": said["bus"], "pace": said["pace"], "controller": said["controller"],
+            "plant": said["plant"], "max_overruns": share}
+
+
+def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
+    """Write user effects to files and run them. The files outlive this call: nodes in other processes read them."""
+    if not codes:
         return ()
     folder = Path(tempfile.mkdtemp(prefix="eha-rig-effects-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for name, data in files.items():
-        (folder / Path(name).name).write_bytes(data)
-    return tuple(folder / Path(name).name for name in files)
+    files = tuple(folder / code.name.removeprefix(_EFFECT_FOLDER) for code in codes)
+    for file, code in zip(files, codes, strict=True):
+        file.write_bytes(code.content)
+        load_effects(file, code.content)
+    return files

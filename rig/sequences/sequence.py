@@ -123,7 +123,11 @@ class Sequence:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        return parse_sequence(bundle[sources[0]].decode(), sources[0], read_file, known)
+        try:
+            text = bundle[sources[0]].decode()
+        except UnicodeDecodeError as error:
+            raise InputError(sources[0], "", "text in UTF-8") from error
+        return parse_sequence(text, sources[0], read_file, known)
 
 
 def load_sequence(name_or_path: str | Path, known: Known = find_quantity) -> Sequence:

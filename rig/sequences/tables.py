@@ -51,6 +51,8 @@ def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
         found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
         message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
         raise InputError(f"{file}:{line}", "", f"TOML; {message[:1].lower()}{message[1:]}") from error
+    except RecursionError as error:
+        raise InputError(file, "", "TOML with fewer levels of brackets") from error
 
 
 def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None) -> T:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
+_MOST_PARTS = 100  # of a key
 Path = tuple[str | int, ...]  # ("main", 3, "time"): key, place in the array, key
 
 _TOKEN = re.compile(
@@ -28,7 +29,11 @@ class _Token(NamedTuple):
 
 
 def find_lines(text: str) -> dict[Path, int]:
-    """Line number, from 1, of every key, array element and table header."""
+    """Line number, from 1, of every key, array element and table header.
+
+    Raises:
+        RecursionError: a key of more than 100 parts; the paths of all its parts would take a lot of memory.
+    """
     scanner = _Scanner(text)
     scanner.document()
     return scanner.found
@@ -93,6 +98,8 @@ class _Scanner:
         while not (self._at("=") or self._at("]") or self._at("end")):
             token = self._take()
             parts += [token.text[1:-1]] if token.kind == "string" else [p for p in token.text.split(".") if p]
+            if len(parts) > _MOST_PARTS:
+                raise RecursionError(f"a key of more than {_MOST_PARTS} parts")
         return parts
 
     def _value(self, path: Path) -> None:

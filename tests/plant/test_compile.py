@@ -170,3 +170,20 @@ def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_live_change_names_what_is_missing() -> None:
     with pytest.raises(InputError, match=r"jack\.moss"):
         Actuator(Model()).set("jack.moss", 1.0)
+
+
+def test_code_is_not_loaded_from_a_folder_that_others_can_write(tmp_path: Path,
+                                                                monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / "file" / "below"))
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
+    taken = tmp_path / f"eha-rig-{os.getuid()}"
+    taken.mkdir()
+    taken.chmod(0o777)
+    assert find_cache_folder() != taken and find_cache_folder() == find_cache_folder()
+    assert find_cache_folder().stat().st_mode & 0o077 == 0
+    taken.chmod(0o700)
+    assert find_cache_folder() == taken
+    taken.rename(tmp_path / "other")
+    taken.symlink_to(tmp_path / "other")
+    assert find_cache_folder() != taken

@@ -111,7 +111,11 @@ def _choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     if args.what and is_campaign_folder(args.what):
         if changed or args.fault or args.model or args.set or args.out:
             raise InputError(args.what, "", "no other option about the matrix: this folder has its own")
-        return read_matrix_of_folder(args.what), Path(args.what)
+        found = read_matrix_of_folder(args.what)
+        work = found.spec["work"]
+        if work not in (*WORKS.values(), WORKS.get(args.work, args.work)):  # a folder is data
+            raise InputError(args.what, "work", f"--work {work} on the command line, to call that function")
+        return found, Path(args.what)
     model = load_model(args.model or "eha").replace(options.parse_changes(args.set))
     work = WORKS.get(args.work, args.work)
     if args.what and Path(args.what).is_dir():

@@ -129,4 +129,5 @@ def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:
     for option, values in (("--model", [args.model] if args.model else []), ("--set", args.set),
                            ("--effects", args.effects)):
         words += [word for value in values for word in (option, str(value))]
+    words += ["--trust"] if args.trust else []
     return "rig explain " + shlex.join(words)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig run`."""
+    from rig.run.job import CONTROLLERS, PACES, PLANTS
+
     add = parser.add_argument
     add("sequence", nargs="?", metavar="SEQUENCE",
         help="test sequence: a .toml file, or the name of a shipped one (default: preflight)")
@@ -26,12 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(seed=None)  # None: not given; --from takes the seed of the log
     add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
         help="virtual: the embedded bus in this process (default); or socketcan:can0, udp_multicast, ...")
-    add("--pace", choices=("lockstep", "realtime"), default=None,
+    add("--pace", choices=PACES, default=None,
         help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time")
-    add("--controller", choices=("builtin", "c", "external"), default=None,
+    add("--controller", choices=CONTROLLERS, default=None,
         help="firmware of node 2: the reference firmware in Python (builtin, default) or in C (c: compiled and started "
              "here), or your own on the bus (external)")
-    add("--plant", choices=("auto", "builtin", "external"), default=None,
+    add("--plant", choices=PLANTS, default=None,
         help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)")
     add("--max-overruns", type=float, default=None, metavar="FRACTION",
         help="largest share of overruns in a real-time run; more make its timing invalid (default 0.001)")
@@ -43,14 +45,17 @@ def run_command(args: argparse.Namespace) -> int:
     """Run a sequence; results go to --out (default: a new folder in runs/)."""
     from fdi.report.run_report import build_run_report
     from fdi.trace.trace import Trace
+    from plant import InputError
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
     from rig.network.bus import choose_bus
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
 
+    if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
+        raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
     job = read_job(args.source, args) if args.source else build_job(args)
-    bus, why = choose_bus(job.bus if args.source and args.bus == "auto" else args.bus)
+    bus, why = choose_bus(job.bus if args.source else args.bus)
     if job.controller == "c" and bus == "embedded" and args.bus == "auto":
         bus, why = "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
     job = replace_settings(job, bus=bus)
@@ -135,21 +140,20 @@ def build_job(args: argparse.Namespace) -> Job:
         InputError: a sequence, model or value that cannot be used.
     """
     from plant import InputError, load_model
-    from rig.run.job import Job
+    from rig.run.job import Job, require_bench_cycle
     from rig.sequences import load_sequence
 
-    options.load_user_effects(args.effects)
+    effects = options.load_chosen_effects(args, args.model)
     sequence = load_sequence(args.sequence or "preflight")
+    if args.model is None:
+        effects += options.load_effects_of_model(args, sequence.model.name)
     chosen = load_model(args.model or sequence.model.name).replace(sequence.model.overrides, sequence.name)
     model = chosen.replace(options.parse_changes(args.set))
-    if model["controller.period"] != 1e-3:
-        raise InputError("--set", "controller.period", "0.001 s: the bench's cycle is fixed; rig simulate takes others")
-    if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
-        raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
+    require_bench_cycle(model, "--set")
     foreign = [name for name in model.differences() if name.startswith("controller.")]
     if args.controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
-    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=tuple(args.effects))
+    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=effects)
     return replace_settings(job, pace=args.pace, controller=args.controller, plant=args.plant,
                             max_overruns=args.max_overruns)
 
@@ -157,18 +161,28 @@ def build_job(args: argparse.Namespace) -> Job:
 def read_job(source: Path, args: argparse.Namespace) -> Job:
     """The job recorded in a log, to repeat it; bus, pace, controller and plant may be given anew.
 
+    A bus other than the embedded one must be named on the command line: a log does not decide what hardware moves.
+
     Raises:
-        InputError: no log of a run, or options that would change the job.
+        InputError: no log of a run, options that would change the job, code in the log that --trust does not allow, or
+            a bus in the log that --bus does not name.
     """
     from plant import InputError
     from rig.run.job import read_job
+    from rig.run.participants import EMBEDDED_NAMES
 
     if args.sequence or args.set or args.model or args.effects or args.seed is not None:
         raise InputError("--from", str(source), "no SEQUENCE, --model, --set, --seed or --effects: the log has them")
     log = source / "trace.mcap" if source.is_dir() else source
     if args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve():
         raise InputError("--out", args.out, "another folder than that of the log to repeat, which would be overwritten")
-    return replace_settings(read_job(source), pace=args.pace, controller=args.controller, plant=args.plant,
+    job = read_job(source, is_trusted=args.trust)
+    if args.bus != "auto":
+        job = replace_settings(job, bus=args.bus)
+    elif job.bus.partition(":")[0] not in EMBEDDED_NAMES:
+        raise InputError(log, f"bus {job.bus}", f"--bus {job.bus} to use it again, or --bus embedded: the bus of a log "
+                                                "is opened only if the command line names it")
+    return replace_settings(job, pace=args.pace, controller=args.controller, plant=args.plant,
                             max_overruns=args.max_overruns)
 
 

@@ -143,7 +143,7 @@ def _read_campaign(folder: Path) -> dict[str, Any]:
     try:
         content = json.loads((folder / MATRIX).read_text(encoding="utf-8"))
         return {"matrix": content["matrix"], "code": content["code"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(folder / MATRIX, "", f"the matrix of a campaign ({type(error).__name__})") from None
 
 

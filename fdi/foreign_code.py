@@ -1,0 +1,105 @@
+"""Code that a log or a model file brings along. It runs only if the user trusts it, and it is announced before.
+
+A recording, a model file and a folder of results are data that people send to each other. What they contain must not
+run on the machine of the person who opens them. A file that the user names on the command line is his own choice.
+"""
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from plant.effects import CATALOGUE, load_effects
+from plant.errors import InputError, escape_control_characters
+from plant.parameters import read_toml
+
+Announce = Callable[[str], None]
+
+
+class ForeignCode(NamedTuple):
+    """A Python file that a log or a model file brings along."""
+
+    name: str  # as the log or the model file has it, or where the file was found
+    content: bytes
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the content, hexadecimal."""
+        return hashlib.sha256(self.content).hexdigest()
+
+
+def print_on_standard_error(text: str) -> None:
+    """Print a line on standard error: standard output may be one JSON object."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def require_trust(origin: object, codes: Sequence[ForeignCode], *, is_trusted: bool,
+                  announce: Announce = print_on_standard_error) -> None:
+    """Announce the code of `origin` that is about to run: name, origin, size, SHA-256.
+
+    Raises:
+        InputError: the user has not said that it may run. Nothing has run then.
+    """
+    if codes and not is_trusted:
+        listed = ", ".join(f"{code.name} (SHA-256 {code.sha256})" for code in codes)
+        raise InputError(origin, "", f"--trust, because it brings code along that would run here: {listed}")
+    for code in codes:
+        announce(escape_control_characters(
+            f"trusted code: {code.name}, {len(code.content)} bytes, from {origin}, SHA-256 {code.sha256}"))
+
+
+def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), *, is_trusted: bool,
+                          announce: Announce = print_on_standard_error) -> tuple[Path, ...]:
+    """Run the effect files that a model file names, if the user trusts them.
+
+    They are looked for in this folder and beside the model file; what is not found is skipped. A file that has been
+    loaded already does not run again.
+
+    Args:
+        model: a model file; None or the name of a shipped model has no such files.
+        given: effect files that the user has named himself; each replaces one of the same name.
+        is_trusted: whether the user lets this code run.
+        announce: gets a line about each file before it runs.
+
+    Returns:
+        The files that have run.
+
+    Raises:
+        InputError: there are such files and the user does not trust them, or one of them cannot be used.
+    """
+    found = [path for path in find_effect_files(model, given) if not _is_loaded(path)]
+    codes = [ForeignCode(str(path), _read(path)) for path in found]
+    require_trust(model, codes, is_trusted=is_trusted, announce=announce)
+    for path, code in zip(found, codes, strict=True):
+        load_effects(path, code.content)
+    return tuple(found)
+
+
+def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> list[Path]:
+    """The effect files that a model file names and that exist, without those of the same name as one in `given`.
+
+    Raises:
+        InputError: the model file cannot be read.
+    """
+    if model is None or not Path(model).is_file():
+        return []
+    provenance: Any = read_toml(Path(model)).get("provenance", {})
+    names = provenance.get("effect_files", []) if isinstance(provenance, Mapping) else []
+    files = [Path(name) for name in names if isinstance(name, str) and "\0" not in name]
+    places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
+    replaced = {file.name for file in given}
+    return list(dict.fromkeys(path for path in places if path is not None and path.name not in replaced))
+
+
+def _is_loaded(path: Path) -> bool:
+    """Whether the effects of the catalogue include some of this file, as it is now or was before."""
+    return any(effect.file == path.absolute() for effect in CATALOGUE.whole().values())
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"a readable file ({error.strerror})") from error
