@@ -40,8 +40,9 @@ FOLDER_MAY_IMPORT = {
     "fdi.foreign_code": set(),
     "fdi.analysis": {"fdi.foreign_code", *ESTIMATOR, "fdi.discovery", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     **dict.fromkeys(BENCH, BENCH),
+    "rig.conformance": {"rig.network"},  # independent of rig.device, which it tests
     "rig.studies": BENCH,
-    "rig.cli": {*BENCH, "rig.studies"},
+    "rig.cli": {*BENCH, "rig.conformance", "rig.studies"},
 }
 # Modules of others that only some files may import (prefixes of paths).
 ONLY_IN = {

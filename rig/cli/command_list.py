@@ -10,6 +10,7 @@ HELP_OF_COMMAND = {
     "bench": "measure the speed of the plant, or how often rig explain is right",
     "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
     "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
+    "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit and HTML",
     "doctor": "report what this machine can do: CAN, vcan, real-time rights, viewer",
     "effects": "list the catalogue of physical effects, or show one in detail",
     "explain": "find the physical effects that a model lacks, and rank the candidates",

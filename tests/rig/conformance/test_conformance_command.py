@@ -1,0 +1,137 @@
+"""`rig conformance`: our nodes on the embedded bus and as processes on UDP; answers, files, exit status, bad input."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from bus_stations import spec
+from rig_command import gone, rig, started
+
+from dbc import EDS
+from rig.conformance.case import CHAPTERS, Result, Verdict
+from rig.conformance.data_sheet import DataSheet
+from rig.conformance.report import Subject, write_junit
+from rig.conformance.runner import CASES, Outcome
+
+NOT_FOR_OUR_NODES = {"plant": {"4.5", "4.13", "4.17", "5.14", "6.12"},
+                     "controller": {"2.10", "4.5", "4.13", "4.17", "5.14"}}
+own_nodes = pytest.mark.parametrize("node", ["plant", "controller"])
+
+
+def test_cases_are_numbered_without_a_gap() -> None:
+    for chapter in CHAPTERS:
+        numbers = [each.number for each in CASES if each.chapter == chapter]
+        assert numbers == [f"{chapter}.{position}" for position in range(1, len(numbers) + 1)]
+    assert len(CASES) > 90
+    assert all(each.section and each.expected and each.check.__doc__ for each in CASES)
+
+
+@own_nodes
+def test_our_nodes_pass_on_the_embedded_bus(node: str) -> None:
+    said = rig("conformance", node, "--json")
+    assert (said.status, said.json["verdict"], said.json["notes"]) == (0, "PASS", [])
+    by_verdict = {verdict.value: {test["number"] for test in said.json["tests"] if test["verdict"] == verdict.value}
+                  for verdict in Verdict}
+    assert by_verdict["fail"] == by_verdict["skipped"] == set()
+    assert by_verdict["not applicable"] == NOT_FOR_OUR_NODES[node]
+    assert len(by_verdict["pass"]) == len(CASES) - len(NOT_FOR_OUR_NODES[node]) == said.json["counts"]["pass"]
+
+
+def test_our_nodes_pass_as_processes_on_udp() -> None:
+    """Both at once, each on its own bus; wide limits, for the machine may be busy. Nothing is left behind."""
+    buses = {node: spec("udp_multicast") for node in NOT_FOR_OUR_NODES}
+    running = {node: started("conformance", node, "--bus", bus, "--json", "--timeout", 5, "--tolerance", 2000)
+               for node, bus in buses.items()}
+    for node, process in running.items():
+        out, err = process.communicate(timeout=300)
+        answer = json.loads(out)
+        failed = [(test["number"], test["measured"]) for test in answer["tests"] if test["verdict"] == "fail"]
+        assert (failed, err) == ([], "")
+        assert {test["number"] for test in answer["tests"] if test["verdict"] == "not applicable"} == NOT_FOR_OUR_NODES[
+            node]
+        assert gone(buses[node])
+
+
+def test_files(tmp_path: Path) -> None:
+    out, junit = tmp_path / "new" / "folder", tmp_path / "junit.xml"
+    said = rig("conformance", "plant", "--chapter", 1, "--chapter", "3.6", "--out", out, "--junit", junit)
+    assert said.status == 0 and said.out.startswith("PASS  Every applicable test passed (11 of 11).")
+    assert "3.6" in said.out and "0x05030000" in said.out
+    answer = json.loads((out / "conformance.json").read_text())
+    assert (answer["node"], answer["product"], answer["bus"]) == (3, "EHA plant emulator", "embedded")
+    assert [test["number"] for test in answer["tests"]][-2:] == ["1.10", "3.6"]
+    page = (out / "conformance.html").read_text()
+    assert "1 Electronic data sheet" in page and "7.2.4.3.7, table 22" in page and "http" not in page
+    suites = ElementTree.parse(junit).getroot()
+    assert [suite.get("name") for suite in suites] == ["1 Electronic data sheet", "3 SDO"]
+    assert [len(suite) for suite in suites] == [10, 1] and suites.get("failures") == "0"
+
+
+def test_a_failure_is_shown_everywhere(tmp_path: Path) -> None:
+    sheet, junit = tmp_path / "other.eds", tmp_path / "junit.xml"
+    sheet.write_text(EDS[3].read_text().replace("EHA plant emulator", "EHA <other>"))
+    said = rig("conformance", "plant", "--eds", sheet, "--chapter", 2, "--junit", junit, "--out", tmp_path)
+    assert said.status == 1
+    assert said.out.startswith("FAIL  1 test failed: 2.3.")
+    assert "2.3 fail" in said.out
+    cases = ElementTree.parse(junit).getroot().findall(".//testcase")
+    failed = [each for each in cases if each.find("failure") is not None]
+    assert [each.get("name") for each in failed] == ["2.3 constants"]
+    failure = failed[0].find("failure")
+    assert failure is not None and "EHA <other>" in (failure.get("message") or "")
+    assert "EHA &lt;other&gt;" in (tmp_path / "conformance.html").read_text()
+
+
+def test_junit_has_skips_and_no_control_characters() -> None:
+    results = [Result("3.1", "a", "7", "e", "bytes \0\x1b", Verdict.FAIL, 0.25),
+               Result("3.2", "b", "7", "e", "no such object", Verdict.NOT_APPLICABLE, 0.0),
+               Result("3.3", "c", "7", "e", "late", Verdict.SKIPPED, 0.0)]
+    text = write_junit(Outcome(results, [], False), Subject(DataSheet(EDS[2], 2), "embedded", True))
+    suite = ElementTree.fromstring(text)[0]
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped"), suite.get("time")) == (
+        "3", "1", "2", "0.250")
+    assert [case[0].tag for case in suite] == ["failure", "skipped", "skipped"]
+    assert suite[0][0].get("message") == "bytes ??"
+
+
+def test_times_that_could_not_be_measured_make_the_timing_invalid() -> None:
+    result = Result("7.1", "a", "7", "e", "late", Verdict.SKIPPED, 0.0)
+    assert Outcome([result], [], True).verdict == "INVALID_TIMING"
+    assert Outcome([result], [], False).verdict == "PASS"
+    assert Outcome([result, result._replace(verdict=Verdict.FAIL)], [], True).verdict == "FAIL"
+
+
+@pytest.mark.parametrize(("words", "line"), [
+    (["128"], "rig conformance: NODE: 128: expected a node-ID from 1 to 127, controller or plant"),
+    (["firmware"], "rig conformance: NODE: firmware: expected a node-ID"),
+    (["5"], "--eds: expected the electronic data sheet of node 5"),
+    (["5", "--eds", EDS[2]], "--bus: embedded: expected a bus that the node is on"),
+    (["plant", "--eds", "none.eds"], "none.eds: expected an electronic data sheet"),
+    (["plant", "--chapter", "9"], "--chapter: 9: expected the number of a chapter"),
+    (["plant", "--junit", "x.txt"], "--junit: x.txt: expected FILE.xml"),
+    (["plant", "--tolerance", "nan"], "--tolerance: nan: expected a number from 0"),
+    (["plant", "--timeout", "0"], "--timeout: 0: expected a number from 0.01"),
+])  # fmt: skip
+def test_bad_input_is_one_line(words: list[object], line: str) -> None:
+    said = rig("conformance", *words)
+    assert (said.status, said.out) == (2, "")
+    assert line in said.err and said.err.count("\n") == 1
+
+
+def test_a_node_that_is_not_there() -> None:
+    said = rig("conformance", "9", "--eds", EDS[2], "--bus", spec("udp_multicast"), "--chapter", "3.1")
+    assert said.status == 2
+    assert "node 9 does not answer" in said.err and said.err.count("\n") == 1
+
+
+def test_a_foreign_node_is_not_written_to() -> None:
+    """Without --write no value of a manufacturer object changes: the cases that need it are skipped."""
+    from broken_devices import examine, nothing
+
+    from rig.conformance.target import Options
+
+    outcome = examine(nothing, 2, options=Options(may_write=False))
+    skipped = [result.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
+    assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["4.15", "6.12"], [])
