@@ -1,9 +1,9 @@
-"""Plain Python physics made fast: the only file that imports numba (machine_code.py stores what it compiled).
+"""Compiles the physics, which is plain Python: the only file that imports numba (machine_code.py stores the result).
 
-The physics is ordinary functions on floats and named tuples. `compiled` links a function with everything it calls,
-puts the model's effects in place of the port functions, and compiles the lot as one, inlined: a call that passes the
-state through memory costs as much as the step. The result is kept on disk under a hash of all the code that went in,
-so a changed effect is never served by stale code: numba's own cache looks at one file only.
+The physics is ordinary functions on floats and named tuples. `compile_function` links a function with everything that
+it calls, replaces the port functions by the model's effects, and compiles all of it as one inlined function: a call
+that passes the state through memory costs as much as the step. The machine code is stored under a hash of all sources
+that went in, so a changed effect never meets stale code. numba's own cache looks at one file only.
 """
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class LibraryFunction:
 
 
 def find_cache_folder() -> Path:
-    """Where compiled code is kept: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
+    """The folder of compiled code: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
     named = os.environ.get("EHA_RIG_CACHE")
     home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "eha-rig"
     try:
@@ -101,12 +101,12 @@ def rebind_names(function: Function, **names: Any) -> Function:
 
 
 def interpret_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
-    """`function` with `ports` in place, in plain Python: for debuggers, and for the test that compiled equals it."""
+    """`function` with `ports` bound, in plain Python: for debuggers and comparisons with compiled code."""
     return _link_calls(function, ports or {}, lambda f: f)
 
 
 def compile_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
-    """`function` and all it calls, with `ports` in place, as machine code cached on disk."""
+    """`function` and all functions that it calls, with `ports` bound, as machine code that is cached on disk."""
     import numba  # here and below: who only reads a trace need not load it, which takes 0.3 s
     import numba.core.compiler_lock
 
@@ -168,11 +168,11 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
 
 
 def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
-    """For compiled code: `(array, place) -> record` of type `kind`, its float i from first + i * apart + place.
+    """A function for compiled code: `(array, place) -> record` of type `kind`; float i is at first + i * apart + place.
 
-    The record is a copy, which the compiler dissolves into registers; laws get it by its address alone. Tried: a tuple
-    of two hundred numbers handed to each law, which doubles the time to compile; the address in the array itself,
-    which lets the compiler turn a choice of two numbers into a choice of two addresses, and then no vector code.
+    The record is a copy, which the compiler keeps in registers; laws get its address. Rejected alternatives: a tuple of
+    two hundred numbers passed to each law doubles the time to compile; with the address in the array itself the
+    compiler turns a choice of two numbers into a choice of two addresses, and then makes no vector code.
     """
     import numba
     import numba.core.cgutils
@@ -194,7 +194,8 @@ def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
 
         return record(array, place), code
 
-    at.__name__ = "record_" + hashlib.sha256(f"{kind!r} {first} {apart}".encode()).hexdigest()[:20]  # for `fingerprint`
+    # `compute_fingerprint` tells readers apart by their name
+    at.__name__ = "record_" + hashlib.sha256(f"{kind!r} {first} {apart}".encode()).hexdigest()[:20]
     return numba.extending.intrinsic(at)
 
 
@@ -212,7 +213,7 @@ def _find_calls(function: Function) -> dict[str, Function]:
 
 
 def list_called_names(function: Function) -> set[str]:
-    """The names of all functions that `function` calls, and that these call."""
+    """The names of all functions that `function` calls, directly or through others."""
     below = _find_calls(function)
     return set(below).union(*(list_called_names(g) for g in below.values()))
 
@@ -247,9 +248,10 @@ def _copy_libraries(function: Function, link: Callable[[Function], Function]) ->
 
 
 def compute_fingerprint(function: Function) -> str:
-    """Changes when the code of `function` or of anything it calls changes, or a constant, table or field they name.
+    """A hash of the code of `function` and of all it calls, with the constants, tables and fields that they name.
 
-    The code that runs counts, not its file: that may have been edited since it was loaded. So does how it is compiled.
+    It hashes the code that runs, not its file, which may have been edited since it was loaded; and this file, which
+    says how the code is compiled.
     """
     seen: dict[Function, str] = {}
 

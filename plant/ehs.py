@@ -35,14 +35,14 @@ Coefficients = namedtuple("Coefficients", "gain valve_slope jack_damping jack_fr
 
 
 def compute_servo_coefficients(p: Any, h: float) -> Any:
-    """D w = AJ XJ' + CLK P12, solved for P12."""
+    """Coefficients of D w = AJ XJ' + CLK P12, solved for P12."""
     slope, mass = p.jack.area / (p.jack.leakage + SEAL_LEAKAGE), p.jack.mass + h * p.jack.damping
     return Coefficients(p.pump.displacement / p.jack.area * slope, slope, p.jack.damping, 1.0 / mass,
                         1.0 / (mass + h * p.jack.area * slope))
 
 
 def step_servo(s: State, u: Input, p: Any, k: Any) -> State:
-    """The plant `u.h` seconds later; P12 is what pushes the ram, over the piston's larger side."""
+    """The state `u.h` seconds later; P12 is the force on the ram over the area of the piston's larger side."""
     m = s.memory
     w, m_current = at_current(u.current, m.current, s, u, p)
     r = 1.0 if (w if w != 0.0 else s.pressure) >= 0.0 else p.pump.area_ratio  # without flow the valve is closed

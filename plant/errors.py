@@ -1,15 +1,17 @@
-"""What can go wrong with what a user gives us: one class, one line."""
+"""Errors that the user can correct, each shown as one line; and the hint at a similar name."""
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 
 class RigError(Exception):
-    """Something the user can mend; the command shows it as one line and exits with `status`."""
+    """An error that the user can correct; the command shows it as one line and exits with `status`."""
 
     status = 2
 
 
 class InputError(RigError):
-    """A value that cannot be used: where it stands, which field, what was expected.
+    """A value that cannot be used: the file or option it is in, its field, and what was expected.
 
     >>> str(InputError("model.toml", "spool.mass", "a number above 0 kg, not -1"))
     'model.toml: spool.mass: expected a number above 0 kg, not -1'
@@ -31,3 +33,15 @@ def escape_control_characters(text: str) -> str:
     'a\\x1b[2Jb'
     """
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def suggest_name(word: str, known: Iterable[str], similarity: float = 0.6) -> str:
+    """The end of a message about an unknown name: the nearest of the `known` ones, or "" if none is near.
+
+    >>> suggest_name("spol_friction", ["jack_friction", "spool_friction"])
+    '; did you mean spool_friction?'
+    """
+    from difflib import get_close_matches  # only a mistake needs it
+
+    near = get_close_matches(word, known, 1, similarity)
+    return f"; did you mean {near[0]}?" if near else ""

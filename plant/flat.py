@@ -1,4 +1,4 @@
-"""Nested tuples as a flat array of floats and back: tuples for the physics, one buffer for whoever keeps them.
+"""Converts nested tuples to a flat array of floats and back: the physics uses tuples, storage uses one buffer.
 
 The state of a model with effects nests their memories. The conversions are written out as plain assignments, so that
 compiled code moves numbers between registers and the buffer and nothing else.
@@ -13,15 +13,15 @@ from plant.state import Memory, Ports, State
 
 
 def make_packers(state: State) -> tuple[Function, Function]:
-    """`pack(state, array)` and `unpack(array) -> state` for states shaped as `state`."""
+    """Two functions, `pack(state, array)` and `unpack(array) -> state`, for states with the fields of `state`."""
     pack, unpack, _ = _make_converters(state, "", lambda i: f"a[{i}]")
     return pack, unpack
 
 
 def make_lane_packers(shape: Any, width: int, first: int) -> tuple[Function, Function, int]:
-    """`keep(x, array, lane)` and `at(array, lane) -> x` for tuples like `shape`, and the first number after them.
+    """Functions `keep(x, array, lane)` and `at(array, lane) -> x` for tuples like `shape`, and the next free number.
 
-    In the buffer number f of a lane stands at f * width + lane; those of `shape` begin with f = `first`.
+    Number f of a lane is at f * width + lane of the buffer; the numbers of `shape` begin with f = `first`.
     """
     keep, at, numbers = _make_converters(shape, ", lane", lambda i: f"a[{(first + i) * width} + lane]")
     return keep, at, first + numbers
@@ -65,10 +65,10 @@ def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: 
 
 
 def pack_state(s: State, a: Any) -> None:
-    """Write `s` into the array `a`. This one stands for a model's own, which is put in its place."""
+    """Write `s` into the array `a`. A placeholder: each model binds its own function."""
     raise TypeError("no model is bound")
 
 
 def unpack_state(a: Any) -> Any:
-    """The state that the array `a` holds. This one stands for a model's own."""
+    """The state that the array `a` holds. A placeholder: each model binds its own function."""
     raise TypeError("no model is bound")

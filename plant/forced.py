@@ -1,22 +1,20 @@
-"""The jack held against measurements of what drives it: two balances, each with the laws and effects of the model.
+"""Two balances of the jack from measured signals, with the laws and effects of a model.
 
-Flow: with spool position and P12 measured, the metering edges say how fast the ram must move.
-Force: with that speed, and P12 measured, what pushes the ram must be what resists it.
-The spool's friction, the pilot stage and the controller have no part in either, so a fault there does not show.
+Flow: from the measured spool position and P12, the metering edges give the speed of the ram.
+Force: at that speed, the force of the measured P12 must equal inertia, drag, loads and friction.
+Neither depends on the spool's friction, the pilot stage or the controller, so a fault there does not show.
 """
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import Function, compile_function
+from plant.anchor import rest_at_reading
 from plant.effects import CATALOGUE
-from plant.model import Model, collect_bindings
+from plant.model import Model, build_kernel
 from plant.ports import at_jack_drag, at_load, at_position
-from plant.replay import rest_at_reading
 from plant.state import Drag, Input, Memory, Ports, State
 from plant.step import Coefficients, apply_oil, compute_coefficients, compute_metering_line
 
@@ -25,29 +23,29 @@ STEPS, FINE = 5, 100  # a cycle: what was stiff is given here, only effects that
 
 
 def compute_flow_balance(model: Model, spool: Array, pressure: Array, position: float) -> tuple[Array, Array]:
-    """Ram position as sensed, m, and speed, m/s, that measured XS (n,) m and P12 (n,) Pa ask for; (n,) both.
+    """Ram position as sensed, (n,) m, and speed, (n,) m/s, that follow from measured XS (n,) m and P12 (n,) Pa.
 
-    The metering edges' law P12(XS, v) solved for v; without effects AJ v = GQ (XS - P12/GP) - CLK P12. The run starts
-    where the transducer shows `position`, m; between samples the inputs are straight lines.
+    It solves the metering edges' law P12(XS, v) for v; without effects AJ v = GQ (XS - P12/GP) - CLK P12. The run
+    starts where the transducer shows `position`, m; between samples the inputs are interpolated linearly.
     """
     out = np.empty((len(spool), 2))
     columns = np.ascontiguousarray(np.column_stack([spool, pressure]), float)
-    run = _find_kernel(run_flow_balance, model)
+    run = build_kernel(run_flow_balance, model.effects)
     run(model.state(), columns, float(position), model.record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy()
 
 
 def compute_force_balance(model: Model, position: Array, speed: Array, pressure: Array,
                   load: Array) -> tuple[Array, Array, Array]:
-    """What the ram's motion takes, N: inertia, viscous drag and loads; and its static and dynamic dry friction.
+    """Force that the motion of the ram needs without dry friction, and the static and dynamic friction levels, (n,) N.
 
-    MJ a + CJ v + FR from measured position (n,) m and known speed (n,) m/s, load (n,) N; each (n,). The measured
-    P12 (n,) Pa is there for laws that look at it. AJ P12 less the first is what dry friction has to hold.
+    The first is MJ a + CJ v + FR from the measured position (n,) m, the speed (n,) m/s and the load (n,) N. AJ P12
+    less the first is the force of dry friction. Some effects also depend on the measured P12, (n,) Pa.
     """
     out = np.empty((len(speed), 3))
     rate = np.gradient(speed, model["controller.period"])
     columns = np.ascontiguousarray(np.column_stack([position, speed, rate, pressure, load]), float)
-    run = _find_kernel(run_force_balance, model)
+    run = build_kernel(run_force_balance, model.effects)
     run(model.state(), columns, model.record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
 
@@ -56,18 +54,8 @@ def _choose_steps(model: Model) -> int:
     return FINE if any(CATALOGUE[e].memory is not None for e in model.effects) else STEPS
 
 
-def _find_kernel(function: Function, model: Model) -> Function:
-    return _compile_balance(function, model.effects, tuple(CATALOGUE[e].function for e in model.effects))
-
-
-@cache
-def _compile_balance(function: Function, effects: tuple[str, ...], laws: tuple[Function, ...]) -> Function:
-    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    return compile_function(function, collect_bindings(effects))
-
-
 def compute_pressure_excess(v: float, s: State, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
-    """By how much the edges' pressure at ram speed v exceeds the state's, Pa; and what is remembered then."""
+    """Pressure of the metering edges at ram speed `v` less the pressure of the state, Pa; and the memories after it."""
     m = s.memory
     s = State(s.flapper_position, s.flapper_speed, s.spool_position, s.spool_speed, s.jack_position, v, s.pressure,
               s.sensed, m)
@@ -79,7 +67,7 @@ def compute_pressure_excess(v: float, s: State, u: Input, p: Any, constant: Coef
 
 
 def solve_ram_speed(s: State, p12: float, u: Input, p: Any, constant: Coefficients) -> tuple[float, Ports]:
-    """Ram speed at which the edges' pressure is `p12`, Pa; by secants from the last speed, exact for a line."""
+    """Ram speed at which the metering edges leave `p12`, Pa; by the secant method, exact for a straight line."""
     v0 = s.jack_speed
     f0, ports = compute_pressure_excess(v0, s, u, p, constant)
     v1 = v0 + (f0 - p12) / constant.valve_slope
@@ -121,7 +109,7 @@ def replace_position_memory(m: Ports, position: Memory) -> Ports:
 
 
 def run_force_balance(s: State, motion: Any, record: Any, steps: int, out: Any) -> None:
-    """Fills out[k] = MJ a + CJ v + FR, static and dynamic friction, N, at sample k, for a motion that is given.
+    """Fills out[k] = MJ a + CJ v + FR, static and dynamic friction, N, at sample k of a given motion.
 
     `motion` (n, 5): position m, speed m/s, acceleration m/s2, P12 Pa, load N.
     """

@@ -9,18 +9,18 @@ from math import inf
 
 
 def clip(x: float, limit: float) -> float:
-    """`x` within +-`limit`, as two selects."""
+    """`x` limited to +-`limit`; two selects, no branch."""
     x = x if x < limit else limit
     return x if x > -limit else -limit
 
 
 def soften(x: float, band: float) -> float:
-    """`x` with [-band, band] taken out: what dry friction leaves of an impulse."""
+    """`x` less the dead zone [-band, band]: the impulse that dry friction leaves."""
     return x - clip(x, band)
 
 
 def play(x: float, held: float, half: float) -> float:
-    """What `x` drags along through a play of +-`half`, having been at `held`."""
+    """The position of a part that `x` drags through a play of +-`half`; it was at `held`."""
     held = held if held > x - half else x - half
     return held if held < x + half else x + half
 

@@ -1,7 +1,7 @@
-"""Elementary functions without branches or calls, so that laws which use them run many to a vector register.
+"""Elementary functions without branches or calls, so that the compiler can turn laws that use them into vector code.
 
-They stand in for those of `math` and `numpy` in all linked code (`plant.compile`), compiled or interpreted, for one run
-or many: a law gives the same bits everywhere. Mathematical libraries do not promise that. The C library and NumPy have
+They replace those of `math` and `numpy` in all linked code (`plant.compile`), compiled or interpreted, for one run or
+many: a law gives the same bits everywhere. Mathematical libraries do not promise that. The C library and NumPy have
 several versions of exp, sin, log and pow, choose by the CPU, and the last bits differ. Methods and coefficients
 are those of fdlibm (sin, cos, log) and Cephes (tanh, atan). Errors against libm, in units of the last place (tests hold
 them): exp, log, atan 1, sin, cos, tanh 2, tan 3; angles up to 1e6 rad, beyond that a digit is lost a decade. What has

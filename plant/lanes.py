@@ -1,24 +1,46 @@
-"""Many runs of one model that differ in a few parameters: fits, Jacobians, null simulations, grids."""
+"""Simulates many runs of one model that differ in a few parameters: for fits, Jacobians, null simulations, grids.
+
+Runs are made in blocks, side by side: one run in each lane of the processor's wide registers. A block keeps everything
+in one flat buffer, number f of a lane at f * width + lane. All distances in memory are constants, so the compiler sees
+that lanes are independent. With one array per quantity it would have to check that at run time, and gives up because
+there are too many checks. The innermost loop runs over the lanes, has constant length, and calls the same step as a
+single run; that step must not branch.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import block, flat
-from plant.compile import Function, is_costly
+from plant.anchor import (
+    compute_pull,
+    initialise_sensed_position,
+    rest_at_reading,
+    set_jack_position,
+    set_sample_memories,
+)
+from plant.compile import Function, compile_function, is_costly, make_record_reader, rebind_names
+from plant.controller import Loop, apply_command_effects, compute_current
 from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
-from plant.model import Model, build_bare_model
+from plant.flat import list_state_values, make_lane_packers
+from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
+from plant.plants import find_plant
+from plant.ports import at_reading
+from plant.state import Input
+from plant.step import compute_coefficients, step_plant
 from plant.threads import count_threads, map_in_threads
 
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
 FEW = 6  # effects that a model may have and still get one kernel for all its runs
+WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
+# two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
+NARROW, WIDE = 16, 32
 
 
 class Lanes:
@@ -89,7 +111,7 @@ class Lanes:
         return out[:-1].transpose(0, 2, 1)
 
     def _shared_out(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
-        """Which runs go where: each to the model with the fewest effects that has all that are at work in it."""
+        """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones."""
         effects = self.model.effects
         if len(self._rungs) == 1:
             return [(self._rungs[0], np.arange(len(values)))]
@@ -104,7 +126,7 @@ class Lanes:
         return shared
 
     def _at_work(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
-        """In which runs a parameter of the effect is off its off value."""
+        """The runs in which the effect is active: one of its parameters differs from its off value."""
         changed = np.zeros(len(values), bool)
         for name, off in effect.off.items():
             column = values[:, self.names.index(name)] if name in self.names else self.model[name]
@@ -113,7 +135,7 @@ class Lanes:
 
 
 class KernelVariant:
-    """A model's kernel, or that of the same model with fewer effects."""
+    """The kernel of a model with some of its effects, for the runs in which the others are off."""
 
     def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
         own = set(build_bare_model(model.plant).having(effects).values)
@@ -124,15 +146,15 @@ class KernelVariant:
 
     def blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
                ) -> Iterator[tuple[Function, Array, NDArray[np.uint64]]]:
-        """The runs `members` in blocks: the kernel, the buffer at the start, and where the rows go.
+        """The runs `members` in blocks: the kernel, the buffer at the start, and the row of the output for each lane.
 
-        Idle lanes repeat the last run; their rows go behind all others.
+        Idle lanes repeat the last run; their rows come after all others.
         """
         model = self.model
-        width = block.WIDE if len(members) >= 2 * block.WIDE and not model.effects else block.NARROW
+        width = WIDE if len(members) >= 2 * WIDE and not model.effects else NARROW
         plan, run = _compile_layout(model.effects, self._laws, model.plant, width)
         if self._state is None:  # not sooner: it asks laws, which may be wrong
-            self._state = np.array(flat.list_state_values(model.state()))
+            self._state = np.array(list_state_values(model.state()))
         start = np.zeros((plan.numbers, width))
         start[:len(self._state)] = self._state[:, None]
         start[plan.parameters:] = self._parameters
@@ -148,11 +170,11 @@ class KernelVariant:
 
 
 def list_kernel_variants(model: Model) -> list[KernelVariant]:
-    """Kernels for the runs of a model, from few effects to all it has.
+    """Kernels for the runs of a model, from few effects to all of them.
 
-    An effect at its off value changes no bit, so a run may be made without it. A model with many effects has three:
-    none of them, those whose laws are cheap, and all; they run at 400, 200 and 70 million steps a second. More kernels
-    would save less than they take to compile.
+    An effect at its off value changes no bit, so a run can be made without it. A model with many effects has three
+    kernels: without effects, with those whose laws are cheap, with all. They make 400, 200 and 70 million steps per
+    second. More kernels would save less time than they take to compile.
     """
     if len(model.effects) <= FEW:
         return [KernelVariant(model, model.effects)]
@@ -161,7 +183,7 @@ def list_kernel_variants(model: Model) -> list[KernelVariant]:
 
 
 def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambda stage, share: None) -> None:
-    """Compile what runs of the model may need, or load it from the cache.
+    """Compile the kernels that runs of the model may need, or load them from the cache.
 
     `progress` is called with each stage and the share done.
     The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
@@ -183,12 +205,124 @@ def _is_cheap(effect: Effect) -> bool:
 
 
 def list_laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
-    """The functions behind the names, as a user's file may have been loaded anew."""
+    """The laws of the effects as they are now: a user's file may have been loaded again."""
     return tuple(CATALOGUE[e].function for e in effects)
 
 
 @cache
 def _compile_layout(effects: tuple[str, ...], functions: tuple[Any, ...], plant: str, width: int
-              ) -> tuple[block.Layout, Function]:
-    plan = block.plan_layout(effects, plant, width)
-    return plan, block.compile_block_kernel(plan)
+              ) -> tuple[Layout, Function]:
+    plan = plan_layout(effects, plant, width)
+    return plan, compile_block_kernel(plan)
+
+
+class Layout(NamedTuple):
+    """The layout of a block's buffer for a plant with certain effects."""
+
+    names: dict[str, Function]  # replace the placeholders below and the ports
+    parameters: int  # the number of the first parameter, which follow each other as in `Model.names`
+    numbers: int  # of a lane
+    width: int  # lanes
+
+
+class Drive(NamedTuple):
+    """Current through the torque motor, A: in this cycle, and the controller's answer for the next."""
+
+    now: float = 0.0
+    next: float = 0.0
+
+
+def _raise_unbound(*arguments: Any) -> Any:
+    raise TypeError("no model is bound")
+
+
+# each of these stands for a model's own, which is put in its place: x_at(buffer, lane), keep_x(x, buffer, lane)
+state_at = parameters_at = coefficients_at = loop_at = drive_at = _raise_unbound
+keep_state = keep_coefficients = keep_loop = keep_drive = _raise_unbound
+
+
+def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> Layout:
+    """The layout for a plant with `effects`, `width` lanes."""
+    record = build_bare_model(plant).having(effects).record()
+    shapes = {"state": build_initial_state(effects), "loop": Loop(), "drive": Drive(),
+              "coefficients": find_plant(plant).coefficients(record[0], 1.0)}
+    made, place = collect_bindings(effects, plant), 0
+    for name, shape in shapes.items():
+        made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, width, place)
+    made["parameters_at"] = make_record_reader(record.dtype, place * width, width)
+    return Layout(made, place, place + record.view(float).size, width)
+
+
+def compile_block_kernel(plan: Layout) -> Function:
+    """`run_block` as machine code."""
+    return compile_function(rebind_names(run_block, WIDTH=plan.width), plan.names)
+
+
+def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
+        rows: Any, out: Any) -> None:
+    """Simulates a block of runs; fills out[rows[lane], :, k] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
+
+    Args:
+        a: the block's buffer: state at the start and parameters in place, the rest zero. Used up.
+        com: (n,) demand m in closed loop, else the measured current A: com[k - 1] acts from k to k + 1.
+        load: (n,) N, external force against extension.
+        position: (n,) m, measured; NaN where missing; or (0,).
+        anchor: 1/s, how fast the ram is pulled to the measured position.
+        closed: with the model's own controller.
+        period: of a cycle, s.
+        steps: steps a cycle.
+        rows: (WIDTH,) where in `out` each lane goes.
+        out: (m, 3 or 4, n), written.
+    """
+    h, columns = period / steps, out.shape[1]
+    for lane in range(WIDTH):
+        begin_lane(a, lane, position, steps, h)
+    for k in range(len(com)):
+        t = k * period
+        for lane in range(WIDTH):
+            row = rows[lane]
+            out[row, 0, k], out[row, columns - 2, k], out[row, columns - 1, k] = sample_lane(a, lane, t)
+        given = com[k - 1] if k else 0.0
+        for lane in range(WIDTH):
+            if closed:
+                out[rows[lane], 1, k] = control_lane(a, lane, t, com[k], out[rows[lane], 0, k])
+            else:
+                keep_drive(Drive(given, 0.0), a, lane)
+        if len(position):
+            for lane in range(WIDTH):
+                s = state_at(a, lane)
+                pulled = s.jack_position + compute_pull(anchor * period, position[k], s.sensed)
+                keep_state(set_jack_position(s, pulled), a, lane)
+        for i in range(steps):
+            # the loop that everything is for
+            for lane in range(WIDTH):
+                u = Input(drive_at(a, lane).now, load[k], 0.0, t + i * h, i * h, h)
+                keep_state(step_plant(state_at(a, lane), u, parameters_at(a, lane), coefficients_at(a, lane)), a, lane)
+
+
+def begin_lane(a: Any, lane: int, position: Any, steps: int, h: float) -> None:
+    """Put one lane at rest where the transducer shows position[0], or at zero, and compute its coefficients."""
+    s, p = state_at(a, lane), parameters_at(a, lane)
+    keep_coefficients(compute_coefficients(p, h), a, lane)
+    rest = rest_at_reading(s, position[0], p, steps) if len(position) else initialise_sensed_position(s, p)
+    keep_state(rest, a, lane)
+
+
+def sample_lane(a: Any, lane: int, t: float) -> tuple[float, float, float]:
+    """Readings of one lane at `t`: XJ m, P12 Pa, XS m; as `plant.solve.read_sensors`, without noise."""
+    s = state_at(a, lane)
+    p = parameters_at(a, lane)
+    xj, m_reading = at_reading(s.sensed, s.memory.reading, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
+    keep_state(set_sample_memories(s, s.memory.command, m_reading), a, lane)
+    return xj, s.pressure, s.spool_position
+
+
+def control_lane(a: Any, lane: int, t: float, com: float, xj: float) -> float:
+    """Cor, A, of one lane's controller for the demand `com` and the sensed position `xj`, m; it acts a cycle later."""
+    s, p, d = state_at(a, lane), parameters_at(a, lane), drive_at(a, lane)
+    demand, m_command = apply_command_effects(com, s.memory.command, xj, t, p)
+    cor, c = compute_current(loop_at(a, lane), demand, xj, p.controller)
+    keep_loop(c, a, lane)
+    keep_state(set_sample_memories(s, m_command, s.memory.reading), a, lane)
+    keep_drive(Drive(d.next, cor), a, lane)
+    return cor

@@ -35,8 +35,9 @@ _ENTRY = ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *_A
 
 
 class StoredCode:
-    """`plant.solve.advance_flat_state` of one kind of plant: from a file in `folder`, else from numba, which then fills
-    the file.
+    """Machine code of `plant.solve.advance_flat_state` for one kind of plant.
+
+    It comes from a file in `folder`; without one, numba compiles it and the result is stored there.
     """
 
     def __init__(self, folder: Path, compile_code: Callable[[], Any]) -> None:
@@ -51,7 +52,7 @@ class StoredCode:
                 self._engine, self._entry = _link_object(code)
 
     def warm(self, flat: Array, record: Array) -> None:
-        """Make sure that there is machine code: with numba, and stored for the next process, if it was not."""
+        """Compile with numba and store the machine code for the next process, unless it was stored already."""
         if self._entry is None:
             run = self._compile()
             run(flat, 0.0, 0.0, 0.0, 0.0, record, 0)
@@ -61,7 +62,7 @@ class StoredCode:
                     _write_object(self._path, code)
 
     def bind(self, flat: Array, record: Array, steps: int) -> Advance:
-        """The function that moves the state `flat` of a plant with the parameters `record` by one cycle."""
+        """The function that advances the state `flat` of a plant with the parameters `record` by one cycle."""
         if self._entry is None:
             run = self._compile()
             return lambda current, load, noise, t: run(flat, current, load, noise, t, record, steps)

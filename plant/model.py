@@ -1,22 +1,21 @@
-"""A model: a plant, its parameter values, and the effects it has. Data; it becomes code when it is run."""
+"""A model is data: a plant, its parameter values and its effects. `build_kernel` turns it into code."""
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import flat, plants, solve
+from plant import flat, plants
 from plant import step as step_module
-from plant.compile import Function, compile_function, compute_fingerprint, find_cache_folder, interpret_function
+from plant.compile import Function, compile_function, interpret_function
 from plant.effects import CATALOGUE, Effect, combine_laws
-from plant.errors import InputError
-from plant.machine_code import StoredCode
+from plant.errors import InputError, suggest_name
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value, read_toml
 from plant.plants import Plant
 from plant.quantity import Quantity
@@ -26,20 +25,20 @@ STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
 
 
 def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eha") -> dict[str, type[Any]]:
-    """Every parameter group: the plant's own and those of `effects` (default: all in the catalogue that suit it)."""
+    """The parameter groups of a plant and of `effects` (default: all effects of the catalogue that suit the plant)."""
     kind = plants.find_plant(plant)
     chosen = list_offered_effects(plant) if effects is None else [CATALOGUE[name] for name in effects]
     return {**kind.groups, **{e.name: e.group for e in chosen if e.group is not None}}
 
 
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
-    """The effects of the catalogue that make sense in a plant."""
+    """The effects of the catalogue that suit a plant."""
     kind = plants.find_plant(plant)
     return [e for e in CATALOGUE.whole().values() if kind.offers(e)]
 
 
 def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Quantity:
-    """What the parameter "group.field" means, whichever effect it belongs to.
+    """Unit, symbol and range of the parameter "group.field" of a plant or of any effect.
 
     Raises:
         InputError: there is no such parameter.
@@ -58,7 +57,7 @@ class Model:
 
     @property
     def kind(self) -> Plant:
-        """The plant itself: what the values are values of."""
+        """The plant that the values belong to."""
         return plants.find_plant(self.plant)
 
     def replace(self, changes: Mapping[str, object], where: object = "--set") -> Model:
@@ -89,12 +88,12 @@ class Model:
         return self.values[name]
 
     def differences(self) -> dict[str, float]:
-        """What is not nominal: changed parameters, and all parameters of the effects it has."""
+        """The parameters that are not nominal, and all parameters of its effects."""
         base = self.kind.nominal
         return {name: value for name, value in self.values.items() if base.get(name) != value}
 
     def to_toml(self) -> str:
-        """The model file that `load_model` reads back."""
+        """The text of a model file, which `load_model` reads."""
         effects = ", ".join(f'"{e}"' for e in self.effects)
         name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
         plant = [] if self.plant == "eha" else [f'plant = "{self.plant}"']
@@ -118,14 +117,14 @@ class Model:
         return find_parameter_groups(self.effects, self.plant)
 
     def record(self) -> NDArray[Any]:
-        """The values as a one-row record array, fields group.field: what compiled code reads, live."""
+        """The values as a record array of one row, fields group.field; compiled code reads it in each step."""
         groups = self._groups()
         inner = {group: np.dtype((np.record, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
         row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
         return np.array([row], np.dtype((np.record, list(inner.items()))))
 
     def state(self) -> State:
-        """The centred actuator at rest, with the memory of this model's effects, as its transducer shows it."""
+        """The actuator at rest in the middle, with the memories of its effects, as its transducer shows it."""
         s = build_initial_state(self.effects)
         if not any(CATALOGUE[e].port == "position" for e in self.effects):
             return s
@@ -135,7 +134,7 @@ class Model:
 
 
 def load_model(source: str | Path = "eha") -> Model:
-    """The nominal model of a plant ("eha", "ehs") or the model in a TOML file: what differs from nominal, by group.
+    """The nominal model of a plant ("eha", "ehs"), or the model of a TOML file, which lists what is not nominal.
 
     Raises:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
@@ -168,13 +167,18 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
     if unknown:
-        raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}")
+        hint = suggest_name(str(unknown[0]), known)
+        raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
     values = flatten_tables(where, tables, find_parameter_groups(plant=plant))
     return build_bare_model(plant, name).having(effects).replace(values, where)
 
 
 def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
-    """Refuse two effects at work that exclude each other; at its off value one may stand beside the other."""
+    """Refuse two active effects that exclude each other; an effect at its off value is not active.
+
+    Raises:
+        InputError: the names of both.
+    """
     working = {e for e in effects if CATALOGUE[e].acts(values)}
     for e in sorted(working):
         for other in working.intersection(CATALOGUE[e].excludes):
@@ -182,14 +186,15 @@ def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str,
 
 
 def find_effect(name: str, plant: str = "eha") -> Effect:
-    """An effect of the catalogue by name, as far as it makes sense in a plant.
+    """The effect of that name, if it suits the plant.
 
     Raises:
         InputError: there is none of that name.
     """
     known = {e.name: e for e in list_offered_effects(plant)}
     if name not in known:
-        raise InputError("effect", name, f"one of {', '.join(known)}")
+        hint = suggest_name(name, known) or f": {', '.join(known)}"
+        raise InputError("effect", name, f"an effect of the catalogue{hint}")
     return known[name]
 
 
@@ -198,31 +203,28 @@ def build_initial_state(effects: tuple[str, ...]) -> State:
     return State(memory=Ports(*(combine_laws(port, effects)[1] for port in Ports._fields)))
 
 
-def build_kernel(name: str, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:
-    """The function `plant.solve.<name>` for a plant with `effects`, compiled once per set, or interpreted."""
+def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:
+    """`function`, which calls the physics, for a plant with `effects`.
+
+    Args:
+        function: of `plant.solve`, `plant.controller` or the like, on floats, tuples and arrays.
+        effects: names, in catalogue order.
+        fast: compiled, once for each set of effects; False runs the same source in plain Python.
+        plant: whose step it takes.
+    """
     laws = tuple(CATALOGUE[e].function for e in effects)
-    return _build_kernel(name, effects, laws, fast, plant)
+    return _build_kernel(function, effects, laws, fast, plant)
 
 
 @cache
-def _build_kernel(name: str, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str) -> Function:
-    return (compile_function if fast else interpret_function)(getattr(solve, name), collect_bindings(effects, plant))
-
-
-def stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
-    """The compiled `plant.solve.advance` for a plant with `effects`, from disk if it was stored there."""
-    return _stored_advance(effects, tuple(CATALOGUE[e].function for e in effects), plant)
-
-
-@cache
-def _stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> StoredCode:
-    source = compute_fingerprint(interpret_function(solve.advance_flat_state, collect_bindings(effects, plant)))
-    compile_code = partial(_build_kernel, "advance_flat_state", effects, laws, True, plant)
-    return StoredCode(find_cache_folder() / source, compile_code)
+def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, plant: str
+                  ) -> Function:
+    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
+    return (compile_function if fast else interpret_function)(function, collect_bindings(effects, plant))
 
 
 def collect_bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
-    """What stands for step, port functions and the packing of the state in a plant with `effects`."""
+    """The functions that replace step, ports and state packing in the kernels of a plant with `effects`."""
     ports = {f"at_{port}": combine_laws(port, effects)[0] for port in Ports._fields}
     kind = plants.find_plant(plant)
     ports["step_plant"], ports["compute_coefficients"] = kind.step, kind.coefficients

@@ -1,4 +1,4 @@
-"""The monitoring model (Fig. 6 of the paper): what is left of the actuator when only two faults are asked for.
+"""The monitoring model (Fig. 6 of the paper): the actuator reduced to what two faults need.
 
     XF = clip((GM Cor - KSF XS)/KF, +-XFM)     XS' = GQF1/ASV deadzone(XF, FSS/(GPF1 ASV)), |XS| <= XSM
     P12 = clip(GP XS - GP/GQ AJ XJ', +-PSR)    MJ XJ'' = AJ P12 - CJ XJ', |XJ| <= XJM
@@ -6,7 +6,7 @@
 A static flapper, a spool without mass, a jack without dry friction, leakage, load or noise. The current is held over a
 cycle, so XS has a closed form: a straight line while the flapper is at its stop, then an exponential with the pilot
 loop's Kv = KSF GQF1/(KF ASV). The ram lags behind it by MJ/(AJ^2 GP/GQ + CJ), 22 us. One step makes a cycle, where the
-reference model takes 20 to 100. Many runs stand side by side, as in `plant.block`.
+reference model takes 20 to 100. Many runs are simulated side by side, as in `plant.lanes`.
 """
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LEAST_SPEED = 1e-300  # stands for no speed at all, where something is divided b
 
 
 class Cell(NamedTuple):
-    """What a step of `h` s needs of the parameters of one run."""
+    """The coefficients of one step of one run."""
 
     tilt: float  # GM/KF, flapper displacement by current, m/A
     back: float  # KSF/KF, by the spool's
@@ -141,12 +141,12 @@ def _raise_unbound(*arguments: Any) -> Any:
     raise TypeError("no layout is bound")
 
 
-# each of these is put in its place by `kernel`: x_at(buffer, lane), keep_x(x, buffer, lane)
+# each of these is replaced by `compile_monitor_kernel`: x_at(buffer, lane), keep_x(x, buffer, lane)
 motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _raise_unbound
 
 
 def sample_lane(a: Any, lane: int, pulled: float, shown: float) -> float:
-    """What one lane's ram shows; and the ram pulled by a share to the position `shown`."""
+    """Position of one lane's ram, m; and pull the ram to the position `shown` by the share `pulled`."""
     s = motion_at(a, lane)
     keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
     position: float = s.position
@@ -208,7 +208,7 @@ STATES = 9  # numbers of the first three
 
 @cache
 def compile_monitor_kernel() -> Function:
-    """`run` as machine code; the first time on a machine this takes some seconds."""
+    """`run_monitor_block` as machine code; the first call on a machine takes some seconds."""
     made, place = {}, 0
     for name, shape in PARTS.items():
         made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, WIDTH, place)
@@ -265,7 +265,7 @@ class Monitor:
                              f"not {position.shape} beside {driven.shape}")
         period = float(self.model["controller.period"])
         kv = compute_cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
-        steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # as far as `decay` goes; one for any usual pilot
+        steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # `compute_decay` reaches no further
         inputs = driven, position, float(anchor), closed, period, steps
         run = compile_monitor_kernel()
 

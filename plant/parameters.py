@@ -1,4 +1,4 @@
-"""What the actuator is made of: one NamedTuple a component, every field with unit, symbol and range.
+"""The parameters of the actuator: one NamedTuple for each component, every field with unit, symbol and range.
 
 The values are data (`plant/models/nominal.toml`); this file gives their meaning and rejects impossible values. The
 ranges are wide, about three orders of magnitude either way: a value outside is a mistake (a unit, an exponent), and for
@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
-from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
-from plant.errors import InputError
+from plant.errors import InputError, suggest_name
 from plant.quantity import Quantity, list_quantities
 
 FILTER_LAWS = {"sqrt": 0.5, "linear": 1.0, "pressure": 0.0}
@@ -132,7 +131,7 @@ def convert_group_unit(group: type[Any], unit: str, other: str, wider: float) ->
 
 
 def parse_value(where: object, name: str, quantity: Quantity, value: object) -> float:
-    """`value` as the number it stands for.
+    """The number that `value`, a number or a word, stands for.
 
     Raises:
         InputError: not a number (or, for a choice, not one of its words), or out of range.
@@ -152,7 +151,7 @@ def parse_value(where: object, name: str, quantity: Quantity, value: object) -> 
 
 
 def find_field(where: object, name: str, groups: Mapping[str, type[Any]]) -> Quantity:
-    """What "group.field" means.
+    """Unit, symbol and range of "group.field".
 
     Raises:
         InputError: no such group or field; the nearest name is offered.
@@ -168,12 +167,8 @@ def find_field(where: object, name: str, groups: Mapping[str, type[Any]]) -> Qua
 
 
 def _suggest_nearest(word: str, known: Mapping[str, Any]) -> str:
-    near = get_close_matches(word, known, 1, 0.6)
-    if near:
-        return f"; did you mean {near[0]}?"
-    if len(known) < 8:
-        return f" ({', '.join(known)})"
-    return ""
+    listed = f" ({', '.join(known)})" if len(known) < 8 else ""
+    return suggest_name(word, known) or listed
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -205,7 +200,11 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 
 
 def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str, type[Any]]) -> dict[str, float]:
-    """{"group": {"field": value}} as {"group.field": value}, every value accepted or refused by name."""
+    """{"group": {"field": value}} as {"group.field": value}, with every value checked.
+
+    Raises:
+        InputError: an unknown group or field, or an impossible value, by name.
+    """
     values: dict[str, float] = {}
     for group, fields in tables.items():
         if not isinstance(fields, Mapping):
@@ -217,7 +216,7 @@ def flatten_tables(where: object, tables: Mapping[str, Any], groups: Mapping[str
 
 
 def load_nominal_values() -> dict[str, float]:
-    """The nominal actuator, "group.field" to SI value."""
+    """The values of the nominal actuator, "group.field" to SI value."""
     return dict(_load_nominal_values())
 
 
@@ -237,7 +236,11 @@ def read_shipped_model(file: str, groups: Mapping[str, type[Any]]) -> dict[str, 
 
 
 def check_combinations(where: object, values: Mapping[str, float]) -> None:
-    """Refuse combinations that no actuator can have, each value being possible alone."""
+    """Refuse values that are possible alone and impossible together.
+
+    Raises:
+        InputError: such as a dynamic friction above the static one.
+    """
     for body in ("spool", "jack"):
         if f"{body}.static_friction" not in values:
             continue

@@ -1,7 +1,7 @@
-"""Which plants there are: each a step function with its parameters, built from the same parts and effects.
+"""The plants: each is a step function with its parameters, built from the same parts and effects.
 
 A plant's `step` and `coefficients` stand in place of the reference model's in every kernel (`plant.compile` binds by
-name), so whatever runs the one runs the other: one run, lanes, the emulator, fits.
+name), so single runs, lanes, emulator and fits work with every plant.
 """
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MODULES = {"ehs": "plant.ehs"}  # plants beside the reference model; read when f
 
 
 class Term(NamedTuple):
-    """A column of a file of the plant's own rig as part of a trace's column: `factor` times the value `later` rows on.
+    """A part of a trace's column: `factor` times a column of the plant's own file, taken `later` rows further down.
 
     A mean of the last m rows stands (m - 1)/2 rows late in its file: `later` puts it back.
     """
@@ -38,7 +38,7 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """How files of the plant's own rig are read as a trace."""
+    """How a file of the plant's own rig becomes a trace."""
 
     columns: Mapping[str, tuple[Term, ...]]  # t, com, xj, cor and what else of a trace there is, as sums
     skip: int = 0  # rows of start-up
@@ -74,21 +74,21 @@ class Plant:
         return {**zero, **self.given}
 
     def tolerance(self, name: str, q: Quantity) -> float:
-        """How far a parameter of one unit differs from another's, a fraction; what is not there does not scatter."""
+        """Scatter of a parameter from unit to unit, as a fraction; 0 where the nominal value is zero."""
         if self.nominal.get(name) == 0.0:
             return 0.0
         return q.tolerance if self.scatter is None else self.scatter.get(name, 0.0)
 
     @cached_property
     def ports(self) -> frozenset[str]:
-        """Where effects can act: the ports that its step calls, and those of the sampled loop around it."""
+        """The ports at which effects can act: those that its step calls, and those of the sampled loop around it."""
         calls = list_called_names(self.step)
         if self.step is reference.step_plant:
             calls = calls | list_called_names(reference.apply_changing_oil)
         return frozenset({"command", "reading"} | {name[3:] for name in calls if name.startswith("at_")})
 
     def offers(self, e: Effect) -> bool:
-        """Whether an effect makes sense here: its port or its parameters are there, and its input has this unit."""
+        """Whether the plant has the port, the parameters and the unit of current that an effect needs."""
         if e.plant not in ("", self.name) or e.name in self.lacks:
             return False
         if e.base:

@@ -1,8 +1,8 @@
 """The ports of the signal path: places where effects act, and how several effects become one function.
 
-`plant.step` calls `at_<port>` at each place. Here these let the signal through; a model's kernels are compiled with
-its effects in their stead (`plant.compile`). A function at a port gets the signal, what it remembers, the state at the
-start of the step, the inputs and the parameters; it returns the signal and what it will remember.
+`plant.step` calls `at_<port>` at each place. The functions here pass the signal unchanged; a model's kernels are
+compiled with its effects instead (`plant.compile`). A function at a port gets the signal, its memory, the state at the
+start of the step, the inputs and the parameters; it returns the signal and its new memory.
 """
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The position demand as data: segments or a CSV file in, one value per 1 ms cycle and named sections out."""
+"""Turns segments or a CSV file into a position demand: one value per 1 ms cycle, and named sections."""
 from __future__ import annotations
 
 import csv
@@ -18,7 +18,7 @@ _LARGEST = {"com": FARTHEST, "load": STRONGEST}  # m, N; a value is either, and 
 
 
 class Section(NamedTuple):
-    """A segment's place in the command: cycles start <= k < stop."""
+    """The cycles of a segment in the command: start <= k < stop."""
 
     name: str
     kind: str
@@ -35,14 +35,14 @@ class Profile(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What a command file holds, one value per cycle."""
+    """The columns of a command file, one value per cycle."""
 
     com: Array  # m
     load: Array | None  # N, None without such a column
 
 
 def name_sections(segments: Sequence[Segment]) -> list[str]:
-    """What the sections of a command are called: their own name, or kind_number with the segment's number from 1."""
+    """Names of the sections of a command: the segment's own, or kind_number with its number from 1."""
     return [segment.name or f"{segment.kind}_{number}" for number, segment in enumerate(segments, 1)]
 
 
@@ -68,8 +68,10 @@ def build_profile(segments: Sequence[Segment], start: float = 0.0) -> Profile:
 def read_command(path: str | Path, period: float = 1 / RATE) -> Command:
     """A command file for `rig simulate`: CSV (or .csv.gz) with columns t, com and optionally load, SI units.
 
-    One value per cycle of `period` s, as `on_cycles` has it. Raises InputError naming the file, the line and what was
-    expected there.
+    One value per cycle of `period` s, as `resample_on_cycles` makes it.
+
+    Raises:
+        InputError: the file, the line and what was expected there.
     """
     try:
         data = Path(path).read_bytes()
@@ -82,10 +84,12 @@ def read_command(path: str | Path, period: float = 1 / RATE) -> Command:
 
 
 def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[str, Array]:
-    """The columns com, value and load of a CSV text, as far as it has them, at one value per cycle from its first row.
+    """The columns com, value and load of a CSV text, those that it has, one value per cycle from its first row.
 
-    Rows and cycles need not agree: see `on_cycles`. Other columns are ignored, so a trace is a command too.
-    Raises InputError for what is not a number, not finite, or not in order of time.
+    Rows need not be one cycle apart: see `resample_on_cycles`. Other columns are ignored, so a trace is a command too.
+
+    Raises:
+        InputError: a value that is no finite number, or times that do not increase.
     """
     rows = _read_rows(data, where)
     _, header = next(rows, (0, [""]))
@@ -99,11 +103,11 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE) -> dict[
 
 
 def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
-    """What is asked for at the start of each cycle, when `values` are asked for at the times `t` (s, increasing).
+    """The demand at the start of each cycle, from `values` at the times `t` (s, increasing).
 
-    Rows at that period are taken as they are. Else rows up to 1 ms apart, the bench's own cycle, are samples that hold
-    until the next: a step stays a step. Rows further apart are breakpoints, joined by straight lines. The last row
-    lasts as long as the one before it, if these are samples, or one cycle.
+    Rows at that period are taken as they are. Otherwise rows up to 1 ms apart, the bench's own cycle, are samples that
+    hold until the next: a step stays a step. Rows further apart are breakpoints, joined by straight lines. The last
+    row lasts as long as the one before it, if these are samples, or one cycle.
     """
     gaps = np.diff(t)
     held = gaps <= (1 + SLACK) / RATE

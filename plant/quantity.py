@@ -1,4 +1,4 @@
-"""A number with a meaning: unit, symbol of the paper, and the values that make sense.
+"""The meaning of a number: its unit, its symbol in the paper, and its possible values.
 
 A parameter group is a NamedTuple whose fields are `Annotated[float, Quantity(...)]`. The unit lives in the type, where
 people, error messages, logs and tables all read the same one.
@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 
 class Quantity(NamedTuple):
-    """What a number means. `low` and `high` are allowed themselves; `above` and `below` are not."""
+    """Unit, symbol and range of a number. `low` and `high` are allowed; `above` and `below` are not."""
 
     unit: str
     symbol: str = ""  # as in the source paper, where it has one
@@ -24,7 +24,7 @@ class Quantity(NamedTuple):
     tolerance: float = 0.0  # how far one unit differs from another, as a fraction (prior of a fit)
 
     def refuses(self, value: float) -> bool:
-        """True for a value that cannot be."""
+        """True for a value outside the range, NaN or infinity."""
         return not (math.isfinite(value) and self.low <= value <= self.high and self.above < value < self.below)
 
     @property
@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
 
 
 def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
-    """The fields of a parameter group with what they mean, in order."""
+    """The fields of a parameter group, in order, with their quantities."""
     if group not in _KNOWN_GROUPS:  # reading annotations takes longer than everything else about a model
         hints = get_type_hints(group, include_extras=True)
         _KNOWN_GROUPS[group] = {name: get_args(hints[name])[1] for name in group._fields}

@@ -1,20 +1,23 @@
-"""The plant as programs use it: one cycle at a time (`Actuator`), or a whole command at once (`simulate`)."""
+"""Runs a model: one cycle at a time (`Actuator`), or over a whole command (`simulate`)."""
 from __future__ import annotations
 
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, cast
+from functools import cache, partial
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
+from plant.controller import apply_command_effects
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.flat import list_state_values, make_packers
-from plant.machine_code import Advance
-from plant.model import STEPS, Model, build_initial_state, build_kernel, stored_advance
-from plant.solve import NOISES
+from plant.machine_code import Advance, StoredCode
+from plant.model import STEPS, Model, build_initial_state, build_kernel, collect_bindings
+from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.state import State
 
 Array = NDArray[np.float64]
@@ -23,7 +26,7 @@ SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pre
 
 
 class Columns(NamedTuple):
-    """A run, one row a cycle: `t` s, `com` and `xj` m, `cor` A, `p12` Pa, `xs` m, `load` N; each (n,)."""
+    """A simulated run, one row per cycle: `t` s, `com` and `xj` m, `cor` A, `p12` Pa, `xs` m, `load` N; each (n,)."""
 
     t: Array
     com: Array
@@ -35,12 +38,12 @@ class Columns(NamedTuple):
 
 
 def draw_noise(seed: int, cycles: int) -> Array:
-    """The random numbers of a run, (cycles, NOISES) standard normal: the same for a bench run and a simulation."""
+    """The random numbers of a run, (cycles, NOISES), standard normal; the same for a bench run and a simulation."""
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
 
 
 def iterate_noise(seed: int) -> Iterator[list[float]]:
-    """The rows of `noise`, without end; a few at a time, which costs a tenth of one by one."""
+    """The rows of `draw_noise` without end; drawn in blocks, which costs a tenth of drawing single rows."""
     rng = np.random.default_rng(seed)
     while True:
         yield from rng.standard_normal((NOISE_BLOCK, NOISES)).tolist()
@@ -48,7 +51,7 @@ def iterate_noise(seed: int) -> Iterator[list[float]]:
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,
              fast: bool = True, drawn: Array | None = None) -> Columns:
-    """The model with its own controller over a command.
+    """Run the model with its own controller over a command.
 
     Args:
         model: the plant.
@@ -69,7 +72,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     out = np.empty((len(com), 4))
     record = model.record()
     with report_law_errors(model):
-        run = build_kernel("run_closed_loop", model.effects, fast, model.plant)
+        run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
         run(model.state(), com, force, draw_noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
@@ -95,7 +98,7 @@ def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     laws = [CATALOGUE[name].function for name in model.effects]
     files = {law.__code__.co_filename for law in laws if law is not None}
     try:
-        step = build_kernel("step_cycle", model.effects, False, model.plant)
+        step = build_kernel(step_cycle, model.effects, False, model.plant)
         step(model.state(), 0.0, 0.0, 0.0, 0.0, model.record(), 1)
     except Exception as error:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
@@ -104,18 +107,18 @@ def _find_law_error(model: Model) -> tuple[str, Exception] | None:
 
 
 class Demand:
-    """What the firmware of a model makes of a demand, cycle by cycle: the effects at the port `command`."""
+    """The demand after the effects at the port `command`, cycle by cycle: what the firmware closes its loop on."""
 
     def __init__(self, model: Model) -> None:
         is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
-        self._law = build_kernel("apply_command_effects", model.effects, fast=False) if is_changed else None
+        self._law = build_kernel(apply_command_effects, model.effects, fast=False) if is_changed else None
         self._first = build_initial_state(model.effects).memory.command
         self._record = model.record()[0]
         self._period = model["controller.period"]
         self.restart()
 
     def restart(self) -> None:
-        """Forget all; the next cycle is the first."""
+        """Forget the past; the next cycle is the first."""
         self._memory, self._cycle = self._first, 0
 
     def __call__(self, demand: float, position: float) -> float:
@@ -128,7 +131,7 @@ class Demand:
 
 
 class Actuator:
-    """One plant that runs cycle by cycle: the emulator's core. Neither a clock nor a bus is known here."""
+    """One plant that runs cycle by cycle: the core of the emulator. It knows neither clock nor bus."""
 
     def __init__(self, model: Model, seed: int = 0, steps: int = STEPS, fast: bool = True) -> None:
         self.model, self.steps = model, steps
@@ -143,16 +146,16 @@ class Actuator:
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
         self._draws = iterate_noise(seed)
         self._noise = [0.0] * NOISES
-        self._code = stored_advance(model.effects, model.plant) if fast else None
+        self._code = load_stored_advance(model.effects, model.plant) if fast else None
         self._advance = self._bind_advance()
         # a reading that nothing changes is faster without a call of compiled code
         changed = any(CATALOGUE[e].port == "reading" for e in model.effects)
-        self._read = build_kernel("read_flat_sensors", model.effects, fast) if changed else None
+        self._read = build_kernel(read_flat_sensors, model.effects, fast) if changed else None
         self._period = model["controller.period"]
 
     @property
     def state(self) -> State:
-        """The plant now."""
+        """The present state of the plant."""
         return cast(State, self._unpack(self._flat.tolist()))
 
     def warm(self) -> None:
@@ -168,7 +171,7 @@ class Actuator:
                 self._read(self._flat.copy(), np.array(self._noise), 0.0, self._record)
 
     def sample(self) -> tuple[float, float, float]:
-        """What the transducers read now: XJ m, P12 Pa, XS m. Once a cycle: it draws the cycle's noise."""
+        """The readings of the transducers: XJ m, P12 Pa, XS m. Call it once per cycle: it draws the cycle's noise."""
         n = self._noise = next(self._draws)
         if self._read:
             return cast("tuple[float, float, float]", self._read(
@@ -179,7 +182,7 @@ class Actuator:
                 state(SPOOL) + level(spool) * n[2])
 
     def advance(self, current: float, load: float = 0.0) -> None:
-        """One cycle with `current` A in the torque motor and `load` N on the ram."""
+        """Simulate one cycle with `current`, A, in the torque motor and `load`, N, on the ram."""
         t = self.cycle * self._period
         self._advance(current, load, self._noise[3], t)
         self.cycle += 1
@@ -187,7 +190,7 @@ class Actuator:
     def _bind_advance(self) -> Advance:
         if self._code is not None:
             return self._code.bind(self._flat, self._record, self.steps)
-        run = build_kernel("advance_flat_state", self.model.effects, fast=False, plant=self.model.plant)
+        run = build_kernel(advance_flat_state, self.model.effects, fast=False, plant=self.model.plant)
         return lambda current, load, noise, t: run(self._flat, current, load, noise, t, self._record, self.steps)
 
     def set(self, name: str, value: float) -> None:
@@ -199,3 +202,16 @@ class Actuator:
         if name not in self._index:
             raise InputError("set", name, f"a parameter of the running model ({self.model.name})")
         self._live[self._index[name]] = value
+
+
+def load_stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredCode:
+    """`advance_flat_state` for a plant with `effects`: machine code from disk if it was stored there."""
+    return _load_stored_advance(effects, tuple(CATALOGUE[e].function for e in effects), plant)
+
+
+@cache
+def _load_stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str) -> StoredCode:
+    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
+    source = compute_fingerprint(interpret_function(advance_flat_state, collect_bindings(effects, plant)))
+    compile_code = partial(build_kernel, advance_flat_state, effects, True, plant)
+    return StoredCode(find_cache_folder() / source, compile_code)

@@ -1,4 +1,4 @@
-"""The kinds of segment a command is made of: hold, step, ramp, sine, chirp, multisine, points, csv.
+"""The kinds of segment of a command: hold, step, ramp, sine, chirp, multisine, points, csv.
 
 A segment starts from the demand that the one before it reached at its end (the value it would take in the cycle after
 its last), so a list of them is continuous except where a step, a CSV file or a wave with given phases says otherwise.
@@ -31,7 +31,7 @@ LONGEST = 3600.0  # s, of one segment or file: beyond it, somebody wrote millise
 
 @dataclass(frozen=True, kw_only=True)
 class Segment(ABC):
-    """One piece of a command. `name` is what checks call its section."""
+    """One piece of a command. Checks refer to its section by `name`."""
 
     kind: ClassVar[str]
     name: str = ""
@@ -53,7 +53,7 @@ class Segment(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Timed(Segment):
-    """A segment that says how long it lasts."""
+    """A segment with a given duration."""
 
     time: Second
 

@@ -1,4 +1,4 @@
-"""What every effect must keep to, whoever wrote it, tried on a command: `rig effects NAME --test` shows it."""
+"""Tests that every effect must pass, also a user's own, on a command: `rig effects NAME --test` shows the result."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ SHORT = np.concatenate([np.zeros(5), np.full(25, 2e-3), np.linspace(2e-3, -1e-3,
 
 
 class Shown(NamedTuple):
-    """What an effect of one size changes: RMS over a command, and over the noise of the sensor."""
+    """How much an effect of one size changes a signal: RMS over a command, and that over the noise of the sensor."""
 
     start: Mapping[str, float]
     xj: float  # m
@@ -28,7 +28,7 @@ class Shown(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What was tried on an effect, and how it went; `faults` in words, none if all is well."""
+    """The result of the tests of an effect; `faults` in words, empty if it passed."""
 
     effect: str
     faults: tuple[str, ...]
@@ -36,12 +36,12 @@ class Report(NamedTuple):
 
     @property
     def visible(self) -> bool:
-        """Whether its largest size shows above the noise on the command it was tried on."""
+        """Whether its largest size shows above the noise on the command of the test."""
         return any(shown.level >= 1.0 for shown in self.shown)
 
 
 def check_effect(name: str, command: Array, load: Array | None = None) -> Report:
-    """Try an effect of the catalogue on `command` (n,) m and `load` (n,) N.
+    """Test an effect of the catalogue on `command` (n,) m and `load` (n,) N.
 
     Raises:
         InputError: a law that cannot be compiled and run.
@@ -77,7 +77,7 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
 
 
 def list_extremes(effect: Effect) -> list[dict[str, float]]:
-    """The ends of the range of each fitted parameter: far out, but a plant that is there must have a number."""
+    """The ends of the range of each fitted parameter, where the simulation must still be finite."""
     ranges = {name: effect.parameters[name] for name in effect.fitted}
     return [{name: end} for name, q in ranges.items() for end in (q.low, q.high) if not q.refuses(end)]
 

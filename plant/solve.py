@@ -1,4 +1,4 @@
-"""One sampled cycle and one closed-loop run, as the physics functions that get compiled.
+"""One sampled cycle and one closed-loop run, as functions for `plant.model.build_kernel`.
 
 Timing (physics of a synchronous bus): cycle k senses XJ_k at t_k, the firmware answers Cor_k, and Cor_k drives the
 torque motor from t_k+1 to t_k+2. Row k of a log holds Com_k, XJ_k, Cor_k and the pressure and spool position at t_k.
@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from plant.controller import Loop, compute_current
+from plant.controller import Loop, apply_command_effects, compute_current
 from plant.flat import pack_state, unpack_state
-from plant.ports import at_command, at_reading
+from plant.ports import at_reading
 from plant.state import Input, Memory, Ports, State
 from plant.step import compute_coefficients, step_plant
 
@@ -17,7 +17,7 @@ NOISES = 4  # standard normal numbers a cycle: position, pressure, spool, and on
 
 
 def read_sensors(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[float, float, float, Memory]:
-    """What the transducers read at time `t`: XJ m, P12 Pa, XS m; and the memory of the reading."""
+    """The readings of the transducers at time `t`: XJ m, P12 Pa, XS m; and the memory of the port `reading`."""
     g = p.sensors
     u = Input(0.0, 0.0, noise[3], t, 0.0, p.controller.period)
     xj, m = at_reading(s.sensed + g.position_noise * noise[0], m, s, u, p)
@@ -25,7 +25,7 @@ def read_sensors(s: State, m: Memory, noise: Any, t: float, p: Any) -> tuple[flo
 
 
 def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> tuple[float, float, float]:
-    """`sense` on a flat state, which keeps the memory."""
+    """`read_sensors` on a flat state, which keeps the memory."""
     s = unpack_state(flat)
     xj, p12, xs, m_reading = read_sensors(s, s.memory.reading, noise, t, record[0])
     m = s.memory
@@ -36,32 +36,8 @@ def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> tuple[flo
     return xj, p12, xs
 
 
-def apply_command_effects(com: float, m: Memory, xj: float, t: float, p: Any) -> tuple[float, Memory]:
-    """The demand as the firmware takes it, m, and its memory; of the plant it knows the sensed position alone."""
-    nothing: Memory = 0.0
-    s = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, xj, nothing)
-    return at_command(com, m, s, Input(0.0, 0.0, 0.0, t, 0.0, p.controller.period), p)
-
-
-def run_firmware(m: Memory, com: Any, xj: Any, record: Any, out: Any) -> None:
-    """The controller alone, on what it was told and what it sensed; fills out[k] = Cor, A.
-
-    Args:
-        m: memory of the port `command` at the start.
-        com: (n,) demand, m.
-        xj: (n,) sensed position, m.
-        record: (1,) parameters of the model.
-        out: (n,), written.
-    """
-    p = record[0]
-    c = Loop(0.0, 0.0, 0.0)
-    for k in range(len(com)):
-        demand, m = apply_command_effects(com[k], m, xj[k], k * p.controller.period, p)
-        out[k], c = compute_current(c, demand, xj[k], p.controller)
-
-
 def step_cycle(s: State, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> State:
-    """The plant one cycle after `t`, current and load held, in `steps` equal steps; `record` is a model's record."""
+    """The state one cycle after `t`, current, A, and load, N, held, in `steps` equal steps; `record` of the model."""
     p = record[0]
     h = p.controller.period / steps
     k = compute_coefficients(p, h)
@@ -71,12 +47,12 @@ def step_cycle(s: State, current: float, load: float, noise: float, t: float, re
 
 
 def advance_flat_state(flat: Any, current: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
-    """`cycle` in place on a flat state: tuples would cross into Python and back at twice the price of the physics."""
+    """`step_cycle` in place on a flat state: passing tuples to Python and back costs twice as much as the physics."""
     pack_state(step_cycle(unpack_state(flat), current, load, noise, t, record, steps), flat)
 
 
 def run_closed_loop(s: State, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> State:
-    """The plant with its controller over the command `com`; fills out[k] = XJ, Cor, P12, XS of cycle k.
+    """Runs the plant with its controller over the command `com`; fills out[k] = XJ, Cor, P12, XS of cycle k.
 
     Args:
         s: state at the start.

@@ -1,4 +1,4 @@
-"""How large an effect shows, and from there sizes to start a fit or a scan at, for effects that name none."""
+"""Finds start values for fits and scans, for effects that name none, from how much an effect changes the signals."""
 from __future__ import annotations
 
 import re
@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from plant.controller import compute_answers
 from plant.effects import CATALOGUE, Effect
 from plant.lanes import Lanes
-from plant.model import Model, build_initial_state, build_kernel
+from plant.model import Model
 from plant.quantity import Quantity
 from plant.run import report_law_errors, simulate
 
@@ -56,7 +57,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tu
 
 
 def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effect:
-    """The effect of that name, which from now on has starts in the catalogue; see `starts_of`."""
+    """The effect of that name; the catalogue has its start values from now on (see `find_starts`)."""
     effect = CATALOGUE[name]
     if not effect.starts:
         CATALOGUE[name] = effect = replace(effect, starts=find_starts(effect, command, load))
@@ -65,7 +66,7 @@ def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effec
 
 def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
             load: Array | None = None) -> Array:
-    """What an effect changes when the nominal plant is driven by the same current, without noise.
+    """How an effect changes the signals of the nominal plant, driven by the same current, without noise.
 
     An effect in the firmware changes no plant: then the first column is its current over the loop's gain, m, when it
     sees the same positions, and the others are zero.
@@ -93,14 +94,14 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
 
 
 def compute_rms(change: Array) -> Array:
-    """RMS of each column of `changes` (m, n, 3), SI, (m, 3); infinite where a run has no number any more."""
+    """RMS of each column of a `change` (m, n, 3), SI, (m, 3); infinite where the simulation diverged."""
     with np.errstate(over="ignore", invalid="ignore"):
         square: Array = (change**2).mean(axis=1)
     return np.sqrt(np.nan_to_num(square, nan=np.inf, posinf=np.inf))
 
 
 def compute_levels(change: Array) -> Array:
-    """`rms` of `changes` (m, n, 3) over the noise of each column's sensor, (m, 3)."""
+    """RMS of a `change` (m, n, 3) over the noise of each column's sensor, (m, 3)."""
     noise: Array = compute_rms(change) / np.array([Model()[name] for name in NOISE])
     return noise
 
@@ -109,8 +110,7 @@ def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]
     out = np.zeros((len(values) + 1, len(com), 3))
     for row, changed in zip(out, ({}, *values), strict=True):
         with report_law_errors(model):
-            build_kernel("run_firmware", model.effects)(build_initial_state(model.effects).memory.command, com, xj,
-                                              model.replace(changed).record(), row[:, 0])
+            row[:, 0] = compute_answers(model.replace(changed), com, xj)
     return (out[1:] - out[:1]) / model["controller.proportional_gain"]
 
 
@@ -142,9 +142,9 @@ def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None) -
 
 
 def parse_hint(quantity: Quantity) -> list[float]:
-    """Both ends of the typical range, where that is one ("0.2-5 kN"), and what lies between; in SI.
+    """Both ends of the typical range, if there is one ("0.2-5 kN"), and values between them, SI.
 
-    >>> hinted(Quantity("N", low=0, typical="1-4 kN"))
+    >>> parse_hint(Quantity("N", low=0, typical="1-4 kN"))
     [1000.0, 2000.0, 4000.0]
     """
     said = _RANGE.match(quantity.typical)

@@ -1,4 +1,4 @@
-"""What the plant remembers, what the world does to it, and the places where an effect may act."""
+"""The state of the plant, its inputs, and the ports where effects act."""
 from __future__ import annotations
 
 from typing import Any, NamedTuple
@@ -9,9 +9,9 @@ Memory = Any  # the memory of a port: 0.0 for none, else what its effects keep, 
 
 
 class Ports(NamedTuple):
-    """The places on the signal path where an effect may act; here, what its effects remember there.
+    """The ports of the signal path, where effects act; each field holds the memories of the effects there.
 
-    An effect gets the signal of its port, in the unit below, and returns what is left of it or made of it.
+    An effect gets the signal of its port, in the unit below, and returns it changed.
     """
 
     command: Memory = 0.0  # m, demand as the firmware takes it; once a cycle, in the controller
@@ -47,7 +47,7 @@ class State(NamedTuple):
 
 
 class Input(NamedTuple):
-    """What acts on the plant in one step."""
+    """The inputs of the plant in one step."""
 
     current: Ampere = 0.0  # Cor of the cycle before, held for this cycle
     load: Newton = 0.0  # FR, held for this cycle
@@ -67,7 +67,7 @@ class Line(NamedTuple):
 
 
 class Drag(NamedTuple):
-    """What resists a body: dry(static, dynamic) + damping * v + force."""
+    """The resistance of a body: dry(static, dynamic) + damping * v + force."""
 
     force: Newton
     damping: float  # N s/m

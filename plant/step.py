@@ -29,7 +29,7 @@ from plant.state import Drag, Input, Line, Memory, Ports, State
 
 
 class Coefficients(NamedTuple):
-    """What a step needs of the parameters, so that no step divides: constant while they are."""
+    """Coefficients computed from the parameters, so that no step divides; constant while the parameters are."""
 
     flapper_keep: float  # velocity kept over a step
     flapper_push: float  # velocity gained per unit of torque
@@ -50,7 +50,7 @@ class Coefficients(NamedTuple):
 
 
 def compute_flow_share(left: float, law: float) -> float:
-    """`left` to the power of `law`, which is 1/2, 1 or 0 (`FILTER_LAWS`).
+    """`left` to the power of `law`, which is 1/2, 1 or 0 (`plant.parameters.FILTER_LAWS`).
 
     Exact to rounding. The last bit of `**` depends on the CPU.
     """
@@ -91,12 +91,12 @@ def compute_coefficients(p: Any, h: float) -> Coefficients:
 
 
 def apply_steady_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
-    """Oil as it should be: the cycle's coefficients hold. And the memory of supply and viscosity."""
+    """Coefficients at nominal oil, unchanged; and the memories of the ports supply and viscosity."""
     return k, s.memory.supply, s.memory.viscosity
 
 
 def apply_changing_oil(k: Coefficients, s: State, u: Input, p: Any) -> tuple[Coefficients, Memory, Memory]:
-    """Oil with effects: coefficients for the pressure and viscosity it has now, at both nominal bit for bit `k`."""
+    """Coefficients at the present supply pressure and viscosity (`k`, to the last bit, at nominal ones); memories."""
     ratio, m_supply = at_supply(1.0, s.memory.supply, s, u, p)
     thick, m_viscosity = at_viscosity(1.0, s.memory.viscosity, s, u, p)
     ratio, thick = max(ratio, LEAST_RATIO), max(thick, LEAST_RATIO)
@@ -169,7 +169,7 @@ def step_spool(s: State, u: Input, p: Any, k: Coefficients, xf: float) -> tuple[
 
 
 def compute_metering_line(s: State, u: Input, p: Any, k: Coefficients, xs: float) -> tuple[Line, Memory, Memory]:
-    """Metering edges with leakage: P12 against the ram's speed, memory of the metering and of the valve."""
+    """Metering edges with leakage: P12 as a function of the ram's speed; memories of the ports metering and valve."""
     opening, m_metering = at_metering(xs, s.memory.metering, s, u, p)
     drive = k.valve_gain * opening
     line, m_valve = at_valve(Line(drive, k.valve_slope, k.valve_limit, drive), s.memory.valve, s, u, p)
@@ -177,12 +177,12 @@ def compute_metering_line(s: State, u: Input, p: Any, k: Coefficients, xs: float
 
 
 def keep_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
-    """How the ram yields to an impulse, 1/kg, at the limit of the pressure and on its slope: no effect changes it."""
+    """Speed of the ram per impulse, 1/kg, at the limit of the pressure and on its slope, if no effect changes it."""
     return k.jack_free, k.jack_coupled
 
 
 def update_compliance(k: Coefficients, drag: Drag, line: Line, p: Any, h: float) -> tuple[float, float]:
-    """The same with effects that may change drag or slope, at two divisions; if they do not, bit for bit `k`."""
+    """The same with effects that may change drag or slope, for two divisions; `k` to the last bit if they do not."""
     mass = p.jack.mass + h * (k.jack_damping + drag.damping)
     free = k.jack_free if drag.damping == 0.0 else 1.0 / mass
     same = drag.damping == 0.0 and line.slope == k.valve_slope
@@ -208,7 +208,7 @@ def step_jack(s: State, u: Input, p: Any, k: Coefficients, line: Line,
 
 
 def step_plant(s: State, u: Input, p: Any, k: Coefficients) -> State:
-    """The plant `u.h` seconds later."""
+    """The state `u.h` seconds later."""
     k, m_supply, m_viscosity = apply_oil(k, s, u, p)
     xf, vf, m_current, m_feedback = step_flapper(s, u, p, k)
     xs, vs, m_nozzle, m_force = step_spool(s, u, p, k, xf)

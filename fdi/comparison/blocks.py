@@ -34,9 +34,9 @@ from fdi.thresholds import (
     SPOOL_FITS_RATIO,
 )
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, rms, shift_rows
-from plant.effects import combine_laws
+from plant.controller import compute_answers
 from plant.forced import compute_flow_balance, compute_force_balance
-from plant.model import Model, build_kernel
+from plant.model import Model
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -321,7 +321,7 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
 def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> ControllerBlock:
     limit = model["controller.current_limit"]
     sensed = shift_rows(trace.xj, xj)
-    answers = run_firmware(model, shift_rows(trace.com, com), hold_last(sensed))
+    answers = compute_answers(model, shift_rows(trace.com, com), hold_last(sensed))
     residual = trace.cor - answers
     unknown = np.isnan(sensed) | ~trace.usable
     unknown[1:] |= unknown[:-1].copy()  # a derivative looks back by one
@@ -335,14 +335,6 @@ def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> Controlle
     floor = max(float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0), FLOAT32 * limit)
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
     return ControllerBlock(residual, error, floor, com, xj, limit=limit)
-
-
-def run_firmware(model: Model, com: Floats, xj: Floats) -> Floats:
-    """What the model's controller answers, (n,) A, to a demand (n,) m and a sensed position (n,) m."""
-    out = np.empty(len(com))
-    memory = combine_laws("command", model.effects)[1]
-    build_kernel("run_firmware", model.effects)(memory, com, xj, model.record(), out)
-    return out
 
 
 def measure_resolution(x: Floats) -> float:

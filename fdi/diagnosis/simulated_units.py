@@ -16,8 +16,7 @@ from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.unknowns import tolerance_sizes
 from fdi.progress import Progress, ignore_progress
-from plant.block import NARROW
-from plant.lanes import Lanes
+from plant.lanes import NARROW, Lanes
 from plant.model import Model
 from plant.threads import count_threads
 

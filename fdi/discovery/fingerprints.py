@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.trace.trace import Trace, hold_last
+from plant.controller import compute_answers
 from plant.effects import CATALOGUE
-from plant.model import Model, build_kernel
+from plant.model import Model
 
 Floats = NDArray[np.float64]
 
@@ -39,11 +40,8 @@ def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
     firmware = tuple(e for e in model.effects if CATALOGUE[e].firmware)
     own = replace(model, effects=firmware)
-    out = np.empty(len(trace))
-    position = hold_last(trace.position)
-    build_kernel("run_firmware", firmware)(own.state().memory.command, trace.com, position, own.record(), out)
     measured: Floats = np.where(trace.incomplete, np.nan, trace.cor)
-    return out - measured
+    return compute_answers(own, trace.com, hold_last(trace.position)) - measured
 
 
 def find_firmware_marks(model: Model, traces: Sequence[Trace]) -> tuple[float, list[Fingerprint]]:

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
+PERIODS = (1e-4, 0.1)  # s, shortest and longest of a controller: the bounds of `controller.period`
 SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
 BRIDGED_ROWS = 5  # of missing current that are interpolated; longer gaps are left out
 STILL = 5e-5  # m; a ram that moves further than that moves every sensor
@@ -78,11 +79,19 @@ def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: obje
 
 
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
-    """The model with the recording's period as its controller's; the model itself within a relative `tolerance`."""
+    """The model with the recording's period as its controller's; the model itself within a relative `tolerance`.
+
+    Raises:
+        InputError: a period that no controller has.
+    """
     own = model["controller.period"]
     if own == trace.period or abs(own / trace.period - 1.0) < tolerance:
         return model
-    return model.replace({"controller.period": trace.period})
+    shortest, longest = PERIODS
+    if not shortest <= trace.period <= longest:
+        raise InputError("trace", "t", f"one row a controller cycle, {1e3 * shortest:g} to {1e3 * longest:g} ms apart; "
+                                       f"these rows are {1e3 * trace.period:.4g} ms apart")
+    return replace(model, values={**model.values, "controller.period": trace.period})
 
 
 def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace"

@@ -3,16 +3,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, driven, spool_at
+from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_spool
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_bench import FirmwareDesk
 
 from plant import Actuator, Model, simulate
 from plant.compile import interpret_function
+from plant.controller import compute_answers
 from plant.effects import CATALOGUE
 from plant.effects.sensors import Lag, sensor_lag
-from plant.model import build_initial_state, build_kernel, collect_bindings
+from plant.model import build_initial_state, collect_bindings
 from plant.state import Input, State
 from plant.step import compute_coefficients, step_plant
 from rig.network.codec import Control
@@ -24,7 +25,7 @@ AREA = WHOLE["jack.area"]
 
 def pressure_at_speed(model: Model, current: np.ndarray = STEADY) -> tuple[float, float]:
     """P12 and speed at the end of a constant current."""
-    _, p12, _, _, v = driven(model, current)[1]
+    _, p12, _, _, v = drive_plant(model, current)[1]
     return float(p12[-1]), float(v[-1])
 
 
@@ -35,7 +36,7 @@ def test_viscous_drag_is_pressure_in_proportion_to_speed() -> None:
 
 def test_moving_mass_is_pressure_in_proportion_to_acceleration() -> None:
     model = EASY.replace({"jack.mass": 200.0, "jack.damping": 0.0})
-    _, p12, _, _, v = driven(model, 2e-3 * np.sin(2 * np.pi * 20 * np.arange(200) * 1e-3))[1]
+    _, p12, _, _, v = drive_plant(model, 2e-3 * np.sin(2 * np.pi * 20 * np.arange(200) * 1e-3))[1]
     inner = slice(60, -1)
     acceleration = np.gradient(v, 1e-3)[inner]
     np.testing.assert_allclose(AREA * p12[inner], 200.0 * acceleration, atol=0.01 * 200 * abs(acceleration).max())
@@ -51,7 +52,7 @@ def test_jack_friction_is_a_square_wave_of_pressure() -> None:
 def test_leakage_shows_as_speed_in_proportion_to_pressure() -> None:
     """Valve closed, a load on the ram: GQ XS = 0 = QJ + GQ/GP P12, QJ = AJ XJ' + CLK P12."""
     model = EASY.replace({"jack.leakage": 3e-11})
-    _, p12, _, _, v = (row[-1] for row in driven(model, np.zeros(60), 6e3)[1])
+    _, p12, _, _, v = (row[-1] for row in drive_plant(model, np.zeros(60), 6e3)[1])
     conductance = 3e-11 + model["valve.flow_gain"] / model["valve.pressure_gain"]
     assert AREA * v == pytest.approx(-conductance * p12, rel=1e-4)
     assert AREA * p12 == pytest.approx(6e3 + model["jack.damping"] * v, rel=1e-4)
@@ -60,7 +61,7 @@ def test_leakage_shows_as_speed_in_proportion_to_pressure() -> None:
 @pytest.mark.parametrize("speed", [0.002, 0.01, 0.05])
 def test_stribeck_at_constant_speed(speed: float) -> None:
     model = QUIET_SPOOL.replace({"stribeck.rise": 0.5, "stribeck.speed": 0.01})
-    current = speed * AREA / model["valve.flow_gain"] / spool_at(model, 1.0)
+    current = speed * AREA / model["valve.flow_gain"] / measure_spool(model, 1.0)
     p12, v = pressure_at_speed(model, np.full(400, current))
     level = 500.0 + 0.5 * 800.0 * np.exp(-(v / 0.01) ** 2)
     assert v == pytest.approx(speed, rel=0.4)  # leakage takes some
@@ -83,13 +84,13 @@ def test_a_ram_with_asymmetric_friction_at_rest_holds_more_one_way() -> None:
     """Loads up to FS (1 - d) against extension and FS (1 + d) with it move nothing, more does."""
     model = WHOLE.replace({"friction_asymmetry.asymmetry": 0.3})
     for load, moves in ((559.0, False), (561.0, True), (-1039.0, False), (-1041.0, True)):
-        assert (driven(model, np.zeros(30), load)[0].state.jack_position != 0.0) == moves, load
+        assert (drive_plant(model, np.zeros(30), load)[0].state.jack_position != 0.0) == moves, load
 
 
 @pytest.mark.parametrize("deflection", [5e-6, 2e-5, 1e-4])
 def test_presliding_is_a_spring_for_small_loads_and_the_dynamic_level_when_it_slides(deflection: float) -> None:
     model = QUIET_SPOOL.replace({"presliding.deflection": deflection})
-    plant = driven(model, np.zeros(3000), 50.0)[0]
+    plant = drive_plant(model, np.zeros(3000), 50.0)[0]
     slipped = -np.log(1.0 - 50.0 / 500.0) * 500.0  # N: the bristles' spring, softening towards the dynamic level
     assert plant.state.jack_position == pytest.approx(-slipped * deflection / 800.0, rel=1e-3)
     p12, v = pressure_at_speed(model)
@@ -98,14 +99,14 @@ def test_presliding_is_a_spring_for_small_loads_and_the_dynamic_level_when_it_sl
 
 def test_mount_compliance_shows_the_force_as_position() -> None:
     model = EASY.replace({"mount_compliance.compliance": 5e-8})
-    sensed, p12, _, x, _ = driven(model, 3e-3 * np.sin(np.arange(100) * 0.3), 4e3)[1]
+    sensed, p12, _, x, _ = drive_plant(model, 3e-3 * np.sin(np.arange(100) * 0.3), 4e3)[1]
     np.testing.assert_allclose(sensed - x, 5e-8 * AREA * p12, rtol=1e-9, atol=1e-18)
     assert abs(sensed - x).max() > 1e-4
 
 
 def test_backlash_loses_its_width_at_every_reversal() -> None:
     model = EASY.replace({"rod_backlash.width": 1e-4})
-    sensed, _, _, x, _ = driven(model, 3e-3 * np.sin(2 * np.pi * 4 * np.arange(500) * 1e-3))[1]
+    sensed, _, _, x, _ = drive_plant(model, 3e-3 * np.sin(2 * np.pi * 4 * np.arange(500) * 1e-3))[1]
     assert np.ptp(x[250:]) - np.ptp(sensed[250:]) == pytest.approx(1e-4, rel=5e-3)  # peaks lie between samples
     assert (sensed - x).min() == pytest.approx(-0.5e-4) and (sensed - x).max() == pytest.approx(0.5e-4)
     standing = np.flatnonzero(np.diff(sensed[130:]) == 0.0) + 130
@@ -114,7 +115,7 @@ def test_backlash_loses_its_width_at_every_reversal() -> None:
 
 def test_sensor_gain_and_offset() -> None:
     model = EASY.replace({"sensor_gain.error": -0.02, "sensor_offset.offset": 50e-6})
-    sensed, _, _, x, _ = driven(model, STEADY)[1]
+    sensed, _, _, x, _ = drive_plant(model, STEADY)[1]
     np.testing.assert_allclose(sensed, 0.98 * x + 50e-6, rtol=1e-12)
 
 
@@ -180,23 +181,15 @@ def test_readings_are_whole_steps_and_their_error_is_evenly_spread() -> None:
     assert np.var(reads - was) == pytest.approx(5e-6**2 / 12, rel=0.06)
 
 
-def run_firmware_alone(model: Model, com: np.ndarray, xj: np.ndarray, out: np.ndarray) -> None:
-    """The controller of a model on a demand and a sensed position, m; fills `out`, A; all (n,)."""
-    memory = build_initial_state(model.effects).memory.command
-    build_kernel("run_firmware", model.effects)(memory, com, xj, model.record(), out)
-
-
 def test_the_firmware_follows_a_step_as_a_ramp() -> None:
     model = Model().replace({"command_rate_limit.rate": 0.1})
-    com, out = np.r_[np.zeros(5), np.full(60, 5e-3), np.full(60, -1e-3)], np.empty(125)
-    run_firmware_alone(model, com, np.zeros(125), out)
-    taken = out / model["controller.proportional_gain"]
+    com = np.r_[np.zeros(5), np.full(60, 5e-3), np.full(60, -1e-3)]
+    taken = compute_answers(model, com, np.zeros(125)) / model["controller.proportional_gain"]
     assert np.diff(taken)[4:20] == pytest.approx(np.full(16, 0.1e-3))
     assert abs(np.diff(taken)).max() <= 0.1e-3 * (1 + 1e-9)
     assert taken[60] == pytest.approx(min(5e-3, 8e-3 / 3.8)) and taken[-1] == pytest.approx(-1e-3)
     slow = np.cumsum(np.full(125, 0.09e-3))
-    run_firmware_alone(model, slow, slow, out)
-    assert not out.any()  # slower commands are as they were, the first one too
+    assert not compute_answers(model, slow, slow).any()  # slower commands are as they were, the first one too
 
 
 def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
@@ -212,10 +205,9 @@ def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
 
 def test_the_firmware_alone_answers_as_in_the_loop() -> None:
     for changes in ({}, {"command_rate_limit.rate": 0.1}):
-        model, out = Model().replace(changes), np.empty(len(COMMAND))
+        model = Model().replace(changes)
         run = simulate(model, COMMAND, seed=2)
-        run_firmware_alone(model, COMMAND, run.xj, out)
-        assert (out == run.cor).all()
+        assert (compute_answers(model, COMMAND, run.xj) == run.cor).all()
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-1.0, 1.0), st.floats(1e-3, 0.1), st.floats(0.0, 0.9),

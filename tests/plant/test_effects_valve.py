@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from effects_cases import EASY, WHOLE, H, driven, speed_at, spool_at
-from effects_reference import jack
+from effects_cases import EASY, WHOLE, H, drive_plant, measure_speed, measure_spool
+from effects_reference import simulate_jack
 from physics_cases import SILENT
 
 from plant import simulate
@@ -32,10 +32,10 @@ def test_hysteresis_is_a_loop_of_its_width_at_any_rate() -> None:
     for period in (400, 1600):  # cycles
         current = 2e-3 * np.interp(np.arange(1.75 * period) / period, [0, 0.25, 0.75, 1.25, 1.75], [0, 1, -1, 1, -1])
         (_, _, xs, _, _), (_, _, plain, _, _) = (
-            driven(EASY.replace({"torque_motor_hysteresis.width": width}), current)[1] for width in (2e-4, 0.0))
+            drive_plant(EASY.replace({"torque_motor_hysteresis.width": width}), current)[1] for width in (2e-4, 0.0))
         down, up = period // 2, period
-        assert xs[down] - plain[down] == pytest.approx(0.5 * spool_at(EASY, 2e-4), rel=0.01)
-        assert xs[down] - xs[up] - (plain[down] - plain[up]) == pytest.approx(spool_at(EASY, 2e-4), rel=0.01)
+        assert xs[down] - plain[down] == pytest.approx(0.5 * measure_spool(EASY, 2e-4), rel=0.01)
+        assert xs[down] - xs[up] - (plain[down] - plain[up]) == pytest.approx(measure_spool(EASY, 2e-4), rel=0.01)
 
 
 @pytest.mark.parametrize("tau", [0.3e-3, 3e-3])
@@ -53,24 +53,24 @@ def test_coil_lag_is_3_dB_down_where_it_should(tau: float) -> None:
 
 @pytest.mark.parametrize("cycles", [1, 2, 5])
 def test_a_delay_of_whole_cycles_is_exactly_that(cycles: int) -> None:
-    late = driven(WHOLE.replace({"transport_delay.cycles": float(cycles)}), ADVANCED)[1]
-    assert (late[:, cycles:] == driven(WHOLE, ADVANCED)[1][:, :-cycles]).all()
+    late = drive_plant(WHOLE.replace({"transport_delay.cycles": float(cycles)}), ADVANCED)[1]
+    assert (late[:, cycles:] == drive_plant(WHOLE, ADVANCED)[1][:, :-cycles]).all()
 
 
 def test_a_delay_of_a_fraction_changes_within_the_cycle() -> None:
     """Half a cycle late: the plant of a bus twice as fast that repeats each current, half a cycle ago."""
-    late = driven(EASY.replace({"transport_delay.cycles": 0.5}), ADVANCED)[1]
+    late = drive_plant(EASY.replace({"transport_delay.cycles": 0.5}), ADVANCED)[1]
     fast = EASY.replace({"controller.period": 0.5e-3})
-    twice = driven(fast, np.r_[0.0, np.repeat(ADVANCED, 2)])[1]  # its steps are half as long
+    twice = drive_plant(fast, np.r_[0.0, np.repeat(ADVANCED, 2)])[1]  # its steps are half as long
     np.testing.assert_allclose(late[2], twice[2, :-1:2], atol=2e-8)
 
 
 def test_current_limit_caps_the_speed_and_does_nothing_below() -> None:
     model = EASY.replace({"current_limit.loss": 0.2})
-    full = driven(model, np.full(60, 8e-3))[1]
-    assert full[4, -1] == pytest.approx(speed_at(model, spool_at(model, 0.8 * 8e-3)), rel=2e-3)
-    below = driven(model, np.full(60, 6.3e-3))[1]
-    assert (below == driven(EASY, np.full(60, 6.3e-3))[1]).all()
+    full = drive_plant(model, np.full(60, 8e-3))[1]
+    assert full[4, -1] == pytest.approx(measure_speed(model, measure_spool(model, 0.8 * 8e-3)), rel=2e-3)
+    below = drive_plant(model, np.full(60, 6.3e-3))[1]
+    assert (below == drive_plant(EASY, np.full(60, 6.3e-3))[1]).all()
 
 
 def test_the_nozzles_gain_differs_by_direction() -> None:
@@ -79,16 +79,16 @@ def test_the_nozzles_gain_differs_by_direction() -> None:
     v = model.values
     kv = v["pilot.flow_gain"] * v["feedback_spring.stiffness"] / v["spool.end_area"]
     for sign in (1.0, -1.0):
-        xs = driven(model, np.full(25, sign * 1e-3))[1][2]
-        rate = np.polyfit(np.arange(6, 14), np.log(1.0 - xs[6:14] / spool_at(model, sign * 1e-3)), 1)[0] / MILLI
+        xs = drive_plant(model, np.full(25, sign * 1e-3))[1][2]
+        rate = np.polyfit(np.arange(6, 14), np.log(1.0 - xs[6:14] / measure_spool(model, sign * 1e-3)), 1)[0] / MILLI
         roots = np.roots([v["flapper.inertia"], v["flapper.damping"], v["flapper.stiffness"], kv * (1 + 0.2 * sign)])
         assert rate == pytest.approx(max(roots.real), rel=0.03)
 
 
 def test_the_worn_ball_lets_the_spool_go_half_a_gap_further_and_hunt_at_null() -> None:
     model = EASY.replace({"feedback_gap.gap": 20e-6})
-    xs = driven(model, np.full(100, 1e-3))[1][2]
-    assert xs[-1] == pytest.approx(spool_at(model, 1e-3) + 10e-6, rel=1e-4)
+    xs = drive_plant(model, np.full(100, 1e-3))[1][2]
+    assert xs[-1] == pytest.approx(measure_spool(model, 1e-3) + 10e-6, rel=1e-4)
     nudge = np.r_[np.full(20, 1e-4), np.zeros(1500)]
     hunting, quiet = (np.std(simulate(m, nudge).xs[-500:]) for m in (model, EASY))
     assert hunting > 2e-6 > 1e-9 > quiet
@@ -98,7 +98,7 @@ def test_flow_force_is_a_weaker_torque_motor_that_depends_on_the_pressure() -> N
     k = 2e-3
     model = EASY.replace({"flow_force.coefficient": k})
     for load in (0.0, 15e3):
-        _, p12, xs, _, _ = driven(model, np.full(80, 2e-3), load)[1]
+        _, p12, xs, _, _ = drive_plant(model, np.full(80, 2e-3), load)[1]
         lever = model["flapper.stiffness"] / (model["spool.end_area"] * model["pilot.pressure_gain"])
         spring = model["feedback_spring.stiffness"] + lever * k * (model["supply.pressure"] - abs(p12[-1]))
         assert xs[-1] == pytest.approx(model["torque_motor.gain"] * 2e-3 / spring, rel=1e-3)
@@ -108,29 +108,29 @@ def test_overlap_is_flat_around_null_and_underlap_is_twice_as_steep() -> None:
     """Speed of the unloaded ram over the opening, both ways and within the lap."""
     for sign in (1.0, -1.0):
         for xs in (10e-6, 100e-6):
-            current = np.full(80, sign * xs / spool_at(EASY, 1.0))
-            over, under = (driven(EASY.replace({name: 20e-6}), current)[1][4, -1] for name in (
+            current = np.full(80, sign * xs / measure_spool(EASY, 1.0))
+            over, under = (drive_plant(EASY.replace({name: 20e-6}), current)[1][4, -1] for name in (
                 "spool_overlap.overlap", "spool_underlap.underlap"))
-            assert over == pytest.approx(sign * speed_at(EASY, max(xs - 20e-6, 0.0)), rel=2e-3, abs=1e-9)
-            assert under == pytest.approx(sign * speed_at(EASY, xs + min(xs, 20e-6)), rel=2e-3)
+            assert over == pytest.approx(sign * measure_speed(EASY, max(xs - 20e-6, 0.0)), rel=2e-3, abs=1e-9)
+            assert under == pytest.approx(sign * measure_speed(EASY, xs + min(xs, 20e-6)), rel=2e-3)
 
 
 @pytest.mark.parametrize("load", [-20e3, 0.0, 20e3])
 def test_orifice_root_of_the_pressure_left(load: float) -> None:
     """XS w = P12/GP + QJ/GQ at constant speed, w = sqrt(1 - sign(XS) P12/PSR)."""
     model = EASY.replace({"orifice_root.share": 1.0, "jack.leakage": 0.0})
-    _, p12, xs, _, v = (row[-1] for row in driven(model, np.full(60, 3e-3), load)[1])
+    _, p12, xs, _, v = (row[-1] for row in drive_plant(model, np.full(60, 3e-3), load)[1])
     w = np.sqrt(1.0 - p12 / model["supply.pressure"])
-    assert v == pytest.approx(speed_at(model, xs * w - p12 / model["valve.pressure_gain"]), rel=1e-3)
+    assert v == pytest.approx(measure_speed(model, xs * w - p12 / model["valve.pressure_gain"]), rel=1e-3)
     assert p12 == pytest.approx((load + model["jack.damping"] * v) / model["jack.area"], rel=1e-3)
 
 
 def test_droop_is_as_large_as_the_flow_and_comes_with_the_lines_lag() -> None:
     model = EASY.replace({"supply_droop.slope": 2e10})
-    _, _, xs, _, v = (row[-1] for row in driven(model, np.full(80, 6e-3))[1])
+    _, _, xs, _, v = (row[-1] for row in drive_plant(model, np.full(80, 6e-3))[1])
     ratio = 1.0 - 2e10 * model["jack.area"] * v / model["supply.pressure"]
     assert ratio < 0.8
-    assert v == pytest.approx(speed_at(model, xs) * np.sqrt(ratio), rel=3e-3)
+    assert v == pytest.approx(measure_speed(model, xs) * np.sqrt(ratio), rel=3e-3)
     p, m, s = model.record()[0], Drawn(), State(jack_speed=0.1)
     for _ in range(200):  # 2 ms
         r, m = supply_droop(1.0, m, s, Input(h=H), p)
@@ -140,7 +140,7 @@ def test_droop_is_as_large_as_the_flow_and_comes_with_the_lines_lag() -> None:
 def test_ripple_is_a_line_in_the_speed() -> None:
     """The flow goes with the root of the supply: a ripple of 4 % is one of 2 % in the speed."""
     model = EASY.replace({"supply_ripple.amplitude": 0.04, "supply_ripple.frequency": 25.0, "supply_ripple.phase": 0.5})
-    v = driven(model, np.full(320, 2e-3))[1][4, 120:]
+    v = drive_plant(model, np.full(320, 2e-3))[1][4, 120:]
     line = 2.0 * np.fft.rfft(v)[5] / len(v)  # 5 periods in 200 cycles
     assert abs(line) == pytest.approx(0.02 * v.mean(), rel=0.02)
     assert np.angle(line * 1j) == pytest.approx(0.5 + 2 * np.pi * 25 * 0.120 - 6 * np.pi, abs=0.05)
@@ -150,7 +150,8 @@ def test_viscosity_moves_three_parameters_together() -> None:
     thick = WHOLE.replace({"viscosity_drift.factor": 1.6})
     by_hand = WHOLE.replace({"jack.damping": 1.6 * WHOLE["jack.damping"], "flapper.damping": 1.6 * 0.45,
                              "jack.leakage": WHOLE["jack.leakage"] / 1.6})
-    np.testing.assert_allclose(driven(thick, ADVANCED)[1], driven(by_hand, ADVANCED)[1], rtol=1e-9, atol=1e-15)
+    found, expected = (drive_plant(model, ADVANCED)[1] for model in (thick, by_hand))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
 
 
 def _moved(s, spool, load, record, h, out):
@@ -192,7 +193,7 @@ def test_implicit_effects_against_an_explicit_integration(changes: dict[str, flo
     ours = np.empty((2, len(paths[h][0])))
     run = compile_function(_moved, collect_bindings(model.effects))
     run(build_initial_state(model.effects), *paths[h], model.record(), h, ours)
-    error = ours - jack(model.values, *paths[fine], fine)[:, every - 1::every]
+    error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
     assert np.sqrt((error[0] ** 2).mean()) * 1e6 < um
     assert np.sqrt((error[1] ** 2).mean()) * 1e-5 < bar
 

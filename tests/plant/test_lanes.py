@@ -3,19 +3,28 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from effect_files import COGGING, MEMORY, restored_catalogue
 from llvmlite.binding import get_host_cpu_features
 
-from plant import Actuator, InputError, Model, block, simulate
+from plant import Actuator, InputError, Model, simulate
 from plant import lanes as lanes_module
+from plant.anchor import (
+    compute_pull,
+    initialise_sensed_position,
+    rest_at_reading,
+    set_jack_position,
+    set_sample_memories,
+)
 from plant.compile import interpret_function
 from plant.effects import CATALOGUE, load_effects
-from plant.lanes import Lanes, compile_kernels, list_kernel_variants
+from plant.lanes import Lanes, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
-from plant.replay import replay_current
+from plant.solve import read_sensors, step_cycle
+from plant.state import State
 
 QUIET = Model().replace({f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")})
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
@@ -23,6 +32,32 @@ LOAD = np.linspace(0.0, 3e3, len(COMMAND))
 CURRENT = np.r_[np.zeros(3), np.full(12, 4e-3), np.full(15, -6e-3), np.linspace(-3e-4, 3e-4, 10)]
 FORCE = np.linspace(0.0, 3e3, len(CURRENT))
 EFFECTS = [name for name, entry in CATALOGUE.items() if not entry.base]
+
+
+def replay_current(s: State, current: Any, load: Any, position: Any, anchor: float, record: Any, steps: int,
+                   out: Any) -> None:
+    """The plant driven by a measured current; fills out[k] = XJ as sensed, P12, XS at sample k, all without noise.
+
+    Args:
+        s: state at the start.
+        current: (n,) A; current[k - 1] acts from k to k + 1, none before.
+        load: (n,) N, external force against extension.
+        position: (n,) m, measured; NaN where missing; or (0,): the run starts as `s` is.
+        anchor: 1/s, how fast the ram is pulled to the measured position.
+        record: (1,) parameters of the model.
+        steps: steps a cycle.
+        out: (n, 3), written.
+    """
+    p = record[0]
+    s = rest_at_reading(s, position[0], p, steps) if len(position) else initialise_sensed_position(s, p)
+    for k in range(len(current)):
+        t = k * p.controller.period
+        out[k, 0], out[k, 1], out[k, 2], m = read_sensors(s, s.memory.reading, (0.0, 0.0, 0.0, 0.0), t, p)
+        s = set_sample_memories(s, s.memory.command, m)
+        if len(position):
+            moved = compute_pull(anchor * p.controller.period, position[k], s.sensed)
+            s = set_jack_position(s, s.jack_position + moved)
+        s = step_cycle(s, current[k - 1] if k else 0.0, load[k], 0.0, t, record, steps)
 
 
 def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.ndarray | None = None,
@@ -176,8 +211,8 @@ def test_no_runs_and_no_cycles() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = block.plan_layout((), "eha")
-    run = block.compile_block_kernel(plan)
+    plan = plan_layout((), "eha")
+    run = compile_block_kernel(plan)
     run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
         np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()

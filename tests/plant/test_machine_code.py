@@ -11,6 +11,7 @@ from plant import Actuator, Model, machine_code
 from plant.effects import CATALOGUE
 from plant.machine_code import StoredCode
 from plant.model import build_kernel
+from plant.solve import advance_flat_state
 
 RUN = """
 import sys
@@ -56,7 +57,7 @@ def test_a_damaged_file_is_compiled_anew(tmp_path: Path) -> None:
 
 def test_stored_code_equals_numba(tmp_path: Path) -> None:
     plant, other = Actuator(Model()), Actuator(Model())
-    run = build_kernel("advance_flat_state", ())
+    run = build_kernel(advance_flat_state, ())
     StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
     stored = StoredCode(tmp_path, lambda: None)  # nothing to fall back to
     advance = stored.bind(other._flat, other._record, other.steps)
@@ -68,7 +69,7 @@ def test_stored_code_equals_numba(tmp_path: Path) -> None:
 
 def test_code_that_gives_other_bits_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plant = Actuator(Model())
-    run = build_kernel("advance_flat_state", ())
+    run = build_kernel(advance_flat_state, ())
     monkeypatch.setattr(machine_code, "_link_object", lambda code: (None, lambda *arguments: 0))  # moves nothing
     StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
     assert list(tmp_path.iterdir()) == []
@@ -80,6 +81,6 @@ def test_another_release_of_numba_runs_without_stored_code(tmp_path: Path, monke
 
     monkeypatch.setattr(machine_code, "_emit_object", fail)
     plant = Actuator(Model())
-    run = build_kernel("advance_flat_state", ())
+    run = build_kernel(advance_flat_state, ())
     StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
     assert list(tmp_path.iterdir()) == []

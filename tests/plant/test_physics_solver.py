@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from physics_cases import FRICTIONLESS, PREFLIGHT, QUIET, SILENT, SMOOTH, build_profile
-from physics_reference import explicit, linear, piecewise
+from physics_reference import simulate_explicit, simulate_linear, simulate_piecewise
 from places import ROOT
 
 from plant import Model, simulate
@@ -27,7 +27,7 @@ def rms(x: np.ndarray) -> float:
 @pytest.mark.parametrize("clogging", [0.0, 0.3])
 def test_linear_case_against_the_matrix_exponential(clogging: float) -> None:
     model = SMOOTH.replace({"filter.clogging": clogging})
-    run, truth = simulate(model, GENTLE), linear(model.values, GENTLE)
+    run, truth = simulate(model, GENTLE), simulate_linear(model.values, GENTLE)
     assert rms(run.xj - truth[0]) < 0.002e-6
     assert rms(run.xs - truth[3]) < 0.002e-6
     assert rms(run.p12 - truth[2]) < 0.05e5
@@ -35,7 +35,7 @@ def test_linear_case_against_the_matrix_exponential(clogging: float) -> None:
 
 
 def test_error_falls_with_the_step() -> None:
-    truth = linear(SMOOTH.values, GENTLE)[0]
+    truth = simulate_linear(SMOOTH.values, GENTLE)[0]
     errors = [rms(simulate(SMOOTH, GENTLE, steps=n).xj - truth) for n in (50, 100, 200, 1000)]
     assert all(coarse > 1.8 * fine for coarse, fine in itertools.pairwise(errors)), errors
 
@@ -46,7 +46,7 @@ def test_saturations_and_stops_against_radau_with_events(step: float, clogging: 
     """1 mm saturates the pressures, 5 mm drives flapper and spool into their stops and back out."""
     model = SMOOTH.replace({"filter.clogging": clogging})
     command = np.r_[np.zeros(3), np.full(57, step)]
-    run, truth = simulate(model, command), piecewise(model.values, command)
+    run, truth = simulate(model, command), simulate_piecewise(model.values, command)
     assert rms(run.xj - truth[0]) < 0.02e-6
     assert rms(run.xs - truth[3]) < 0.02e-6
     assert rms(run.p12 - truth[2]) < 0.05e5
@@ -62,14 +62,14 @@ def test_saturated_pilot_against_radau(clogging: float) -> None:
     """
     model = SMOOTH.replace({"filter.clogging": clogging, "spool.mass": 5.0, "pilot.pressure_gain": 6.59e12})
     command = np.r_[np.zeros(3), np.full(20, 2e-3), np.full(17, -2e-3)]
-    run, truth = simulate(model, command, steps=1000), piecewise(model.values, command)
+    run, truth = simulate(model, command, steps=1000), simulate_piecewise(model.values, command)
     assert rms(run.xj - truth[0]) < 0.1e-6  # 95 um with the limit of a clean filter
     assert rms(run.xs - truth[3]) < 0.1e-6
     assert rms(run.p12 - truth[2]) < 0.05e5
 
 
 def test_preflight_without_friction_against_an_explicit_scheme() -> None:
-    run, truth = simulate(SMOOTH, PREFLIGHT), explicit(SMOOTH.values, PREFLIGHT, substeps=4000)
+    run, truth = simulate(SMOOTH, PREFLIGHT), simulate_explicit(SMOOTH.values, PREFLIGHT, substeps=4000)
     assert rms(run.xj - truth[0]) < 0.03e-6  # 0.017, nearly all of it the explicit scheme's
     assert np.abs(run.xj - truth[0]).max() < 0.3e-6
 
@@ -84,7 +84,7 @@ def test_rig_simulate_follows_an_independent_simulation_at_1_us(tmp_path: Path) 
                                               "sensors.position_noise")]
     assert main.main(["simulate", *options, "--command", str(command), "--out", str(out), "--quiet"]) == 0
     xj = np.genfromtxt(out, delimiter=",", names=True)["xj"]
-    truth = explicit(Model().replace(off).values, PREFLIGHT)[0]
+    truth = simulate_explicit(Model().replace(off).values, PREFLIGHT)[0]
     assert rms(xj - truth) < 0.1e-6
 
 
@@ -92,7 +92,7 @@ def test_rig_simulate_follows_an_independent_simulation_at_1_us(tmp_path: Path) 
 def test_preflight_with_friction_against_an_explicit_scheme(changes: dict[str, float]) -> None:
     """The stick-slip of the loop has a phase of its own: small differences stay, and it does not run away."""
     model = SILENT.replace(changes)
-    run, truth = simulate(model, PREFLIGHT), explicit(model.values, PREFLIGHT)
+    run, truth = simulate(model, PREFLIGHT), simulate_explicit(model.values, PREFLIGHT)
     assert rms(run.xj - truth[0]) < 1e-6
     assert np.abs(run.xj - truth[0]).max() < 5e-6
 
@@ -102,7 +102,7 @@ def test_replay_with_friction_against_an_explicit_scheme(friction: float) -> Non
     """From the current there is no loop to lose the phase in: spool and pressure agree everywhere."""
     model = SILENT.replace({"spool.static_friction": friction, "spool.dynamic_friction": friction / 1.5})
     run = simulate(model, PREFLIGHT)
-    truth = explicit(model.values, PREFLIGHT, measured=run.cor, substeps=2000)
+    truth = simulate_explicit(model.values, PREFLIGHT, measured=run.cor, substeps=2000)
     assert rms(run.xs - truth[3]) < 0.05e-6
     assert rms(run.p12 - truth[2]) < 0.05e5
     assert rms(np.diff(run.xj) - np.diff(truth[0])) < 0.01e-6
@@ -113,7 +113,7 @@ def test_filter_laws_against_an_explicit_scheme(law: str, exponent: float) -> No
     """The reference knows "sqrt" alone: the rest of the power is put into its flow gain. The page has the figures."""
     clogged = {"filter.clogging": 0.35, "filter.law": law}
     values = SILENT.replace({"filter.clogging": 0.35, "pilot.flow_gain": 0.069 * 0.65 ** (exponent - 0.5)}).values
-    truth = rms(explicit(values, PREFLIGHT)[0] - explicit(SILENT.values, PREFLIGHT)[0])
+    truth = rms(simulate_explicit(values, PREFLIGHT)[0] - simulate_explicit(SILENT.values, PREFLIGHT)[0])
     pairs = ((m.replace(clogged), m) for m in (SILENT, SMOOTH))
     ours, smooth = (rms(simulate(a, PREFLIGHT).xj - simulate(b, PREFLIGHT).xj) for a, b in pairs)
     assert ours == pytest.approx(truth, abs=0.3e-6)
@@ -126,7 +126,7 @@ def test_loads_against_an_explicit_scheme() -> None:
     n = np.arange(1500)
     load = 4000.0 * np.sin(2 * np.pi * 3e-3 * n) + 2000.0 * (n > 700)
     command = 1e-3 * np.sin(2 * np.pi * 2e-3 * n)
-    run, truth = simulate(SILENT, command, load), explicit(SILENT.values, command, load)
+    run, truth = simulate(SILENT, command, load), simulate_explicit(SILENT.values, command, load)
     assert rms(run.xj - truth[0]) < 1e-6
     assert rms(run.p12 - truth[2]) < 0.2e5
     assert (run.load == load).all()

@@ -23,7 +23,7 @@ compile_function(double)(1.5)
 @pytest.fixture(scope="module")
 def hashes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
     """CPU to case to hash."""
-    answers = other_cpus.on_each_cpu("cpu_plant_cases.py", folder=tmp_path_factory.mktemp("cpus"))
+    answers = other_cpus.run_on_each_cpu("cpu_plant_cases.py", folder=tmp_path_factory.mktemp("cpus"))
     assert len(answers) >= 2
     return answers
 
@@ -40,8 +40,8 @@ def test_interpreted_is_compiled(hashes: dict[str, dict[str, str]]) -> None:
     """The first cycles of the two agree."""
     import cpu_plant_cases as cases
 
-    model = cases.at_work(cases.SOME)
-    fast, plain = cases.actuator(model, True), cases.actuator(model, False)
+    model = cases.activate_effects(cases.SOME)
+    fast, plain = cases.run_actuator(model, True), cases.run_actuator(model, False)
     assert (fast[:len(plain)] == plain).all()
 
 
@@ -49,7 +49,7 @@ def test_the_settings_reach_the_libraries(tmp_path: Path) -> None:
     """Without them nothing above would be tested: the machine code, and NumPy's and the C library's own exp, change."""
     program = tmp_path / "seen.py"
     program.write_text(SEEN)
-    answers = other_cpus.on_each_cpu(str(program), folder=tmp_path)
+    answers = other_cpus.run_on_each_cpu(str(program), folder=tmp_path)
     here, oldest = answers[other_cpus.THIS], answers[other_cpus.OLDEST]
     assert oldest["cpu"] == "generic" and oldest["features"] == "" and oldest["numpy"] == []
     if here["numpy"]:
@@ -106,7 +106,7 @@ def test_linear_algebra_has_one_thread_and_the_kernels_of_2013(tmp_path: Path, p
         pytest.skip("a CPU without AVX2 and FMA")
     program = tmp_path / "kernels.py"
     program.write_text(BLAS)
-    answer = other_cpus.on_each_cpu(str(program), package, folder=tmp_path, cpus=[other_cpus.THIS])[other_cpus.THIS]
+    answer = other_cpus.run_on_each_cpu(str(program), package, folder=tmp_path, cpus=[other_cpus.THIS])[other_cpus.THIS]
     if answer == [[], []]:
         pytest.skip("NumPy and SciPy with another BLAS")
     assert answer == [["Haswell"], [1]]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from plant import Model, simulate
 from plant.model import STEPS, build_kernel
 from plant.run import draw_noise
+from plant.solve import run_closed_loop
 from rig.studies.benchmarks.rivals import FLAGS, SAME_ROUNDING, build_library, find_gcc
 from rig.studies.benchmarks.stopwatch import Work, measure_durations
 
@@ -70,7 +71,7 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
 
 def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
-    run, state, record = build_kernel("run_closed_loop", model.effects), model.state(), model.record()
+    run, state, record = build_kernel(run_closed_loop, model.effects), model.state(), model.record()
     return lambda: run(state, command, load, draws, record, steps, out), out
 
 
