@@ -24,7 +24,7 @@ from plant.effects import load_effects
 
 BLOCK = 36  # rows per point of a figure, which has no more pixels
 HERE = Path(__file__).parent / "tutorial"
-SIGNALS = (("xj", "XJ [µm]", 1e6), ("p12", "P12 [bar]", 1e-5), ("xs", "XS [µm]", 1e6))
+SIGNALS = (("xj", "XJ [um]", 1e6), ("p12", "P12 [bar]", 1e-5), ("xs", "XS [um]", 1e6))
 
 
 def draw_residuals(run: str, repeat: str, model: Model) -> str:

@@ -36,7 +36,7 @@ def format_minima(name: str, drive: str, trace: Trace) -> str:
     """Minima of the three maps and centre of gravity as a row of the table."""
     g = search_grid(trace, drive=drive)
     assert g.step and g.ramp
-    cells = [f"{p.kintas:.3f}, {p.fss:.1f} N ({p.rms * 1e6:.1f} µm)" for p in (
+    cells = [f"{p.kintas:.3f}, {p.fss:.1f} N ({p.rms * 1e6:.1f} um)" for p in (
         g.step.minimum, g.ramp.minimum, g.joint.minimum, g.best)]
     return f"| {name} | {drive} | {' | '.join(cells)} | {g.merged.kintas:.3f}, {g.merged.fss:.1f} N | " \
            f"{g.merged.weight:.2f} |"

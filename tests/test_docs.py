@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rig_command import rig
-from short_runs import HIDDEN, measured, words
+from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
 from plant import Model, segments, simulate
 from plant.effects import CATALOGUE, effect, load_effects
@@ -230,7 +230,7 @@ def test_the_keys_of_a_diagnosis_are_documented(preflight: Path) -> None:
 
 @pytest.fixture(scope="module")
 def short_runs_with_a_null_bias(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return measured(tmp_path_factory.mktemp("documented"), HIDDEN)
+    return write_measured_runs(tmp_path_factory.mktemp("documented"), HIDDEN)
 
 
 def test_the_keys_of_a_comparison_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
@@ -241,7 +241,7 @@ def test_the_keys_of_a_comparison_are_documented(short_runs_with_a_null_bias: di
 
 
 def test_the_keys_of_an_explanation_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
-    answer = rig("explain", *words(short_runs_with_a_null_bias), "--json").json
+    answer = rig("explain", *list_trace_arguments(short_runs_with_a_null_bias), "--json").json
     assert answer["candidates"] and answer["blind_to"]
     assert_documented(answer, "rig explain")
 

@@ -126,7 +126,7 @@ def compute_features(com: Floats, x: Floats, period: float, parts: Sequence[Sect
                      ) -> dict[str, Floats]:
     """Values of all precursors for runs `x` (m, n) m of a command (n,) m, by name as in MEANINGS, SI or %; (m,) each.
 
-    Precursors of steps carry the step's size in their name, as `overshoot_5mm`; a step below `least_step` m shows
+    Precursors of steps carry the step's size in their name, such as overshoot_5mm; a step below `least_step` m shows
     little but noise and friction and is left out. Precursors that the command cannot show are missing; those that a run
     does not show (an oscillation that never settles) are NaN.
     """

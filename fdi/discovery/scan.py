@@ -186,7 +186,7 @@ def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str,
 
 
 class Slope(NamedTuple):
-    """A fit's Jacobian as `absorbed` needs it: whole, thinned, and what is known of the unknowns."""
+    """A fit's Jacobian as the scan needs it: whole, thinned, and what is known of the unknowns."""
 
     whole: Floats  # (p, s * n)
     thin: Floats  # (p, s, n / SCAN_STRIDE)

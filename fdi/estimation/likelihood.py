@@ -163,7 +163,7 @@ def compute_misfit(white: Floats) -> Floats:
 
 
 def compute_weights(white: Floats) -> Floats:
-    """Weights of the squares, (s, n), that give `misfit` its slope at whitened residuals (s, n)."""
+    """Weights of the squares, (s, n), that give `compute_misfit` its slope at whitened residuals (s, n)."""
     sums = sum_blocks(white)
     each = np.minimum(1.0, BLOCK_FITTED_SQUARE * BLOCK / np.maximum(sums, 1e-300))
     return np.repeat(each, BLOCK, axis=-1)[:, :white.shape[-1]]

@@ -71,7 +71,7 @@ def _shade_rows_left_out(ax: Axes, c: Comparison) -> None:
         ax.axvspan(float(t[a]), float(t[b - 1]), color=RED, alpha=0.12, lw=0, zorder=-1)
 
 
-def draw_shares(c: Comparison) -> str:
+def draw_error_shares(c: Comparison) -> str:
     """Each section's share of the squared error, in the order of time."""
     places = sorted(c.where, key=lambda place: place.t0)
     with start_figure(0.7 + 0.27 * len(places)) as figure:

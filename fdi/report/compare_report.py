@@ -269,7 +269,7 @@ def _show_figures(c: Comparison) -> list[Section]:
     if c.where:
         sections.append(Section("Where", [_tabulate_places(c), Figure(
             "Share of each section in the squared error. The longest bar shows where to look first.",
-            partial(compare_figures.draw_shares, c))], medium=Medium.PAGE))
+            partial(compare_figures.draw_error_shares, c))], medium=Medium.PAGE))
     sections.append(Section("Is the residual noise", [Figure(
         "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within green: "
         "the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat shows the "

@@ -90,7 +90,7 @@ def _draw_step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section,
     _shade_events(ax, judged.events, MS, float(trace.t[s.start]), "position")
     ax.set_title(f"step of {(s.last - s.first) * MM:+.3g} mm at {float(trace.t[s.start]):.4g} s", fontsize=9)
     ax.set_xlabel("time from the step [ms]")
-    ax.set_ylabel("off the healthy\nresponse [µm]")
+    ax.set_ylabel("off the healthy\nresponse [um]")
 
 
 def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
@@ -103,7 +103,7 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
         axes = figure.subplots(2, len(bands.ramps), sharex="col", sharey="row", squeeze=False)
         for pair, ramp in zip(axes.T, bands.ramps, strict=True):
             _draw_ramp(pair, trace, ramp, place[ramp.section], judged)
-        axes[0, 0].set_ylabel("error [µm]")
+        axes[0, 0].set_ylabel("error [um]")
         axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
         axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
         return to_svg(figure, "ramps")

@@ -254,7 +254,7 @@ def group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Event
 
 def _summarise_events(group: Sequence[Event]) -> list[Cell | str]:
     first = group[0]
-    scale, unit = (1e6, "µm") if first.signal == "position" else (1e3, "mm/s")
+    scale, unit = (1e6, "um") if first.signal == "position" else (1e3, "mm/s")
     furthest = max(abs(event.excess) for event in group)
     return [BAND_NAMES[first.band], first.signal, first.section, str(len(group)), f"{first.t_in:.3f}",
             f"{group[-1].t_out:.3f}", f"{1e3 * sum(event.t_out - event.t_in for event in group):.0f}",
@@ -277,7 +277,7 @@ def _show_maps(d: Diagnosis) -> list[Item]:
     rows.append([f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", f"{grid.merged.kintas:.3f}",
                  f"{grid.merged.fss:.3g}", ""])
     columns = [Column("minimum"), Column("Kintas", align="right"), Column("FSS", "N", "right"),
-               Column("RMS", "µm", "right")]
+               Column("RMS", "um", "right")]
     return [Figure("RMS difference between the measured position and that of the monitor model, for every pair of "
                    "fault sizes (logarithmic colour scale). The minima A (steps) and B (ramps) are merged into G; "
                    "dashed: the first bisector.", draw),

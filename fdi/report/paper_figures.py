@@ -25,7 +25,7 @@ COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
 AMBER = "#d9730d"
 SHOWN = 0.1  # s of a step
 LEVELS = 7  # contours
-LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "position [departure, µm]",
+LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "position [departure, um]",
           ("ramp", "speed"): "speed [departure, mm/s]"}  # of the bands' axes
 
 
@@ -68,7 +68,7 @@ def draw_ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
             error.plot(*thin_line(t, (trace.com - trace.xj)[rows] * 1e6), color=colour, lw=1.0)
         way.plot(t, trace.com[rows] * 1e3, color=COMMAND, lw=1.0, ls=":", label="command")
         way.set_ylabel("position [mm]")
-        error.set_ylabel("error [µm]")
+        error.set_ylabel("error [um]")
         error.set_xlabel("time [s]")
         way.legend(loc="lower right" if s.rate > 0 else "upper right", frameon=False)
         return to_svg(figure, "ramps")
@@ -166,7 +166,7 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
             _draw_map(ax, grid, m, letter)
             if m is grid.joint:
                 ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
-            ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} µm at {letter}", fontsize=9)
+            ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}", fontsize=9)
             ax.set_xlabel("Kintas")
             if truth:
                 ax.plot(*truth, "x", color="white", ms=9, mew=1.6, label="injected")

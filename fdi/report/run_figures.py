@@ -18,9 +18,9 @@ Floats = NDArray[np.float64]
 FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
 SHORTEST_TIME = 0.1  # us, the left end of a histogram: the resolution of the clock
-PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [µm]", 1e6, "#d9730d"),
-          ("close", "error, close up [µm]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
-          ("p12", "P12 [MPa]", 1e-6, "#0f8b8d"), ("xs", "XS [µm]", 1e6, "#bf3989"),
+PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [um]", 1e6, "#d9730d"),
+          ("close", "error, close up [um]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
+          ("p12", "P12 [bar]", 1e-5, "#0f8b8d"), ("xs", "XS [um]", 1e6, "#bf3989"),
           ("load", "load [kN]", 1e-3, "#57606a"))
 
 
@@ -112,7 +112,7 @@ def draw_timing(trace: Trace) -> str:
                 axis.set_minor_locator(NullLocator())
             ax.xaxis.set_label_coords(0.5, -0.14)
             ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
-            ax.set_xlabel(f"{name} [µs]")
+            ax.set_xlabel(f"{name} [us]")
         axes[0].set_ylabel("cycles (dotted: p99)")
         axes[0].yaxis.set_label_coords(-0.06 * len(drawn), 0.5)
         return to_svg(figure, "timing")

@@ -123,8 +123,11 @@ def _tabulate_protocol(checks: tuple[Check, ...]) -> list[Item]:
 
 
 def _name_measure(check: Check) -> str:
-    """The kind of a check and its signal: "steady error of xj"."""
-    return " of ".join(word for word in (check.kind.replace("_", " "), check.signal) if word)
+    """What a check measures: "steady error of xj", "largest size of cor", "number of EMCY events"."""
+    if check.kind in ("event_occurs", "event_never"):
+        return f"number of {check.signal} events" if check.signal else "number of events"
+    quantity = {"never_exceeds": "largest size", "response_within": "response time"}.get(check.kind)
+    return " of ".join(word for word in (quantity or check.kind.replace("_", " "), check.signal) if word)
 
 
 def _format_value(check: Check) -> str:
@@ -177,7 +180,7 @@ def _show_timing(trace: Trace) -> list[Item]:
 
         return run_figures.draw_timing(trace)
 
-    columns = [Column("wall clock"), *(Column(name, "µs", "right") for name in ("p50", "p99", "p99.9", "max"))]
+    columns = [Column("wall clock"), *(Column(name, "us", "right") for name in ("p50", "p99", "p99.9", "max"))]
     caption = "Number of cycles by duration, both axes logarithmic; the dotted line is the 99th percentile."
     return [Figure(caption, draw),
             Table(columns, rows, caption="p99 is the time that 99 of 100 cycles stay below."),

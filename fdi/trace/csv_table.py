@@ -22,10 +22,10 @@ Floats = NDArray[np.float64]
 
 
 class CsvColumns(NamedTuple):
-    """What a CSV file holds: known columns, shape (rows,), NaN where a field is empty; and the names of all others."""
+    """What a CSV file holds."""
 
-    columns: dict[str, Floats]
-    unknown: tuple[str, ...]
+    columns: dict[str, Floats]  # the known ones, shape (rows,), NaN where a field is empty
+    notes: tuple[str, ...]  # what a reader should know: columns left out, fields that say "nan"
     plant: Plant | None  # whose rig wrote the file in its own columns; None for a trace of this software
 
 
@@ -42,8 +42,8 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
             rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
             if table is None:
                 return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
-            sources, unknown = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-            return CsvColumns(_combine_columns(sources, table), unknown, plant)
+            sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
+            return CsvColumns(_combine_columns(sources, table), notes, plant)
     except UnicodeDecodeError as error:
         raise InputError(path, "", "a text file (UTF-8)") from error
     except csv.Error as error:
@@ -97,6 +97,7 @@ class _LimitedGzip(io.RawIOBase):
 
 def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...],
                 optional: tuple[str, ...]) -> tuple[dict[str, Floats], tuple[str, ...]]:
+    """The columns and the notes of a CSV text."""
     header = [name.strip() for name in next(rows, [])]
     for name in required:
         if name not in header:
@@ -106,6 +107,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
         raise InputError(f"{path}: line 1", "header", "each column once")
     known = [(i, name) for i, name in enumerate(header) if name in required or name in optional]
     values: list[list[float]] = [[] for _ in known]
+    words = dict.fromkeys((name for _, name in known), 0)  # fields that say "nan"
     last = -math.inf
     for line, row in enumerate(rows, 2):
         if not row:
@@ -114,14 +116,17 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
             raise InputError(f"{path}: line {line}", "", f"{len(header)} fields as in the header, not {len(row)}")
         for out, (i, name) in zip(values, known, strict=True):
             out.append(_parse_number(path, line, name, row[i]))
+            words[name] += math.isnan(out[-1]) and bool(row[i].strip())
             if name == "t":
                 if not out[-1] > last:
                     raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, not {row[i]!r}")
                 last = out[-1]
     if not values[0]:
         raise InputError(path, "", "at least one row after the header")
-    return ({name: np.array(column) for column, (_, name) in zip(values, known, strict=True)},
-            tuple(name for name in header if name not in required and name not in optional))
+    unknown = [name for name in header if name not in required and name not in optional]
+    notes = (*(f"column {name} is not known and was left out" for name in unknown),
+             *(f"column {name}: {count} fields say nan and count as missing" for name, count in words.items() if count))
+    return {name: np.array(column) for column, (_, name) in zip(values, known, strict=True)}, notes
 
 
 def _parse_number(path: Path, line: int, name: str, text: str) -> float:

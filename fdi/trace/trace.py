@@ -148,8 +148,12 @@ class Trace:
         Raises InputError, naming file, line or field, for what cannot be a trace.
         """
         path = Path(path)
+        if not path.exists():
+            raise InputError(path, "", "a readable file or the folder of a run; it does not exist")
         if path.is_dir():
             path /= "trace.mcap"
+            if not path.is_file():
+                raise InputError(path.parent, "", "the folder of a run; it has no trace.mcap")
         if path.suffix == ".mcap":
             return _from_log(open_log(path), all)
         if path.name.endswith((".csv", ".csv.gz")):
@@ -217,7 +221,7 @@ class Trace:
 
 
 def _from_csv(path: Path) -> Trace:
-    columns, unknown, plant = read_csv(path, REQUIRED, OPTIONAL)
+    columns, notes, plant = read_csv(path, REQUIRED, OPTIONAL)
     t = columns.pop("t")
     if len(t) < 2:
         raise InputError(path, "t", "at least two rows")
@@ -231,8 +235,7 @@ def _from_csv(path: Path) -> Trace:
     lost = np.isnan(grid["t"])
     grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
     return _make_trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
-                       units=UNITS | ({"cor": plant.unit} if plant else {}),
-                       notes=tuple(f"column {name} is not known and was left out" for name in unknown))
+                       units=UNITS | ({"cor": plant.unit} if plant else {}), notes=notes)
 
 
 def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Gap]]:

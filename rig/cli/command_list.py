@@ -29,5 +29,5 @@ HELP_OF_COMMAND = {
 
 
 def import_command(name: str) -> ModuleType:
-    """Import the module of a command: `add_arguments(parser)` and `run(args)`, which returns the exit status."""
+    """Import the module of a command: `add_arguments(parser)` and `run_command(args)`, which returns the status."""
     return importlib.import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")

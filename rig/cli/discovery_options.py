@@ -5,7 +5,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,7 +56,7 @@ def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[li
     Raises:
         InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
     """
-    from plant import InputError
+    from plant.errors import InputError, suggest_name
     from plant.model import list_offered_effects
 
     effects, known = [], [e.name for e in list_offered_effects(plant)]
@@ -68,8 +67,7 @@ def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[li
         elif trace is None and is_file:
             trace = word
         else:
-            near = get_close_matches(word, known, 1, 0.5)
-            hint = f"; did you mean {near[0]}?" if near else " (rig effects lists them)"
+            hint = suggest_name(word, known, 0.5) or " (rig effects lists them)"
             raise InputError("effect", word, f"an effect of the catalogue{hint}")
     if not effects:
         raise InputError("effect", "", "at least one effect (rig effects lists them)")

@@ -36,22 +36,22 @@ def add_seed_option(parser: argparse.ArgumentParser) -> None:
 
 def parse_whole_number(text: str) -> int:
     """Parse a whole number from 0, as an argparse type."""
-    value = int(text)
-    if value < 0:
-        raise ValueError
-    return value
+    return _parse_integer(text, 0)
 
 
 def parse_count(text: str) -> int:
     """Parse a whole number from 1, as an argparse type."""
-    value = parse_whole_number(text)
-    if value < 1:
-        raise ValueError
+    return _parse_integer(text, 1)
+
+
+def _parse_integer(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number from {least}, not {text!r}")
     return value
-
-
-parse_whole_number.__name__ = "whole number from 0"
-parse_count.__name__ = "whole number from 1"
 
 
 def parse_changes(pairs: list[str]) -> dict[str, str]:

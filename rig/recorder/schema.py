@@ -4,7 +4,7 @@ Fields of fixed width come first and are packed in one precompiled `struct` call
 text and bytes follow. That is about 1 us a record against 5 us with protobuf's Python objects, and the log shares the
 interpreter lock with the loop. Zeros are written out, which proto3 allows; a test reads it with Google's library.
 """
-# ruff: noqa: RUF009 (`_doc` is a field specifier, as dataclasses.field is)
+# ruff: noqa: RUF009 (`_describe_field` is a field specifier, as dataclasses.field is)
 from __future__ import annotations
 
 import math

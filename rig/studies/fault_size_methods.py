@@ -1,13 +1,13 @@
 """Other methods for the fault sizes of a trace: what each one finds, its error, its simulations and its time."""
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.progress import Progress
+from fdi.report.json import to_plain
 from fdi.report.numbers import NO_NUMBER, format_digits
 from fdi.report.report import Column, Section, Table
 from plant.errors import InputError
@@ -59,8 +59,8 @@ def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Itera
     for name, learner in comparators.LEARNERS.items():
         progress(name, 1.0)
         found, seconds = measure_time(partial(learner, lesson, seed))
-        yield Row(found.method, _replace_nan(found.kintas), _replace_nan(found.fss), left=None,
-                  error_kintas=_replace_nan(found.error_kintas), error_fss=_replace_nan(found.error_fss),
+        yield Row(found.method, to_plain(found.kintas), to_plain(found.fss), left=None,
+                  error_kintas=to_plain(found.error_kintas), error_fss=to_plain(found.error_fss),
                   right=found.right, levels={fault: level.word for fault, level in found.levels.items()},
                   simulations=found.simulations, seconds=simulation_seconds + seconds)
 
@@ -70,10 +70,6 @@ def measure_time(work: Callable[[], Any]) -> tuple[Any, float]:
     clock = WallClock()
     start = clock.now()
     return work(), 1e-9 * (clock.now() - start)
-
-
-def _replace_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def build_methods_section(rows: Sequence[Row]) -> Section:

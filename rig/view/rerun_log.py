@@ -48,7 +48,7 @@ PLOTS = (
                                        Line("ram", "XJ ram [mm]", MEASURED))),
     Plot("error", "Following error [um]", (Line("error", "Com - XJ [um]", 0xE8A33DFF),)),
     Plot("current", "Current [mA]", (Line("current", "Cor current [mA]", 0xB57EDCFF),)),
-    Plot("pressure", "Differential pressure [MPa]", (Line("pressure", "P12 pressure [MPa]", 0x45B8ACFF),)),
+    Plot("pressure", "Differential pressure [bar]", (Line("pressure", "P12 pressure [bar]", 0x45B8ACFF),)),
     Plot("spool", "Spool position [um]", (Line("spool", "XS spool [um]", 0xD96BA0FF),)),
     Plot("timing", "Cycle timing [us]", (Line("lateness", "SYNC lateness [us]", 0xF2C94CFF, 1.0),
                                          Line("response", "controller's response [us]", 0x7FD46BFF, 1.0),
@@ -58,7 +58,7 @@ SECTIONS = {"hold": NEUTRAL, "step": MEASURED, "ramp": 0x2A8C82FF, "dynamic": 0x
 LANES, TEXTS = "Verdict, phase, NMT states, checks", "Events and checks"  # titles of the views that are no plots
 LANE_HEIGHT, LANES_SHARE = 0.039, (0.5, 0.78)  # a lane's and all lanes' least and most part of the window's height
 SHOWN_IN = {"xj": ("position", 1e3), "com": ("position", 1e3), "error": ("error", 1e6), "cor": ("current", 1e3),
-            "p12": ("pressure", 1e-6), "xs": ("spool", 1e6)}  # signal -> plot, scale from SI
+            "p12": ("pressure", 1e-5), "xs": ("spool", 1e6)}  # signal -> plot, scale from SI
 LIMITS_OF = {"never_exceeds", "max_error"}  # kinds of check whose limits are limits of the plotted line
 
 
@@ -99,7 +99,7 @@ def list_lines(trace: Trace) -> dict[str, tuple[Floats, Floats]]:
     timing = trace.timing
     out = {"position/command": trace.com * 1e3, "position/ram": trace.xj * 1e3,
            "error/error": (trace.com - trace.xj) * 1e6, "current/current": trace.cor * 1e3,
-           "pressure/pressure": trace.p12 * 1e-6, "spool/spool": trace.xs * 1e6}
+           "pressure/pressure": trace.p12 * 1e-5, "spool/spool": trace.xs * 1e6}
     found = {path: (trace.t, values) for path, values in out.items()}
     found |= {f"timing/{name}": (timing.t, column * 1e6) for name, column in
               (("lateness", timing.lateness), ("response", timing.response), ("work", timing.work))}

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from effect_files import restored_catalogue
-from short_runs import HIDDEN, measured
+from short_runs import HIDDEN, write_measured_runs
 
 import fdi
 from fdi.analysis import Plot, Result
@@ -27,7 +27,7 @@ FEW = {"null_bias", "spool_friction", *(suspect.effect for suspect in SUSPECTS)}
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return measured(tmp_path_factory.mktemp("runs"), HIDDEN)
+    return write_measured_runs(tmp_path_factory.mktemp("runs"), HIDDEN)
 
 
 @pytest.fixture(scope="module")

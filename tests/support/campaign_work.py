@@ -12,7 +12,7 @@ from fdi.trace.trace import Trace
 from plant import Model
 
 
-def quick(trace: Trace, model: Model) -> dict[str, Any]:
+def judge_quickly(trace: Trace, model: Model) -> dict[str, Any]:
     """Some numbers that depend on every bit of the trace; each call leaves its mark in $CAMPAIGN_CALLS."""
     source = f"{trace.provenance['source']} {trace.provenance.get('seed')}"
     if "CAMPAIGN_CALLS" in os.environ:

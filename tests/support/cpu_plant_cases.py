@@ -20,7 +20,7 @@ SOME = ("filter_clogging", "null_bias", "presliding", "stribeck", "orifice_root"
 EVERY = tuple(name for name, effect in CATALOGUE.items() if not effect.base and name != "spool_underlap")  # or overlap
 
 
-def at_work(names: tuple[str, ...]) -> Model:
+def activate_effects(names: tuple[str, ...]) -> Model:
     """The nominal plant with these effects at the sizes that a fit starts from."""
     model = Model()
     for name in names:
@@ -31,23 +31,23 @@ def at_work(names: tuple[str, ...]) -> Model:
 
 def print_hashes() -> None:
     """One object on standard output: case to hash."""
-    some, bare = at_work(SOME), Model().replace({"filter.clogging": 0.3})
+    some, bare = activate_effects(SOME), Model().replace({"filter.clogging": 0.3})
     cases = {
-        "commands": command(),
+        "commands": build_command(),
         "simulate": np.column_stack(simulate(bare, PREFLIGHT, seed=3)),
         "simulate, effects": np.column_stack(simulate(some, SHORT, LOAD, seed=4)),
-        "Actuator, effects": actuator(some, True),
+        "Actuator, effects": run_actuator(some, True),
         "interpreted simulate, every effect": np.column_stack(
-            simulate(at_work(EVERY), SWING[:40], steps=5, fast=False)),
-        "interpreted Actuator, effects": actuator(some, False),
-        "lanes, closed loop": lanes(bare, 40).closed_loop(sizes(40), SHORT, LOAD),
-        "lanes, replay, effects": lanes(some, 20).replay(sizes(20), 5.0 * SWING, LOAD, SWING, 2.0),
+            simulate(activate_effects(EVERY), SWING[:40], steps=5, fast=False)),
+        "interpreted Actuator, effects": run_actuator(some, False),
+        "lanes, closed loop": build_lanes(bare, 40).closed_loop(draw_values(40), SHORT, LOAD),
+        "lanes, replay, effects": build_lanes(some, 20).replay(draw_values(20), 5.0 * SWING, LOAD, SWING, 2.0),
     }
     hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}
     print(json.dumps({name: found.hexdigest() for name, found in hashes.items()}))
 
 
-def command() -> np.ndarray:
+def build_command() -> np.ndarray:
     """Every kind of wave."""
     segments = [Sine(amplitude=2e-3, frequency=1.7, time=2.0), Ramp(to=1e-3, time=0.3),
                 Chirp(amplitude=1e-3, f0=1.0, f1=31.0, fade=20.0, time=3.0),
@@ -56,7 +56,7 @@ def command() -> np.ndarray:
     return build_profile(segments).command
 
 
-def actuator(model: Model, fast: bool) -> np.ndarray:
+def run_actuator(model: Model, fast: bool) -> np.ndarray:
     """Readings and state of a plant that is driven cycle by cycle."""
     plant, rows = Actuator(model, seed=5, steps=10, fast=fast), []
     for k in range(200 if fast else 20):
@@ -65,12 +65,12 @@ def actuator(model: Model, fast: bool) -> np.ndarray:
     return np.array(rows)
 
 
-def lanes(model: Model, runs: int) -> Lanes:
+def build_lanes(model: Model, runs: int) -> Lanes:
     """`runs` side by side."""
     return Lanes(model, ["filter.clogging", "spool.static_friction", "jack.damping"], steps=10)
 
 
-def sizes(runs: int) -> np.ndarray:
+def draw_values(runs: int) -> np.ndarray:
     """Their parameters."""
     return np.random.default_rng(6).uniform([0.0, 5.0, 1e3], [0.6, 40.0, 9e3], (runs, 3))
 

@@ -14,7 +14,7 @@ EASY = SMOOTH.having(LAWS)  # nor dry friction
 H = 1e-5
 
 
-def driven(model: Model, current: np.ndarray, load: float = 0.0) -> tuple[Actuator, np.ndarray]:
+def drive_plant(model: Model, current: np.ndarray, load: float = 0.0) -> tuple[Actuator, np.ndarray]:
     """The plant after the current (n,) A, one a cycle, and its rows XJ as sensed, P12, XS, XJ, XJ' at each sample."""
     plant, out = Actuator(model), np.empty((len(current), 5))
     for k, amperes in enumerate(current):
@@ -24,11 +24,11 @@ def driven(model: Model, current: np.ndarray, load: float = 0.0) -> tuple[Actuat
     return plant, out.T
 
 
-def spool_at(model: Model, current: float) -> float:
+def measure_spool(model: Model, current: float) -> float:
     """XS at which feedback and torque motor are in balance, m."""
     return model["torque_motor.gain"] * current / model["feedback_spring.stiffness"]
 
 
-def speed_at(model: Model, spool: float) -> float:
+def measure_speed(model: Model, spool: float) -> float:
     """Speed of an unloaded ram at that opening, m/s."""
     return model["valve.flow_gain"] * spool / model["jack.area"]

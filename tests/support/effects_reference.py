@@ -56,7 +56,7 @@ def _run(p: Any, spool: Any, load: Any, h: float, out: Any) -> None:
         out[0, i], out[1, i] = x, pressure
 
 
-def jack(values: Mapping[str, float], spool: Any, load: Any, h: float) -> Any:
+def simulate_jack(values: Mapping[str, float], spool: Any, load: Any, h: float) -> Any:
     """Rows XJ, P12 after each step of `h` s under the path `spool` (n,) m and `load` (n,) N; no stick-slip."""
     v = values
     stored = 0.25 * v["compressibility.volume"] * v["compressibility.coefficient"]

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 from physics_cases import PREFLIGHT, QUIET
-from synthetic_run import command
+from synthetic_run import build_command
 
 from fdi.trace.trace import Trace
 from plant import Actuator, Model
@@ -15,10 +15,10 @@ from plant.run import PRESSURE, SENSED, SPOOL
 LEVELS = np.array([2e-6, 2e4, 1e-6])  # of the nominal transducers: m, Pa, m
 TURN = 0.78  # of one sample of coloured noise, what the next one keeps: a corner at 40 Hz, as on the practice bench
 HUM = 0.4  # amplitude over the level, 50 Hz
-SHORT = np.concatenate([command()[3800:5200], command()[9000:11600]])  # a ramp and a sine: 4 s
+SHORT = np.concatenate([build_command()[3800:5200], build_command()[9000:11600]])  # a ramp and a sine: 4 s
 
 
-def noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
+def draw_noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
     """(rows, 3) noise of XJ, P12, XS at the nominal levels; "hum": XJ coloured, with 50 Hz at the same phase always."""
     rng = np.random.default_rng(seed)
     out = rng.standard_normal((rows, 3))
@@ -30,11 +30,11 @@ def noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
     return out * LEVELS
 
 
-def recorded(changes: dict[str, float] | None = None, com: np.ndarray = PREFLIGHT, seed: int = 0, colour: str = "white",
-             sensor: Callable[[float], float] | None = None, load: float = 0.0) -> Trace:
+def record_plant(changes: dict[str, float] | None = None, com: np.ndarray = PREFLIGHT, seed: int = 0,
+                 colour: str = "white", sensor: Callable[[float], float] | None = None, load: float = 0.0) -> Trace:
     """A trace of the nominal plant with some `changes`; `sensor` turns the ram's position into what is sensed."""
     model = Model().replace(QUIET | (changes or {}))
-    plant, n = Actuator(model), noise(seed, len(com), colour).tolist()
+    plant, n = Actuator(model), draw_noise(seed, len(com), colour).tolist()
     state = plant._flat
     gain, limit = model["controller.proportional_gain"], model["controller.current_limit"]
     out, current = np.empty((len(com), 4)), 0.0
@@ -51,12 +51,12 @@ def recorded(changes: dict[str, float] | None = None, com: np.ndarray = PREFLIGH
 
 
 @cache
-def healthy(seed: int = 0, colour: str = "white") -> Trace:
+def record_healthy(seed: int = 0, colour: str = "white") -> Trace:
     """The nominal plant over the preflight command."""
-    return recorded(seed=seed, colour=colour)
+    return record_plant(seed=seed, colour=colour)
 
 
-def backlash(width: float) -> Callable[[float], float]:
+def make_backlash(width: float) -> Callable[[float], float]:
     """A transducer with that play, m, in its coupling."""
     held = 0.0
 
@@ -68,7 +68,7 @@ def backlash(width: float) -> Callable[[float], float]:
     return sense
 
 
-def lagging(time: float) -> Callable[[float], float]:
+def make_lag(time: float) -> Callable[[float], float]:
     """A transducer with a first-order lag of `time` s, sampled each ms."""
     held, keep = 0.0, float(np.exp(-1e-3 / time))
 

@@ -21,7 +21,7 @@ WITHOUT_FMA = "glibc.cpu.hwcaps=" + ",".join(
 HASWELL = ("sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "avx", "avx2", "fma", "bmi", "bmi2", "lzcnt", "f16c", "movbe")
 
 
-def numpy_without(*kept: str) -> str:
+def list_disabled_features(*kept: str) -> str:
     """Switches off the vector code of NumPy that this CPU has, but for that of the `kept` instruction sets."""
     core = np._core._multiarray_umath  # type: ignore[attr-defined]
     return " ".join(name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] and name not in kept)
@@ -30,23 +30,23 @@ def numpy_without(*kept: str) -> str:
 THIS, AVX2, OLDEST = "this CPU", "AVX2 and FMA (2013)", "no vector code beyond SSE2, no FMA"
 
 
-def settings() -> dict[str, Mapping[str, str]]:
+def list_cpu_settings() -> dict[str, Mapping[str, str]]:
     """Name of a CPU and the environment that stands for it; only CPUs whose instructions this one has too."""
     found: dict[str, Mapping[str, str]] = {THIS: {}}
     if all(get_host_cpu_features().get(feature) for feature in HASWELL):
         found[AVX2] = {
             "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ",".join(f"+{feature}" for feature in HASWELL),
-            "NPY_DISABLE_CPU_FEATURES": numpy_without("AVX", "F16C", "FMA3", "AVX2", "X86_V3")}
+            "NPY_DISABLE_CPU_FEATURES": list_disabled_features("AVX", "F16C", "FMA3", "AVX2", "X86_V3")}
     found[OLDEST] = {"NUMBA_CPU_NAME": "generic", "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": WITHOUT_FMA,
-                     "NPY_DISABLE_CPU_FEATURES": numpy_without()}
+                     "NPY_DISABLE_CPU_FEATURES": list_disabled_features()}
     return found
 
 
-def on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600,
+def run_on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600,
                 cpus: Sequence[str] = (THIS, AVX2, OLDEST)) -> dict[str, Any]:
     """What the program of this folder prints as JSON, by CPU; all processes at the same time, outputs in `folder`."""
     began = {}
-    for name, changes in settings().items():
+    for name, changes in list_cpu_settings().items():
         if name not in cpus:
             continue
         environment = {key: value for key, value in os.environ.items() if not key.startswith(("NUMBA_CPU", "OPENBLAS"))}

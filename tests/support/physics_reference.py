@@ -1,8 +1,8 @@
 """The reference model once more, written from the equations alone, to hold the plant against.
 
-`explicit` is a plain 1 us integration with Karnopp's friction; `piecewise` an adaptive implicit solver (Radau) with
-the stops as events; `linear` the matrix exponential where nothing saturates. None of them shares code or scheme with
-plant/.
+`simulate_explicit` is a plain 1 us integration with Karnopp's friction; `simulate_piecewise` an adaptive implicit
+solver (Radau) with the stops as events; `simulate_linear` the matrix exponential where nothing saturates. None of them
+shares code or scheme with plant/.
 """
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Plant(NamedTuple):
     XJM: float
 
 
-def plant(v: Mapping[str, float]) -> Plant:
+def convert_parameters(v: Mapping[str, float]) -> Plant:
     """The symbols from "group.field" values; clogging after the law "sqrt"."""
     left = 1 - v["filter.clogging"]
     assert v["filter.law"] == 0.5
@@ -111,12 +111,13 @@ def _explicit(p: Any, com: Any, measured: Any, replay: bool, load: Any, substeps
         current = answer
 
 
-def explicit(v: Mapping[str, float], com: Any, load: Any = None, measured: Any = None, substeps: int = 1000) -> Any:
+def simulate_explicit(v: Mapping[str, float], com: Any, load: Any = None, measured: Any = None,
+                      substeps: int = 1000) -> Any:
     """Rows XJ, Cor, P12, XS, shape (4, n), at 1 us (semi-implicit Euler); `measured` current instead of the law's."""
     out = np.empty((4, len(com)))
     force = np.zeros(len(com)) if load is None else np.asarray(load, float)
     replayed = np.zeros(len(com)) if measured is None else np.asarray(measured, float)
-    _explicit(plant(v), np.asarray(com, float), replayed, measured is not None, force, substeps, out)
+    _explicit(convert_parameters(v), np.asarray(com, float), replayed, measured is not None, force, substeps, out)
     return out
 
 
@@ -125,9 +126,9 @@ class _Modes(NamedTuple):
     spool: float = 0.0
 
 
-def piecewise(v: Mapping[str, float], com: Any) -> Any:
+def simulate_piecewise(v: Mapping[str, float], com: Any) -> Any:
     """Rows XJ, Cor, P12, XS without friction: Radau at tight tolerance, inelastic stops as events."""
-    p, out, y, current, modes = plant(v), np.empty((4, len(com))), np.zeros(6), 0.0, _Modes()
+    p, out, y, current, modes = convert_parameters(v), np.empty((4, len(com))), np.zeros(6), 0.0, _Modes()
     assert p.FSS == p.FSJ == 0
     for k, demand in enumerate(com):
         answer = float(np.clip(p.GAP * (demand - y[4]), -p.Imax, p.Imax))
@@ -181,9 +182,9 @@ def _cycle(p: Plant, y: Any, current: float, modes: _Modes) -> tuple[Any, _Modes
     return y, modes
 
 
-def linear(v: Mapping[str, float], com: Any) -> Any:
+def simulate_linear(v: Mapping[str, float], com: Any) -> Any:
     """Rows XJ, Cor, P12, XS without friction, exact to rounding; asserts that nothing saturates."""
-    p, out, y, current = plant(v), np.empty((4, len(com))), np.zeros(6), 0.0
+    p, out, y, current = convert_parameters(v), np.empty((4, len(com))), np.zeros(6), 0.0
     unit = np.eye(6)
     wide = p._replace(PS1=np.inf, PSR=np.inf)
 

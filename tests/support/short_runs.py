@@ -13,7 +13,7 @@ STEPS = 200  # a cycle: 5 us
 HIDDEN = {"null_bias.current": 1.5e-4}
 
 
-def command() -> np.ndarray:
+def build_command() -> np.ndarray:
     """A step, a slow ramp and a sine: 4 s."""
     t = np.arange(4000) / 1000.0
     ramp = np.interp(t, [1.1, 2.1], [0.0, 1e-3])
@@ -21,23 +21,24 @@ def command() -> np.ndarray:
     return np.where((t >= 0.2) & (t < 0.7), 3e-3, ramp + wave)
 
 
-def another() -> np.ndarray:
+def build_other_command() -> np.ndarray:
     """Another command, for the held-out run: 3 s."""
     t = np.arange(3000) / 1000.0
     wave = np.where(t > 1.2, 1.5e-3 * np.sin(3.0 * np.pi * (t - 1.2)), 0.0)
     return np.where((t > 0.2) & (t < 1.0), -2e-3, wave)
 
 
-def measured(folder: Path, changes: Mapping[str, float]) -> dict[str, Path]:
+def write_measured_runs(folder: Path, changes: Mapping[str, float]) -> dict[str, Path]:
     """Files `est`, `repeat` and `holdout` of the nominal plant with `changes`."""
     files = {}
     for seed, name in enumerate(("est", "repeat", "holdout"), 1):
-        columns = simulate(Model().replace(changes), another() if name == "holdout" else command(), None, seed, STEPS)
+        demand = build_other_command() if name == "holdout" else build_command()
+        columns = simulate(Model().replace(changes), demand, None, seed, STEPS)
         files[name] = folder / f"{name}.csv"
         Trace.of(columns._asdict(), 1e-3, {}).write_csv(files[name])
     return files
 
 
-def words(files: Mapping[str, Path]) -> list[object]:
+def list_trace_arguments(files: Mapping[str, Path]) -> list[object]:
     """The runs as words of a command."""
     return [files["est"], "--repeat", files["repeat"], "--holdout", files["holdout"]]

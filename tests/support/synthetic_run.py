@@ -18,7 +18,7 @@ ATTACHMENTS = {"sequence.toml": ("application/toml", b"title = 'synthetic'\n"),
 METADATA = {"seed": "1", "bus": "embedded", "pace": "lockstep", "period": "0.001", "model": "eha"}
 
 
-def command() -> np.ndarray:
+def build_command() -> np.ndarray:
     """The preflight command, shape (13500,), m."""
     def hold(level: float, seconds: float) -> np.ndarray:
         return np.full(round(seconds * 1000), level)
@@ -30,10 +30,10 @@ def command() -> np.ndarray:
         3 * np.sin(2 * math.pi * t), chirp, hold(0, 0.5)])
 
 
-def cycles(seed: int = 1,
+def build_cycles(seed: int = 1,
            settings: dict[str, float] | None = None) -> Iterator[tuple[int, list[Frame], Signals, Timing]]:
     """(t_ns, frames, signals, timing) of each cycle: 300 of set-up, the preflight command, 200 of clean-up."""
-    com = np.concatenate([np.zeros(300), command(), np.zeros(200)])
+    com = np.concatenate([np.zeros(300), build_command(), np.zeros(200)])
     run = simulate(load_model().replace(settings or {}), com, seed=seed)
     phase = np.concatenate([np.zeros(300), np.ones(len(com) - 500), np.full(200, 2)]).astype(int)
     rng = np.random.default_rng(seed)
@@ -50,7 +50,7 @@ def cycles(seed: int = 1,
                Timing(k, bool(late[k] > 1e-3), float(late[k]), float(answer[k]), float(answer[k] + 1e-4)))
 
 
-def record(path: Path, seed: int = 1, settings: dict[str, float] | None = None, stop: int | None = None) -> Path:
+def record_run(path: Path, seed: int = 1, settings: dict[str, float] | None = None, stop: int | None = None) -> Path:
     """Record the run (the first `stop` cycles of it) as `path`."""
     recorder = Recorder(path, ATTACHMENTS, METADATA)
     recorder.put(0, Event("INFO", "phase", "set-up"))
@@ -58,7 +58,7 @@ def record(path: Path, seed: int = 1, settings: dict[str, float] | None = None, 
         recorder.put(0, NmtState(node, 0, "boot-up"))
         recorder.put(50_000_000, NmtState(node, 127, "pre-operational"))
         recorder.put(100_000_000, NmtState(node, 5, "operational"))
-    for t_ns, frames, signals, timing in cycles(seed, settings):
+    for t_ns, frames, signals, timing in build_cycles(seed, settings):
         if signals.cycle == stop:
             break
         if signals.cycle == 300:

@@ -24,6 +24,8 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out) if args.out is not None else source.with_name(source.name.split(".")[0] + ".mcap")
     if not csv and source.suffix not in RAW_SUFFIXES:
         raise InputError(source, "", f"a file that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
+    if csv and args.dbc:
+        raise InputError("--dbc", args.dbc, "a CAN log to decode; a CSV of signals has no frames")
     if csv:
         cycles = import_csv(source, out)
     else:

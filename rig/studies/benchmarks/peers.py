@@ -47,7 +47,7 @@ class Task(NamedTuple):
 
 
 def make_c_replay(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Replay:
-    """The function `replay_each` or `replay_lanes` of lanes.c."""
+    """A function of lanes.c: "replay_each" or "replay_lanes"."""
     library = build_library("lanes.c", flags, target)
     records = np.repeat(task.model.record(), len(task.values))
     numbers = records.view(np.float64).reshape(len(records), -1)

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from fdi.prognosis.gather import list_traces
 from plant.effects import Effect
-from plant.errors import InputError
+from plant.errors import InputError, suggest_name
 from plant.model import Model, find_effect
 from plant.parameters import parse_toml, parse_value, read_toml
 
@@ -82,7 +82,7 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     """
     given = {key: value for key, value in tables.items() if key != "case"}
     for key in given.keys() - DEFAULTS.keys():
-        raise InputError(where, key, f"one of {', '.join([*DEFAULTS, '[[case]]'])}")
+        raise InputError(where, key, f"one of {', '.join([*DEFAULTS, '[[case]]'])}{suggest_name(key, DEFAULTS)}")
     common = {**DEFAULTS, **given}
     _check_common(common, where)
     _check_model(model)

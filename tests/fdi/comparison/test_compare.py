@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from noisy_traces import SHORT, backlash, healthy, lagging, recorded
+from noisy_traces import SHORT, make_backlash, make_lag, record_healthy, record_plant
 
 from fdi.comparison.compare import Comparison, compare
 from fdi.report.compare_report import collect_data, describe_findings, describe_verdict
@@ -19,7 +19,7 @@ MODEL = Model()
 @cache
 def faulty(name: str) -> Trace:
     changes, sensor = FAULTS[name]
-    return recorded(changes, sensor=sensor() if sensor else None)
+    return record_plant(changes, sensor=sensor() if sensor else None)
 
 
 Fault = tuple[dict[str, float], Callable[[], Callable[[float], float]] | None]
@@ -32,8 +32,8 @@ FAULTS: dict[str, Fault] = {
     "jack: friction": ({"jack.static_friction": 1200.0, "jack.dynamic_friction": 750.0}, None),
     "jack: mass": ({"jack.mass": 200.0}, None),
     "jack: drag": ({"jack.damping": 8e3}, None),
-    "sensor: play": ({}, lambda: backlash(60e-6)),
-    "sensor: lag": ({}, lambda: lagging(1e-3)),
+    "sensor: play": ({}, lambda: make_backlash(60e-6)),
+    "sensor: lag": ({}, lambda: make_lag(1e-3)),
 }
 
 
@@ -44,7 +44,7 @@ def at_floor(found: Comparison) -> bool:
 @pytest.mark.parametrize("colour", ["white", "hum"])
 def test_a_perfect_model_is_at_the_floor(colour: str) -> None:
     """With a repeat and, where the noise is as the model says, without."""
-    found = compare(healthy(2, colour), MODEL, [healthy(3, colour)])
+    found = compare(record_healthy(2, colour), MODEL, [record_healthy(3, colour)])
     assert at_floor(found), describe_verdict(found)
     for name, limit in {"xj": 0.05, "p12": 0.02, "xs": 0.02}.items():
         assert found.signals[name].ratio == pytest.approx(1.0, abs=limit)
@@ -52,13 +52,13 @@ def test_a_perfect_model_is_at_the_floor(colour: str) -> None:
         assert found.signals[name].solver_error < 0.1 * found.signals[name].floor.value
     assert all(ratio is not None and ratio < 1.1 for ratio in found.blocks.values())
     assert abs(found.drift) < 1e-6 and found.signals["xj"].closed_loop_error > 2 * found.signals["xj"].error
-    assert at_floor(compare(healthy(2, colour), MODEL))
+    assert at_floor(compare(record_healthy(2, colour), MODEL))
 
 
 @pytest.mark.parametrize("colour", ["white", "hum"])
 def test_seeds_do_not_matter(colour: str) -> None:
     """Short traces, whose estimates scatter the most."""
-    traces = [recorded(com=SHORT, seed=seed, colour=colour) for seed in range(10)]
+    traces = [record_plant(com=SHORT, seed=seed, colour=colour) for seed in range(10)]
     found = [compare(trace, MODEL, repeats) for trace, other in zip(traces[::2], traces[1::2], strict=True)
              for repeats in ([other], [])]
     assert [describe_verdict(f) for f in found if not at_floor(f)] == []
@@ -85,14 +85,14 @@ def test_the_model_with_the_fault_is_at_the_floor(fault: str) -> None:
 
 
 def test_another_firmware_is_the_controllers_fault_alone() -> None:
-    found = compare(recorded({"controller.proportional_gain": 4.2}), MODEL)
+    found = compare(record_plant({"controller.proportional_gain": 4.2}), MODEL)
     assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("controller",)
     assert found.scatter is None and "the output of the controller differs" in describe_verdict(found)
     assert found.answer.gain == pytest.approx(4.2, rel=1e-6)
 
 
 def test_a_sensors_gain_and_a_valves_cannot_be_told_apart() -> None:
-    found = compare(recorded(sensor=lambda x: 1.02 * x), MODEL)
+    found = compare(record_plant(sensor=lambda x: 1.02 * x), MODEL)
     assert set(found.named) == {"jack", "sensor"} and "the jack or the sensor disagree" in describe_verdict(found)
     assert found.parts["gain"] == pytest.approx(0.02, abs=0.002)
 
@@ -100,7 +100,7 @@ def test_a_sensors_gain_and_a_valves_cannot_be_told_apart() -> None:
 def test_scatter_from_unit_to_unit_is_offered_as_a_reason() -> None:
     """1.5 % in a few parameters is no missing physics; an effect is not explained that way."""
     unit = {"valve.flow_gain": 0.3 * 1.02, "torque_motor.gain": 2.27 * 0.99, "jack.damping": 2000.0 * 1.02}
-    found = compare(recorded(unit), MODEL)
+    found = compare(record_plant(unit), MODEL)
     assert found.verdict == "MODEL_INCOMPLETE" and found.scatter is not None and found.scatter.enough
     assert found.scatter.moved["valve.flow_gain"] == pytest.approx(0.02 / 0.015, abs=0.4)
     other = compare(faulty("servovalve: spool friction"), MODEL)
@@ -119,10 +119,10 @@ def test_fewer_signals_give_fewer_blocks(kept: tuple[str, ...], known: set[str])
 
 def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
     silent = MODEL.replace({"sensors.position_noise": 0.0})
-    found = compare(healthy(2, "hum"), silent)
+    found = compare(record_healthy(2, "hum"), silent)
     assert found.signals["xj"].floor.lower_bound and found.signals["xj"].floor.source == "data"
     assert found.verdict == "CANNOT_TELL" and "only a lower bound" in describe_verdict(found)
-    assert compare(healthy(2, "hum"), silent, [healthy(3, "hum")]).verdict == "WITHIN_FLOOR"
+    assert compare(record_healthy(2, "hum"), silent, [record_healthy(3, "hum")]).verdict == "WITHIN_FLOOR"
     assert compare(faulty("servovalve: clogged filter"), silent).verdict == "MODEL_INCOMPLETE"
 
 
@@ -134,7 +134,7 @@ def test_a_simulation_without_noise_is_its_own_floor() -> None:
 
 def test_every_other_row_lost_is_no_error() -> None:
     """The current between is guessed, and the floor says how little is known then."""
-    columns = {name: getattr(healthy(2), name)[::2] for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    columns = {name: getattr(record_healthy(2), name)[::2] for name in ("com", "xj", "cor", "p12", "xs", "load")}
     found = compare(Trace.of(columns, 2e-3, {}), MODEL)
     assert found.verdict in ("CANNOT_TELL", "WITHIN_FLOOR") and found.trace.period == 1e-3
     slow = MODEL.replace({"controller.period": 0.002})
@@ -145,14 +145,15 @@ def test_every_other_row_lost_is_no_error() -> None:
 
 def test_rows_lost_at_random_are_no_error() -> None:
     keep = np.random.default_rng(0).random(13_500) > 0.05
-    columns = {name: np.where(keep, getattr(healthy(2), name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
+    trace = record_healthy(2)
+    columns = {name: np.where(keep, trace.column(name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
     found = compare(Trace.of(columns, 1e-3, {}), MODEL)
     assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
 
 
 @pytest.mark.parametrize(("name", "rows"), [("com", 4), ("cor", -3)])
 def test_columns_out_of_step_are_moved(name: str, rows: int) -> None:
-    columns = {n: getattr(healthy(2), n) for n in ("com", "xj", "cor", "p12", "xs")}
+    columns = {n: getattr(record_healthy(2), n) for n in ("com", "xj", "cor", "p12", "xs")}
     columns[name] = np.roll(columns[name], rows)
     found = compare(Trace.of(columns, 1e-3, {}), MODEL)
     assert found.verdict == "WITHIN_FLOOR"
@@ -161,7 +162,7 @@ def test_columns_out_of_step_are_moved(name: str, rows: int) -> None:
 
 
 def test_every_number_has_a_place_in_json_and_words() -> None:
-    found = compare(faulty("sensor: play"), MODEL, [recorded(seed=9, sensor=backlash(60e-6))])
+    found = compare(faulty("sensor: play"), MODEL, [record_plant(seed=9, sensor=make_backlash(60e-6))])
     told = collect_data(found)
     assert {"verdict", "signals", "solver_error", "where", "blocks"} <= set(told)
     assert set(told["signals"]["xj"]) >= {"unit", "error", "floor", "ratio", "closed_loop_error"}

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from noisy_traces import healthy
+from noisy_traces import record_healthy
 
 from fdi.comparison.blocks import compare_controller, find_lags, measure_resolution
 from fdi.estimation.preparation import read_cycles
@@ -18,7 +18,7 @@ MODEL = Model()
 
 @pytest.fixture(scope="module")
 def c() -> Trace:
-    return read_cycles(healthy(), MODEL)[0]
+    return read_cycles(record_healthy(), MODEL)[0]
 
 
 def test_the_same_firmware_agrees_to_the_last_digit(c: Trace) -> None:
@@ -48,8 +48,8 @@ def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
     {"controller.integral_gain": 0.5}, {"command_rate_limit.rate": 0.1}])
 def test_another_firmware_is_told(changes: dict[str, float]) -> None:
     model = MODEL.replace(changes)
-    run = simulate(model, healthy().com, seed=1, steps=20)
-    c = replace(read_cycles(healthy(), MODEL)[0], com=run.com, xj=run.xj, cor=run.cor)
+    run = simulate(model, record_healthy().com, seed=1, steps=20)
+    c = replace(read_cycles(record_healthy(), MODEL)[0], com=run.com, xj=run.xj, cor=run.cor)
     found = compare_controller(c, MODEL)
     assert found.ratio > 100 and (found.com_lag, found.xj_lag) == (0, 0)
     assert compare_controller(c, model).ratio <= 1.0

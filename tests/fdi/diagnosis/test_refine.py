@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from noisy_traces import recorded
+from noisy_traces import record_plant
 
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level, compute_severity, find_ruling_fault, judge_size
@@ -33,7 +33,7 @@ def faulty(kintas: float, fss: float, **more: float) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def off_grid() -> Refinement:
-    return refine_sizes(MODEL, hold_inputs(recorded(faulty(0.17, 45.0))))
+    return refine_sizes(MODEL, hold_inputs(record_plant(faulty(0.17, 45.0))))
 
 
 def test_a_pair_between_the_cells_of_a_grid(off_grid: Refinement) -> None:
@@ -57,7 +57,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
         pytest.skip("needs gcc")
     case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
     run = cases.measure_case(case, "est").trace
-    trace = recorded({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
+    trace = record_plant({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
     found = refine_sizes(MODEL, hold_inputs(trace))
     true = case.effects[0].value
     assert found.is_explained and found.fss.low * 0.98 < true < found.fss.high * 1.02
@@ -69,7 +69,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     ({"constant_load.force": -1e3}, "constant_load.force", -1e3),
     ({"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}, "jack.dynamic_friction", 1000.0)])
 def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], name: str, value: float) -> None:
-    found = refine_sizes(MODEL, hold_inputs(recorded(settings)))
+    found = refine_sizes(MODEL, hold_inputs(record_plant(settings)))
     assert found.is_explained
     assert judge_size(CLOGGING, found.kintas) == judge_size(FRICTION, found.fss) == Level.ACCEPTABLE
     other = found.others[name]
@@ -78,7 +78,7 @@ def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], n
 
 def test_flat_directions_change_no_signal() -> None:
     """Scaled together, they are another plant and the same run; along any one of their parameters the run changes."""
-    problem, free = make_problem(MODEL, hold_inputs(recorded({}))), list_unknowns(MODEL)
+    problem, free = make_problem(MODEL, hold_inputs(record_plant({}))), list_unknowns(MODEL)
     x = make_start(free, 0.2, 20.0)
     flat = find_flat_directions(problem, free, x)
     assert flat.shape == (len(free), 4)
@@ -88,7 +88,7 @@ def test_flat_directions_change_no_signal() -> None:
 
 
 def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refinement) -> None:
-    problem, found = make_problem(MODEL, hold_inputs(recorded({}))), off_grid.fit
+    problem, found = make_problem(MODEL, hold_inputs(record_plant({}))), off_grid.fit
     flat = find_flat_directions(problem, found.free, found.x)
     here = linearise_across(problem, found.free, found.x, found.covariance, flat)
     along = np.abs(np.tensordot(flat.T, here.jacobian, 1)).max()
@@ -100,7 +100,7 @@ def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refinement) -> No
 
 def test_sizes_are_within_what_is_possible() -> None:
     """Also where a lag that no fault explains makes the intervals wide."""
-    sizes = diagnose(recorded({"sensor_lag.time": 3e-3})).sizes
+    sizes = diagnose(record_plant({"sensor_lag.time": 3e-3})).sizes
     for size, most in zip(sizes.values(), (LARGEST_KINTAS, LARGEST_FSS), strict=True):
         assert 0.0 <= size.low <= size.value <= size.high <= most
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effect_files import restored_catalogue
-from noisy_traces import recorded
+from noisy_traces import record_plant
 from scipy.signal import lfilter
 
 from fdi.discovery.fingerprints import compute_firmware_residual, find_firmware_marks, find_quantisation
@@ -176,7 +176,7 @@ def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
 def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None:
     """Of a supply that ripples: a start is within a quarter turn over the test, though the misfit has other lines."""
     ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": hertz, "supply_ripple.phase": 0.4}
-    search = Search(Model(), hold_inputs(recorded(ripple)), [], ["supply_ripple"], 1)
+    search = Search(Model(), hold_inputs(record_plant(ripple)), [], ["supply_ripple"], 1)
     starts = find_tones(search.problem, search.fit_base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10

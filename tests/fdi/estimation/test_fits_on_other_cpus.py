@@ -10,7 +10,7 @@ from typing import Any
 
 import other_cpus
 import pytest
-from noisy_traces import SHORT, recorded
+from noisy_traces import SHORT, record_plant
 
 FRACTION = 0.01  # of the width of the interval
 RELATIVE = 1e-3  # of an error, a noise floor or a ratio, which have no interval
@@ -20,13 +20,13 @@ RELATIVE = 1e-3  # of an error, a noise floor or a ratio, which have no interval
 def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
     """CPU to command to its JSON answer."""
     folder = tmp_path_factory.mktemp("traces")
-    recorded({"null_bias.current": 2e-4}, SHORT, seed=1).write_csv(folder / "biased.csv")
-    recorded({"null_bias.current": 2e-4}, SHORT, seed=2).write_csv(folder / "repeat.csv")
-    recorded({"filter.clogging": 0.3}, SHORT, seed=3).write_csv(folder / "clogged.csv")
-    if other_cpus.AVX2 not in other_cpus.settings():
+    record_plant({"null_bias.current": 2e-4}, SHORT, seed=1).write_csv(folder / "biased.csv")
+    record_plant({"null_bias.current": 2e-4}, SHORT, seed=2).write_csv(folder / "repeat.csv")
+    record_plant({"filter.clogging": 0.3}, SHORT, seed=3).write_csv(folder / "clogged.csv")
+    if other_cpus.AVX2 not in other_cpus.list_cpu_settings():
         pytest.skip("a CPU without AVX2 and FMA: OpenBLAS has the kernels of its own there, and nothing is promised")
     cpus = other_cpus.THIS, other_cpus.AVX2
-    return other_cpus.on_each_cpu("cpu_fit_cases.py", folder, folder=tmp_path_factory.mktemp("cpus"), cpus=cpus)
+    return other_cpus.run_on_each_cpu("cpu_fit_cases.py", folder, folder=tmp_path_factory.mktemp("cpus"), cpus=cpus)
 
 
 def intervals(answer: Any, path: str = "") -> Iterator[tuple[str, dict[str, float]]]:

@@ -37,7 +37,7 @@ def test_either_fault_alone() -> None:
     runs = {"healthy": trace(0.0, 5.0), "Kintas 0.35": trace(0.35, 5.0), "FSS 70 N": trace(0.0, 70.0)}
     for draw in (figures.draw_steps, figures.draw_ramps):
         assert set(runs) <= texts(draw(runs))
-    assert "error [µm]" in texts(figures.draw_ramps(runs, number=1))
+    assert "error [um]" in texts(figures.draw_ramps(runs, number=1))
 
 
 def test_a_trace_in_its_bands() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_run import record
+from synthetic_run import record_run
 
 from fdi.report import drawing, run_figures
 from fdi.report.html import render_html
@@ -28,7 +28,7 @@ from rig.recorder.recover import recover_log
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("run") / "trace.mcap")
+    return record_run(tmp_path_factory.mktemp("run") / "trace.mcap")
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_it_says_what_the_trace_says(page: str) -> None:
     assert text.startswith("FAIL · ") and "1 of 4 checks failed: ramp error" in text
     assert "3 of 4" in text and "13.500 s, 13500 cycles" in text
     for words in ("overshoot of the 5 mm step", "61", "ms", "2.500 – 3.250 s", "mean of com - xj over the slope",
-                  "sensors.position_offset: ramps in", "pre-operational", "error [µm]", "P12 [MPa]", "XS [µm]",
+                  "sensors.position_offset: ramps in", "pre-operational", "error [um]", "P12 [bar]", "XS [um]",
                   "title = 'synthetic'", "p99.9", "0 of 14000"):
         assert words in text, words
 
@@ -154,7 +154,7 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
 
 
 def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
-    record(tmp_path / "aborted.mcap", stop=100)
+    record_run(tmp_path / "aborted.mcap", stop=100)
     (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-50_000])
     recover_log(tmp_path / "cut.mcap", tmp_path / "salvaged.mcap")
     (tmp_path / "short.csv").write_text("t,com,xj,cor\n0,0,,0\n0.001,0,1e-6,0\n0.004,0,1e-6,0\n")

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
-from synthetic_run import record
+from synthetic_run import record_run
 
 from fdi.trace.mcap_log import Log, open_log
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    return open_log(record(tmp_path_factory.mktemp("run") / "trace.mcap"))
+    return open_log(record_run(tmp_path_factory.mktemp("run") / "trace.mcap"))
 
 
 def rewrite(log: Log, path: Path, index_types: IndexType) -> Log:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import ROOT, SHARED
-from synthetic_run import ATTACHMENTS, command, record
+from synthetic_run import ATTACHMENTS, build_command, record_run
 
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Check, Gap, Trace
@@ -22,7 +22,7 @@ KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold",
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("run") / "trace.mcap").parent
+    return record_run(tmp_path_factory.mktemp("run") / "trace.mcap").parent
 
 
 def test_main_phase_of_a_log(run: Path) -> None:
@@ -132,6 +132,13 @@ def test_missing_samples_and_gaps(tmp_path: Path) -> None:
     assert Trace.read(tmp_path / "y.csv").gaps == trace.gaps
 
 
+def test_fields_that_say_nan_are_missing_and_noted(tmp_path: Path) -> None:
+    rows = "0.000,0,1e-6,2e-6,nan\n0.001,0,,3e-6,NaN\n0.002,0,1e-6,0,1e5\n"
+    trace = Trace.read(_csv(tmp_path, "t,com,xj,cor,p12\n" + rows))
+    np.testing.assert_array_equal(np.isnan(trace.p12), [True, True, False])
+    assert trace.notes == ("column p12: 2 fields say nan and count as missing",)
+
+
 def test_jitter_of_the_recorded_time_is_not_a_gap(tmp_path: Path) -> None:
     t = np.arange(5000) * 1e-3 + np.random.default_rng(1).uniform(-2e-4, 2e-4, 5000)
     path = _csv(tmp_path, "t,com,xj,cor\n" + "".join(f"{v:.6f},0,0,0\n" for v in t))
@@ -174,7 +181,7 @@ def test_refusals_of_files(tmp_path: Path) -> None:
 
 
 def test_run_that_ended_in_its_set_up(tmp_path: Path) -> None:
-    path = record(tmp_path / "trace.mcap", stop=100)
+    path = record_run(tmp_path / "trace.mcap", stop=100)
     with pytest.raises(InputError, match="ended in its set-up"):
         Trace.read(path)
     assert len(Trace.read(path, all=True)) == 100
@@ -196,14 +203,14 @@ def test_sections_of_any_command() -> None:
     with_gap = steps.copy()
     with_gap[700:720] = np.nan
     assert [s.kind for s in find_sections(with_gap)] == ["hold", "step", "step", "step"]
-    cover = find_sections(command())
+    cover = find_sections(build_command())
     assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == 13_500
 
 
 def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:
     """As an abort leaves it: main breaks off, clean-up goes back from there."""
     for last in [*range(1, 60), *range(3900, 4100, 7), *range(5950, 6050, 3), *range(9000, 11000, 97)]:
-        cut = command()[:last]
+        cut = build_command()[:last]
         for com in (cut, np.concatenate([cut, np.linspace(cut[-1], 0, 300)]), cut[-15:]):
             cover = find_sections(com)
             assert [s.start for s in cover] == [0, *[s.stop for s in cover][:-1]] and cover[-1].stop == len(com)
@@ -218,7 +225,7 @@ def test_practice_traces_load() -> None:
         assert len(trace) > 5000 and trace.period == 1e-3 and set(trace.signals) >= {"com", "xj", "cor"}
         assert {s.kind for s in trace.sections()} >= {"hold"}
         if path.name != "holdout.csv.gz":
-            np.testing.assert_allclose(trace.com, command(), atol=1e-9)
+            np.testing.assert_allclose(trace.com, build_command(), atol=1e-9)
             assert [s.kind for s in trace.sections()] == KINDS
 
 

@@ -8,7 +8,7 @@ import pytest
 from effect_files import STIFF, restored_catalogue
 from places import SHARED
 from rig_command import Said, rig
-from short_runs import HIDDEN, measured, words
+from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
 from fdi.discovery import model_file
 from fdi.discovery.candidates import Value
@@ -19,14 +19,14 @@ SHARED = SHARED / "practice"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return measured(tmp_path_factory.mktemp("runs"), HIDDEN)
+    return write_measured_runs(tmp_path_factory.mktemp("runs"), HIDDEN)
 
 
 @pytest.fixture(scope="module")
 def added(runs: dict[str, Path]) -> tuple[Said, Path]:
     """The right effect in a new model file; not to be written to."""
     model = runs["est"].with_name("biased.toml")
-    return rig("add", "null_bias", *words(runs), "--json", "--out", model), model
+    return rig("add", "null_bias", *list_trace_arguments(runs), "--json", "--out", model), model
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_the_page_has_the_ledger(added: tuple[Said, Path]) -> None:
 
 def test_such_a_model_simulates_and_lacks_nothing(model: Path, runs: dict[str, Path], tmp_path: Path) -> None:
     assert rig("simulate", "--model", model, "--out", tmp_path / "s.csv", "--quiet").status == 0
-    said = rig("explain", *words(runs), "--model", model, "--json")
+    said = rig("explain", *list_trace_arguments(runs), "--model", model, "--json")
     assert said.status == 0 and said.json["verdict"] == "NOTHING_MISSING"
 
 
@@ -82,7 +82,7 @@ def test_the_ledger_goes_on_and_a_useless_effect_is_said_so(model: Path, added: 
 
 
 def test_without_it_the_error_rises_again(model: Path, runs: dict[str, Path]) -> None:
-    said = rig("remove", "null_bias", *words(runs), "--model", model, "--json")
+    said = rig("remove", "null_bias", *list_trace_arguments(runs), "--model", model, "--json")
     assert said.status == 0, said.err
     before, after = said.json["ledger"][-2:]
     assert after["removed"] and after["effect"] == "null_bias"
@@ -157,7 +157,7 @@ def test_on_traces_of_another_simulator(tmp_path: Path) -> None:
     if not folder.is_dir():
         pytest.skip("the practice traces are not beside this checkout")
     files = {name: folder / f"{name}.csv.gz" for name in ("est", "repeat", "holdout")}
-    said = rig("add", "internal_leakage", *words(files), "--json", "--out", tmp_path / "m.toml")
+    said = rig("add", "internal_leakage", *list_trace_arguments(files), "--json", "--out", tmp_path / "m.toml")
     assert said.status == 0, said.err
     for signal, level in said.json["floor"].items():
         assert said.json["ledger"][1]["holdout"][signal] < 1.15 * level

@@ -105,7 +105,7 @@ BAD = {
                                    "controller.proportional_gain=1"], "controller.proportional_gain"),
     "bad pace": (["run", "--pace", "warp"], "'warp'"),
     "bad seed": (["run", "--seed", "-1"], "whole number from 0"),
-    "seed no number": (["run", "--seed", "x"], "'x'"),
+    "seed no number": (["run", "--seed", "x"], "argument --seed: expected a whole number from 0, not 'x'"),
     "impossible overruns": (["run", "--max-overruns", "2"], "fraction from 0 to 1"),
     "no such model": (["run", "--model", "none.toml"], "none.toml"),
     "no such effects": (["run", "--effects", "none.py"], "none.py"),
@@ -125,6 +125,10 @@ BAD = {
     "no steps": (["simulate", "--steps", "0"], "at least 1"),
     "a law with a slip": (["simulate", "--effects", "slip.py", "--set", "slip.size=1"], "slip.py:8: slip: "),
     "unknown effect": (["effects", "gremlins"], "gremlins"),
+    "misspelt effect": (["effects", "spol_friction"], "did you mean spool_friction?"),
+    "misspelt fault": (["campaign", "--fault", "filter_cloging=0.1"], "did you mean filter_clogging?"),
+    "no such folder": (["fdi", "none/"], "none: expected a readable file or the folder of a run; it does not exist"),
+    "folder without a log": (["fdi", "folder.toml"], "folder.toml: expected the folder of a run; it has no trace.mcap"),
     "effects to nowhere": (["effects", "--out", "none/x.json"], "none/x.json"),
     "doctor to nowhere": (["doctor", "--seconds", "0", "--out", "none/x.json"], "none/x.json"),
     "no such node": (["node", "pilot"], "'pilot'"),
@@ -134,6 +138,7 @@ BAD = {
     "nothing to report": (["report", "none.mcap"], "none.mcap"),
     "nothing to view": (["view", "none.mcap"], "none.mcap"),
     "nothing to export": (["export", "none.mcap", "--out", "x.csv"], "none.mcap"),
+    "no frames to decode": (["import", "trace.csv", "--dbc", "x.dbc"], "a CSV of signals has no frames"),
     "nothing to import": (["import", "none.blf", "--out", "x.mcap"], "none.blf"),
 }
 

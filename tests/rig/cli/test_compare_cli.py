@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from noisy_traces import healthy, recorded
+from noisy_traces import record_healthy, record_plant
 from rig_command import Said, rig
 
 from fdi.trace.csv_table import write_csv
@@ -20,9 +20,9 @@ KEYS = {"verdict", "signals", "solver_error", "where", "blocks"}
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """est, repeat of a healthy plant; fault with spool friction."""
     folder = tmp_path_factory.mktemp("traces")
-    healthy(2).write_csv(folder / "est.csv")
-    healthy(3).write_csv(folder / "repeat.csv")
-    recorded({"spool.static_friction": 30.0, "spool.dynamic_friction": 20.0}).write_csv(folder / "fault.csv")
+    record_healthy(2).write_csv(folder / "est.csv")
+    record_healthy(3).write_csv(folder / "repeat.csv")
+    record_plant({"spool.static_friction": 30.0, "spool.dynamic_friction": 20.0}).write_csv(folder / "fault.csv")
     return folder
 
 
@@ -102,7 +102,7 @@ def test_results_go_where_they_should(folder: Path) -> None:
     (["{}/dead.csv"], "dead.csv: xs: expected a signal that changes"),
 ])
 def test_bad_input_is_one_line(folder: Path, words: list[str], refusal: str) -> None:
-    columns = {name: getattr(healthy(2), name) for name in ("t", "com", "xj", "cor", "xs")}
+    columns = {name: getattr(record_healthy(2), name) for name in ("t", "com", "xj", "cor", "xs")}
     write_csv(folder / "other.csv", columns | {"com": -columns["com"]})
     write_csv(folder / "mm.csv", columns | {"xj": 1e3 * columns["xj"]})
     write_csv(folder / "nocor.csv", {name: x for name, x in columns.items() if name != "cor"})
@@ -133,7 +133,7 @@ def test_a_users_own_effect(folder: Path) -> None:
 
 
 def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
-    short = {name: getattr(healthy(2), name)[:300] for name in ("com", "xj", "cor", "p12", "xs")}
+    short = {name: getattr(record_healthy(2), name)[:300] for name in ("com", "xj", "cor", "p12", "xs")}
     Trace.of(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
     said = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
     assert said.status in (0, 1) and (tmp_path / "short.html").exists(), said.err

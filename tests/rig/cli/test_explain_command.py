@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from effect_files import HEAD, restored_catalogue
 from rig_command import Said, rig
-from short_runs import HIDDEN, command, measured, words
+from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
 
 from fdi.estimation.unknowns import active_effects, all_unknowns, own_unknowns
 from fdi.report import numbers as spoken
@@ -21,18 +21,18 @@ SIGNALS = {"xj", "p12", "xs"}
 
 @pytest.fixture(scope="module")
 def biased(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return measured(tmp_path_factory.mktemp("biased"), HIDDEN)
+    return write_measured_runs(tmp_path_factory.mktemp("biased"), HIDDEN)
 
 
 @pytest.fixture(scope="module")
 def healthy(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return measured(tmp_path_factory.mktemp("healthy"), {})
+    return write_measured_runs(tmp_path_factory.mktemp("healthy"), {})
 
 
 @pytest.fixture(scope="module")
 def found(biased: dict[str, Path]) -> Said:
     """One search; its page is page.html beside the run."""
-    return rig("explain", *words(biased), "--json", "--out", biased["est"].with_name("page.html"))
+    return rig("explain", *list_trace_arguments(biased), "--json", "--out", biased["est"].with_name("page.html"))
 
 
 def test_the_effect_is_named_with_its_evidence(found: Said) -> None:
@@ -74,7 +74,7 @@ def test_the_page_needs_no_network(found: Said, biased: dict[str, Path]) -> None
 
 
 def test_nothing_missing_passes(healthy: dict[str, Path]) -> None:
-    said = rig("explain", *words(healthy))
+    said = rig("explain", *list_trace_arguments(healthy))
     assert said.status == 0 and said.out.startswith("NOTHING_MISSING")
     assert "the residual is noise" in said.out and "not detectable" in said.out and "next" not in said.out
 
@@ -113,7 +113,7 @@ def test_a_users_effect_is_ranked_with_the_others(tmp_path: Path, few_effects: N
 
 
 def csv(folder: Path) -> Path:
-    rows = "\n".join(f"{k / 1000:.3f},{x!r}" for k, x in enumerate(command().tolist()))
+    rows = "\n".join(f"{k / 1000:.3f},{x!r}" for k, x in enumerate(build_command().tolist()))
     (folder / "command.csv").write_text(f"t,com\n{rows}\n")
     return folder / "command.csv"
 

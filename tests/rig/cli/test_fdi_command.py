@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from noisy_traces import SHORT, healthy, recorded
+from noisy_traces import SHORT, record_healthy, record_plant
 from rig_command import Said, rig
 
 from fdi.diagnosis import comparators, optimisers
@@ -27,9 +27,9 @@ KEYS = {"level", "ruling", "events", "precursors", "grid", "refined"}
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """healthy, clogged and stuck on the preflight command; short on another."""
     folder = tmp_path_factory.mktemp("traces")
-    healthy(2).write_csv(folder / "healthy.csv")
-    recorded(CLOGGED).write_csv(folder / "clogged.csv")
-    recorded(STUCK, SHORT).write_csv(folder / "short.csv")
+    record_healthy(2).write_csv(folder / "healthy.csv")
+    record_plant(CLOGGED).write_csv(folder / "clogged.csv")
+    record_plant(STUCK, SHORT).write_csv(folder / "short.csv")
     return folder
 
 
@@ -82,7 +82,7 @@ def test_another_command_is_judged_without_bands(other_command: Diagnosis) -> No
 
 def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: Path) -> None:
     """A null bias moves the response out of the bands of clogging; the fit knows better, and that is said."""
-    recorded({"null_bias.current": 2.4e-4}).write_csv(tmp_path / "biased.csv")
+    record_plant({"null_bias.current": 2.4e-4}).write_csv(tmp_path / "biased.csv")
     said = rig("fdi", tmp_path / "biased.csv", "--out", tmp_path / "biased.html")
     page = (tmp_path / "biased.html").read_text()
     assert said.status == 0 and said.out.startswith("ACCEPTABLE")
@@ -96,7 +96,7 @@ def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: 
 
 def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     """Spool and ram see a lag of the transducer that no fault and no tolerance explains."""
-    found = diagnose(recorded({"sensor_lag.time": 3e-3}, SHORT))
+    found = diagnose(record_plant({"sensor_lag.time": 3e-3}, SHORT))
     assert found.verdict == "SOMETHING_ELSE" and not found.is_acceptable and found.ruling is None
     assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
     assert "Something else is wrong" in describe_verdict(found)
@@ -134,7 +134,7 @@ def test_a_trace_without_position_or_current_is_refused(folder: Path, tmp_path: 
 
 
 def test_a_ram_at_rest_is_refused(tmp_path: Path) -> None:
-    recorded({}, np.zeros(400)).write_csv(tmp_path / "rest.csv")
+    record_plant({}, np.zeros(400)).write_csv(tmp_path / "rest.csv")
     said = rig("fdi", tmp_path / "rest.csv")
     assert said.status == 2 and "moves" in said.err and len(said.err.splitlines()) == 1
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from rig_command import rig
-from synthetic_run import record
+from synthetic_run import record_run
 
 from rig.recorder.convert import RAW_SUFFIXES
 
@@ -30,7 +30,7 @@ COMMANDS = {  # name -> words, of what suffix the result is
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("sources")
-    files = {"log": record(folder / "trace.mcap", stop=400), "csv": folder / "x.csv", "can": folder / "x.log",
+    files = {"log": record_run(folder / "trace.mcap", stop=400), "csv": folder / "x.csv", "can": folder / "x.log",
              "command": folder / "command.csv"}
     files["csv"].write_text(HEAD + "0,0,0,0\n0.001,0,0,0\n")
     files["can"].write_text("(0.000000) can0 080#\n(0.001000) can0 080#\n")

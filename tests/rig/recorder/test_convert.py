@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_run import record
+from synthetic_run import record_run
 
 import dbc
 from fdi.trace.trace import Trace
@@ -22,7 +22,7 @@ from rig.recorder.convert import RAW_SUFFIXES, export_trace, import_csv, import_
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1300)
+    return record_run(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1300)
 
 
 @pytest.mark.parametrize("suffix", RAW_SUFFIXES)

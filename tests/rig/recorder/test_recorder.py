@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from synthetic_run import ATTACHMENTS, METADATA, cycles, record
+from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
 from rig.network.frame import Frame
 from rig.recorder import U32, CanFrame, Check, Event, NmtState, Recorder, RecorderError, Signals, Timing
@@ -27,7 +27,7 @@ VALUES: dict[Any, st.SearchStrategy[Any]] = {
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
+    return record_run(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
 
 
 @pytest.mark.parametrize("kind", TOPICS.values(), ids=lambda kind: kind.__name__)
@@ -62,7 +62,7 @@ def test_library_reads_a_complete_log(log: Path) -> None:
     assert {c.topic: c.metadata for c in summary.channels.values()}["/signals"]["unit.p12"] == "Pa"
     assert names == {name: data for name, (_, data) in ATTACHMENTS.items()}
     assert metadata == {"run": METADATA, "verdict": {"status": "ABORTED"}}
-    written = [(t, f, s) for t, f, s, _ in cycles() if s.cycle < 1000]
+    written = [(t, f, s) for t, f, s, _ in build_cycles() if s.cycle < 1000]
     assert [(t, d.cycle, d.xj, d.p12) for topic, t, d in rows if topic == "/signals"] == \
         [(t, s.cycle, s.xj, s.p12) for t, _, s in written]
     assert [(t, d.cob_id, d.data) for topic, t, d in rows if topic == "/can"] == \

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from places import ROOT, SUPPORT
-from synthetic_run import ATTACHMENTS, METADATA, record
+from synthetic_run import ATTACHMENTS, METADATA, record_run
 
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -62,7 +62,7 @@ def test_kill_9_in_mid_run_loses_at_most_half_a_second(tmp_path: Path, capsys: p
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
+    return record_run(tmp_path_factory.mktemp("log") / "trace.mcap", stop=1000)
 
 
 def test_every_cut_gives_a_readable_log_or_a_clear_refusal(whole: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_run import record
+from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
 from rig.view import rerun_log, viewer
@@ -62,7 +62,7 @@ def rows(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> dict[str, li
 
 def test_recording_holds_every_line(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
     drawn = {"/position/command": trace.com * 1e3, "/position/ram": trace.xj * 1e3, "/current/current": trace.cor * 1e3,
-             "/error/error": (trace.com - trace.xj) * 1e6, "/pressure/pressure": trace.p12 / 1e6,
+             "/error/error": (trace.com - trace.xj) * 1e6, "/pressure/pressure": trace.p12 / 1e5,
              "/spool/spool": trace.xs * 1e6, "/timing/response": trace.timing.response * 1e6,
              "/timing/work": trace.timing.work * 1e6}
     for entity, values in drawn.items():
@@ -77,7 +77,7 @@ def test_recording_holds_every_limit(rows: dict[str, list[tuple[float, object]]]
             for entity, values in limits.items()} == {
         "/error/limit_13_high": [(13.2, 29.0), (13.5, 29.0)], "/error/limit_13_low": [(13.2, -29.0), (13.5, -29.0)],
         "/position/limit_14_high": [(0.0, 6.0), (13.5, 6.0)], "/position/limit_14_low": [(0.0, -6.0), (13.5, -6.0)],
-        "/pressure/limit_15_high": [(0.0, 4.0), (13.5, 4.0)], "/pressure/limit_15_low": [(0.0, -4.0), (13.5, -4.0)]}
+        "/pressure/limit_15_high": [(0.0, 40.0), (13.5, 40.0)], "/pressure/limit_15_low": [(0.0, -40.0), (13.5, -40.0)]}
 
 
 def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
@@ -149,7 +149,7 @@ def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monke
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
+    return record_run(tmp_path_factory.mktemp("run") / "trace.mcap", stop=1000).parent
 
 
 def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,83 @@
+"""Docstrings and comments name only what exists: a name in backticks is defined in the project or used in that file."""
+from __future__ import annotations
+
+import ast
+import builtins
+import io
+import keyword
+import re
+import sys
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FILES = sorted(path for package in ("plant", "fdi", "rig", "dbc") for path in (ROOT / package).rglob("*.py"))
+TREES = {path: ast.parse(path.read_text()) for path in FILES}
+NAME = re.compile(r"`([A-Za-z_][\w.]*)(?:\([^`]*\))?`")
+# names of other programs, which this code neither defines nor uses
+LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "can", "canopen", "mcap", "numba"}
+FOREIGN = {*LIBRARIES, "resid", "array_split", "udp_multicast", "_asdict"}
+
+
+def list_definitions(tree: ast.Module) -> Iterator[str]:
+    """Functions and classes, and the names that a module or a class assigns."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+    for scope in ast.walk(tree):
+        if isinstance(scope, ast.Module | ast.ClassDef):
+            for statement in scope.body:
+                if isinstance(statement, ast.Assign | ast.AnnAssign):
+                    yield from (part.id for part in ast.walk(statement)
+                                if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
+
+
+DEFINED = {*dir(builtins), *keyword.kwlist, *(name for tree in TREES.values() for name in list_definitions(tree)),
+           *(part for path in FILES for part in path.relative_to(ROOT).with_suffix("").parts)}
+
+
+def find_docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module) and ast.get_docstring(node) is not None:
+            first = node.body[0]
+            assert isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+            yield first.value
+
+
+def list_words(tree: ast.Module) -> Iterator[str]:
+    """Names that the code of a file uses, and the words of its texts, which may be keys of files and messages."""
+    docstrings = set(find_docstrings(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            yield node.id
+        elif isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, ast.arg | ast.keyword) and node.arg:
+            yield node.arg
+        elif isinstance(node, ast.alias):
+            yield from (node.asname or node.name).split(".")
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in docstrings:
+            yield from re.split(r"\W+", node.value)
+
+
+def find_unknown_names(source: str) -> list[str]:
+    """Names in backticks in the docstrings and comments of a file that nothing defines or uses."""
+    tree = ast.parse(source)
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    texts = [str(node.value) for node in find_docstrings(tree)]
+    texts += [token.string for token in tokens if token.type == tokenize.COMMENT]
+    known = DEFINED | FOREIGN | set(list_words(tree))
+    return [name for text in texts for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_names_in_backticks_exist(path: Path) -> None:
+    assert find_unknown_names(path.read_text()) == []
+
+
+def test_a_name_of_nothing_is_found() -> None:
+    text = '"""As `starts_of` does; see `plant.run.simulate` and `own`."""\n# `no_such_name(x)`\nown = 1\n'
+    assert find_unknown_names(text) == ["starts_of", "no_such_name"]
