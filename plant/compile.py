@@ -133,7 +133,8 @@ def list_compilations() -> Iterator[list[str]]:
         def on_start(self, event: Any) -> None:
             entries.append(str(event.data))
 
-        def on_end(self, event: Any) -> None: ...
+        def on_end(self, event: Any) -> None:
+            """The end says nothing that the start did not."""
 
     with numba.core.event.install_listener("numba:compiler_lock", Listener()):
         yield entries
