@@ -63,7 +63,13 @@ def _list_facts(trace: Trace) -> list[tuple[str, str]]:
         facts += [(name, f"{sum(check.passed for check in checks)} of {len(checks)}") for name, checks in (
             ("checks passed", trace.sequence_checks), ("protocol checks passed", trace.protocol_checks)) if checks]
     named = ((name, trace.provenance.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host"))
-    return [*facts, *((name, text) for name, text in named if text)]
+    facts += [(name, text) for name, text in named if text]
+    kind = trace.provenance.get("timing.kind", "")
+    return [*facts, ("timing", f"{kind}: {_KINDS_OF_TIMING[kind]}")] if kind in _KINDS_OF_TIMING else facts
+
+
+_KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
+                    "soft real time": "the rig's cycle ran in Python, on a bus that compiled code cannot use"}
 
 
 def _list_notes(trace: Trace) -> list[str]:

@@ -59,6 +59,10 @@ class Loop(Protocol):
         """Due times missed, and cycles late by more than half a period."""
 
     @property
+    def underruns(self) -> int:
+        """Cycles for which no input was given in time; they repeat the last one, and count as overruns."""
+
+    @property
     def scheduler(self) -> str:
         """How the kernel schedules the thread of the cycle; empty before it has run."""
 
@@ -88,6 +92,7 @@ class CycleLoop:
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
+    underruns = 0  # it waits for its inputs
 
     def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire

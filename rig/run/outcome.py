@@ -14,6 +14,7 @@ from fdi.report.json import to_plain
 from plant.segments import Array
 from rig.run.history import History
 from rig.run.job import Job
+from rig.run.loop import Loop
 from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
 
@@ -80,9 +81,14 @@ class Outcome:
         write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
 
 
-def summarise_timing(history: History, overruns: int, scheduler: str) -> dict[str, Any]:
-    """Percentiles of lateness and response in us, as `rig run --json` gives them."""
-    return {"cycles": len(history), "overruns": overruns, "scheduler": scheduler,
+def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str) -> dict[str, Any]:
+    """Percentiles of lateness, response and execution in us, as `rig run --json` gives them.
+
+    `kind`: "lockstep", "hard real time" (the cycle is compiled code) or "soft real time" (the cycle is Python).
+    """
+    return {"kind": kind, "cycles": len(history), "overruns": loop.overruns, "underruns": loop.underruns,
+            "scheduler": scheduler,
+            "execution_us": _compute_percentiles(history.column("execution")),
             "lateness_us": _compute_percentiles(history.column("lateness")),
             "response_us": _compute_percentiles(history.column("response"))}
 

@@ -54,13 +54,15 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
             scheduled = session.loop.scheduler or scheduled
         spent = stopwatch.now() * 1e-9
         loop = session.loop
+        kind = f"{loop.kind} real time" if job.realtime else "lockstep"
+        recorder.metadata("timing", {"kind": kind})
         history = session.history
         checks = judge_run(job, session)
         for check in checks:
             recorder.put(session.now(), _make_check_record(check))
         outcome = Outcome(
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-            interrupted=session.interrupted, timing=summarise_timing(history, loop.overruns, scheduled),
+            interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind),
             counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent)
         recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
                                       "overruns": str(loop.overruns)})

@@ -101,7 +101,7 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     if outcome.job.realtime:
         late = timing["lateness_us"]
         text = (f"{timing['cycles']} cycles, {timing['overruns']} overruns; lateness p50 {late['p50']:g}, "
-                f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['scheduler']})")
+                f"p99 {late['p99']:g}, max {late['max']:g} us ({timing['kind']}, {timing['scheduler']})")
     else:
         text = f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time"
     lines = [Line("timing", text)]
