@@ -230,7 +230,7 @@ class HardLoop:
         self._thread.start()
 
     def _run_thread(self) -> None:
-        with enter_loop_thread() as self.scheduler:
+        with enter_loop_thread(from_last=1) as self.scheduler:
             self._status = self._play(self._bus.port, self._buffers)
 
     def _is_running(self) -> bool:

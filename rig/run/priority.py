@@ -32,17 +32,21 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def enter_loop_thread() -> Iterator[str]:
-    """Give the calling thread the loop's priority and, where there are two CPUs or more, the last one for itself.
+def enter_loop_thread(from_last: int = 2) -> Iterator[str]:
+    """Give the calling thread the loop's priority and, where there are two CPUs or more, one of them for itself.
 
-    The process's other threads get the other CPUs until the end. Yields the name of the scheduler that was granted.
+    The process's other threads get the other CPUs until the end. `from_last`: 1 is the last CPU, which the rig takes; 2
+    the one before, for a node on the same machine. Yields the name of the scheduler that was granted.
     """
     _set_fifo(0, LOOP_PRIORITY)
     cpus = list_cpus()
     others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
-    moved = [thread for thread in others if thread is not None and len(cpus) > 1 and _set_cpus(thread, cpus[:-1])]
+    moved = []
     if len(cpus) > 1:
-        _set_cpus(0, cpus[-1:])
+        own = cpus[-min(from_last, len(cpus))]
+        rest = [cpu for cpu in cpus if cpu != own]
+        moved = [thread for thread in others if thread is not None and _set_cpus(thread, rest)]
+        _set_cpus(0, [own])
     try:
         yield name_scheduler()
     finally:

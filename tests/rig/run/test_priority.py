@@ -5,10 +5,20 @@ import gc
 import os
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
-from rig.run.priority import LOOP_PRIORITY, SWITCH_INTERVAL, name_scheduler, raise_priority, suspend_garbage_collection
+from rig.run.priority import (
+    LOOP_PRIORITY,
+    SWITCH_INTERVAL,
+    enter_loop_thread,
+    list_cpus,
+    lock_memory,
+    name_scheduler,
+    raise_priority,
+    suspend_garbage_collection,
+)
 
 
 def allowed() -> bool:
@@ -34,6 +44,39 @@ def test_all_threads_are_raised_and_lowered() -> None:
     finally:
         done.set()
         helper.join()
+
+
+@pytest.mark.skipif(len(list_cpus()) < 2, reason="one CPU is not divided")
+@pytest.mark.parametrize("from_last", [1, 2])
+def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
+    cpus, seen, entered, done = list_cpus(), [], threading.Event(), threading.Event()
+
+    def run() -> None:
+        with enter_loop_thread(from_last):
+            seen.extend(list_cpus())
+            entered.set()
+            done.wait()
+
+    loop = threading.Thread(target=run)
+    loop.start()
+    try:
+        assert entered.wait(10)
+        assert seen == [cpus[-from_last]] and list_cpus() == [cpu for cpu in cpus if cpu not in seen]
+    finally:
+        done.set()
+        loop.join()
+    assert list_cpus() == cpus
+
+
+def test_memory_is_locked_and_unlocked() -> None:
+    with lock_memory() as is_locked:
+        assert (read_locked_kilobytes() > 0) == is_locked
+    assert read_locked_kilobytes() == 0
+
+
+def read_locked_kilobytes() -> int:
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmLck:")[2].split()[0])
 
 
 def test_without_the_right_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
