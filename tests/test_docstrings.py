@@ -19,7 +19,7 @@ TREES = {path: ast.parse(path.read_text()) for path in FILES}
 NAME = re.compile(r"`([A-Za-z_][\w.]*)(?:\([^`]*\))?`")
 # names of other programs, which this code neither defines nor uses
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "scipy", "can", "canopen", "mcap", "numba"}
-FOREIGN = {*LIBRARIES, "resid", "array_split", "udp_multicast", "_asdict"}
+FOREIGN = {*LIBRARIES, "resid", "array_split", "udp_multicast", "_asdict", "ro", "wo"}  # the last two: EDS
 
 
 def list_definitions(tree: ast.Module) -> Iterator[str]:
