@@ -1,0 +1,127 @@
+/* The reference firmware with a fault, to see that the bench notices:
+ *
+ *     faulty FAULT BUS [--parent PID]
+ *
+ * The faults change frames and memory around a sound controller, as a careless programmer would have from within.
+ */
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "bytes.h"
+#include "controller.h"
+#include "serve.h"
+
+enum { COMMAND = 0x202, DRIVE = 0x182, HEARTBEAT = 0x702, ACTIVE = 0x7 };
+enum { CURRENT = 0, STATUS = 4, CYCLE = 6 }; /* bytes in the drive frame */
+
+static struct controller controller;
+static const char *fault;
+static uint8_t previous[8]; /* drive frame */
+static unsigned drives;     /* sent, that is: computed */
+static int64_t now_ns, start_ns;
+static struct frame start;
+
+static bool has(const char *name)
+{
+    return strcmp(fault, name) == 0;
+}
+
+static int32_t current_of(const uint8_t *drive)
+{
+    return (int32_t)(uint32_t)read_bytes(drive + CURRENT, 4);
+}
+
+static void set_current(uint8_t *drive, double counts)
+{
+    write_bytes(drive + CURRENT, (uint32_t)(int32_t)counts, 4);
+}
+
+/* Change a drive frame as the fault does; false: it is not sent. */
+static bool spoil_drive(uint8_t *drive)
+{
+    uint8_t sound[8];
+    const bool is_active = current_of(drive) != 0;
+    memcpy(sound, drive, 8);
+    drives++;
+    if (has("late_frame"))
+        memcpy(drive, previous, 8);
+    else if (has("late_current"))
+        memcpy(drive + CURRENT, previous + CURRENT, 4);
+    else if (has("stale_cycle"))
+        write_bytes(drive + CYCLE, read_bytes(drive + CYCLE, 2) - 1, 2);
+    else if (has("frozen_output") && is_active && drives > 150)
+        set_current(drive, 20000);
+    else if (has("sign_error"))
+        set_current(drive, -current_of(drive));
+    else if (has("gain_high"))
+        set_current(drive, 1.3 * current_of(drive));
+    else if (has("gain_low"))
+        set_current(drive, 0.7 * current_of(drive));
+    else if (has("wrong_status"))
+        write_bytes(drive + STATUS, 0xF, 2);
+    else if (has("missing_ready"))
+        write_bytes(drive + STATUS, read_bytes(drive + STATUS, 2) & ACTIVE, 2);
+    else if (has("nan_current") && is_active && drives > 150)
+        set_current(drive, INT32_MIN); /* what a conversion of NaN gives on x86 */
+    else if (has("saturated_current") && is_active && drives > 150)
+        set_current(drive, INT32_MAX);
+    memcpy(previous, sound, 8);
+    return !(has("missed_cycles") && drives % 50 == 0);
+}
+
+static void send_spoiled(void *context, uint16_t cob_id, const uint8_t *data, uint8_t length)
+{
+    uint8_t spoiled[8] = {0};
+    memcpy(spoiled, data, length);
+    if (cob_id == DRIVE && length == 8 && !spoil_drive(spoiled))
+        return;
+    if (cob_id == HEARTBEAT && has("no_heartbeat") && data[0] != NMT_INITIALISING)
+        return;
+    BUS_OUTPUT.send(context, cob_id, spoiled, length);
+}
+
+static void receive(void *context, const struct frame *frame)
+{
+    struct frame seen = *frame;
+    (void)context;
+    if (has("ignores_control") && frame->cob_id == COMMAND && frame->length == 8)
+        write_bytes(seen.data + 4, ACTIVE, 2);
+    if (has("slow_start") && frame->cob_id == 0 && frame->data[0] == NMT_START && start_ns == 0) {
+        start = *frame;
+        start_ns = now_ns + INT64_C(3000000000);
+        return;
+    }
+    const struct control_law before = controller.law;
+    controller_receive(&controller, &seen);
+    if (has("leaks_state") && controller.law.integral == 0.0) /* a reset and an open loop must clear it */
+        controller.law.integral = before.integral;
+}
+
+static void tick(void *context, int64_t t_ns)
+{
+    (void)context;
+    now_ns = t_ns;
+    if (start_ns != 0 && t_ns >= start_ns) {
+        start.t_ns = t_ns;
+        controller_receive(&controller, &start);
+        start_ns = 0;
+    }
+    controller_tick(&controller, t_ns);
+}
+
+int main(int count, char **words)
+{
+    const bool has_parent = count == 5 && strcmp(words[3], "--parent") == 0;
+    if (count != 3 && !has_parent)
+        return 2;
+    fault = words[1];
+    const struct output output = {send_spoiled, NULL};
+    if (!controller_init(&controller, output))
+        return 2;
+    if (has("leaks_state") || has("integral")) { /* with an integral part there is something to leak */
+        const double gain = 20.0;
+        memcpy(&controller.values[OBJECT_2110_02], &gain, sizeof gain);
+    }
+    return serve_node((struct node){NULL, receive, tick}, words[2], has_parent ? atol(words[4]) : 0);
+}
