@@ -54,7 +54,7 @@ def check_lengths(t: Target) -> str:
     return f"{count} values"
 
 
-@case("2.3", "constants", "7.4.7, 7.5.2.21", "const objects, device type and identity hold the values of the EDS")
+@case("2.3", "constants", "7.4, 7.5.2.21", "const objects, device type and identity hold the values of the EDS")
 def check_constants(t: Target) -> str:
     """What cannot change is as the EDS says. The serial number is the device's own."""
     problems, count = [], 0
@@ -89,7 +89,7 @@ def check_defaults(t: Target) -> str:
     return f"{count} objects"
 
 
-@case("2.5", "values within their limits", "7.4.7", "each value lies between LowLimit and HighLimit of the EDS")
+@case("2.5", "values within their limits", "7.4", "each value lies between LowLimit and HighLimit of the EDS")
 def check_values_in_range(t: Target) -> str:
     """The limits of the EDS hold for what is read."""
     problems, count = [], 0
@@ -108,7 +108,7 @@ def check_values_in_range(t: Target) -> str:
     return f"{count} values"
 
 
-@case("2.6", "sub 0 of arrays and records", "7.4.3", "sub 0 holds the highest sub-index of the EDS")
+@case("2.6", "sub 0 of arrays and records", "7.4", "sub 0 holds the highest sub-index of the EDS")
 def check_highest_sub(t: Target) -> str:
     """Not for the error history and mappings, whose sub 0 counts."""
     problems, count = [], 0
@@ -126,7 +126,7 @@ def check_highest_sub(t: Target) -> str:
 
 @case("2.7", "unknown object", "7.2.4.3.17, table 22", "upload and download are refused with 0x06020000")
 def check_unknown_object(t: Target) -> str:
-    """In each area of the dictionary an index that the EDS does not have."""
+    """An index that the EDS does not have, in each area of the dictionary."""
     areas = (range(0x1002, 0x1200), range(0x1F00, 0x2000), range(0x2000, 0x6000), range(0x6000, 0xA000),
              range(0xFFFF, 0x10000))
     tried, problems = [], []

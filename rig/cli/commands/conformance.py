@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rig.network.wire import Wire
 
-OWN_NODES = {"controller": 2, "plant": 3}
+OWN_NODES = {"controller": 2, "plant": 3, "c": 2}  # c: the controller in C, rig/firmware
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig conformance`."""
     add = parser.add_argument
     add("node", metavar="NODE",
-        help="node-ID of a node on the bus, 1 to 127; or plant, controller: our own, started by this command")
+        help="node-ID of a node on the bus, 1 to 127; or plant, controller or c (the controller in C): our own, "
+             "started by this command")
     add("--bus", default="auto", metavar="INTERFACE:CHANNEL",
         help="for example socketcan:can0 or udp_multicast; our own nodes also run on the embedded bus (default)")
     add("--eds", type=Path, metavar="FILE", help="electronic data sheet of the node (our own nodes have theirs)")
@@ -90,7 +91,7 @@ def parse_node(text: str) -> int:
         return OWN_NODES[text]
     if text.isdigit() and 1 <= int(text) <= 127:
         return int(text)
-    raise InputError("NODE", text, f"a node-ID from 1 to 127, {' or '.join(OWN_NODES)}")
+    raise InputError("NODE", text, "a node-ID from 1 to 127, controller, plant or c")
 
 
 def choose_data_sheet(args: argparse.Namespace) -> Path:
@@ -125,7 +126,7 @@ def open_wire(node: str, bus: str) -> Iterator[Wire]:
     from rig.run.participants import EMBEDDED_NAMES
 
     if bus.partition(":")[0] in EMBEDDED_NAMES:
-        if node not in OWN_NODES:
+        if node not in ("plant", "controller"):
             raise InputError("--bus", bus, "a bus that the node is on, such as socketcan:can0")
         from rig.nodes.emulator import Emulator
         from rig.nodes.firmware import Firmware
@@ -146,6 +147,7 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
     """Start our own node in a process that ends with this one. A node that is there already is tested as it is.
 
     Raises:
+        InputError: the controller in C on a bus that it has no port for, or without a C compiler.
         RigError: it does not boot.
     """
     import os
@@ -153,6 +155,8 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
     import sys
 
     from plant.errors import RigError
+    from rig.firmware.build import build_controller
+    from rig.run.participants import require_firmware_bus
 
     if name not in OWN_NODES:
         yield
@@ -164,8 +168,12 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
     if wire.wait(lambda: boot_up in booted, 0.7):
         yield
         return
-    command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", bus, "--quiet", "--parent",
-               str(os.getpid())]
+    if name == "c":
+        require_firmware_bus(bus)
+        command = [str(build_controller()), bus, "--parent", str(os.getpid())]
+    else:
+        command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", bus, "--quiet", "--parent",
+                   str(os.getpid())]
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
         for _ in range(60):  # s: it may have to compile the plant first

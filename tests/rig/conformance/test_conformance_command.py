@@ -2,21 +2,28 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from broken_devices import examine, nothing
 from bus_stations import spec
+from c_device import CFirmware, skip_without_compiler
 from rig_command import gone, rig, started
 
 from dbc import EDS
 from rig.conformance.case import CHAPTERS, Result, Verdict
 from rig.conformance.data_sheet import DataSheet
 from rig.conformance.report import Subject, write_junit
-from rig.conformance.runner import CASES, Outcome
+from rig.conformance.runner import CASES, Outcome, run_cases
+from rig.conformance.target import Options, Target
+from rig.network.clock import VirtualClock
+from rig.network.wire import EmbeddedWire
 
-NOT_FOR_OUR_NODES = {"plant": {"4.5", "4.13", "4.17", "5.14", "6.12"},
-                     "controller": {"2.10", "4.5", "4.13", "4.17", "5.14"}}
+ROOT = Path(__file__).parents[3]
+_CONTROLLER = {"2.10", "4.5", "4.13", "4.17", "5.14"}
+NOT_FOR_OUR_NODES = {"plant": {"4.5", "4.13", "4.17", "5.14", "6.12"}, "controller": _CONTROLLER, "c": _CONTROLLER}
 own_nodes = pytest.mark.parametrize("node", ["plant", "controller"])
 
 
@@ -40,7 +47,8 @@ def test_our_nodes_pass_on_the_embedded_bus(node: str) -> None:
 
 
 def test_our_nodes_pass_as_processes_on_udp() -> None:
-    """Both at once, each on its own bus; wide limits, for the machine may be busy. Nothing is left behind."""
+    """All at once, each on its own bus; wide limits, for the machine may be busy. Nothing is left behind."""
+    skip_without_compiler()
     buses = {node: spec("udp_multicast") for node in NOT_FOR_OUR_NODES}
     running = {node: started("conformance", node, "--bus", bus, "--json", "--timeout", 5, "--tolerance", 2000)
                for node, bus in buses.items()}
@@ -52,6 +60,21 @@ def test_our_nodes_pass_as_processes_on_udp() -> None:
         assert {test["number"] for test in answer["tests"] if test["verdict"] == "not applicable"} == NOT_FOR_OUR_NODES[
             node]
         assert gone(buses[node])
+
+
+def test_the_firmware_in_c_passes_in_this_process() -> None:
+    skip_without_compiler()
+    target = Target(EmbeddedWire(VirtualClock(), [CFirmware]), DataSheet(EDS[2], 2), Options(may_write=True))
+    outcome = run_cases(target)
+    assert [(each.number, each.measured) for each in outcome.results if each.verdict is Verdict.FAIL] == []
+    assert {each.number for each in outcome.results if each.verdict is Verdict.NOT_APPLICABLE} == _CONTROLLER
+    assert (outcome.verdict, outcome.notes) == ("PASS", [])
+
+
+def test_the_manual_lists_every_test() -> None:
+    page = (ROOT / "docs" / "conformance.md").read_text()
+    listed = re.findall(r"^\| (\d+\.\d+) \| ([^|]+) \|", page, re.MULTILINE)
+    assert listed == [(each.number, each.name) for each in CASES]
 
 
 def test_files(tmp_path: Path) -> None:
@@ -104,7 +127,7 @@ def test_times_that_could_not_be_measured_make_the_timing_invalid() -> None:
 
 
 @pytest.mark.parametrize(("words", "line"), [
-    (["128"], "rig conformance: NODE: 128: expected a node-ID from 1 to 127, controller or plant"),
+    (["128"], "rig conformance: NODE: 128: expected a node-ID from 1 to 127, controller, plant or c"),
     (["firmware"], "rig conformance: NODE: firmware: expected a node-ID"),
     (["5"], "--eds: expected the electronic data sheet of node 5"),
     (["5", "--eds", EDS[2]], "--bus: embedded: expected a bus that the node is on"),
@@ -128,10 +151,6 @@ def test_a_node_that_is_not_there() -> None:
 
 def test_a_foreign_node_is_not_written_to() -> None:
     """Without --write no value of a manufacturer object changes: the cases that need it are skipped."""
-    from broken_devices import examine, nothing
-
-    from rig.conformance.target import Options
-
     outcome = examine(nothing, 2, options=Options(may_write=False))
     skipped = [result.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
     assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["4.15", "6.12"], [])
