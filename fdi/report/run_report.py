@@ -194,7 +194,7 @@ def _show_timing(trace: Trace) -> list[Item]:
 
 
 def _tabulate_events(events: tuple[Event, ...], most: int = 12) -> list[Item]:
-    """All events on the page; warnings and errors on the terminal, at most `most`."""
+    """The first 2000 events on the page; warnings and errors on the terminal, at most `most`."""
     columns = [Column("t", "s", "right"), Column("level", medium=Medium.PAGE), Column("kind"), Column("event")]
 
     def tabulate(chosen: list[Event]) -> list[list[Cell | str]]:
@@ -203,7 +203,9 @@ def _tabulate_events(events: tuple[Event, ...], most: int = 12) -> list[Item]:
 
     items: list[Item] = []
     if events:
-        items.append(Table(columns, tabulate(list(events)), medium=Medium.PAGE))
+        shown = list(events[:2000])  # a node can send a thousand emergencies a second
+        rest = f"The first {len(shown)} of {len(events)} events." if len(shown) < len(events) else ""
+        items.append(Table(columns, tabulate(shown), rest, medium=Medium.PAGE))
     notable = [event for event in events if event.level != "INFO"]
     if notable:
         items.append(Table(columns, tabulate(notable), terminal_rows=most, medium=Medium.TERMINAL))

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,15 +71,27 @@ class Outcome:
 
     def to_json(self) -> dict[str, Any]:
         """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
+        events, omitted = select_events(self.events)
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [to_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
-                "events": [to_plain(event._asdict()) for event in self.events],
+                "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
                 "run": self.job.settings(), "fdi": self.fdi}
 
     def save(self) -> None:
         """Write verdict.json."""
         write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
+
+
+def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list[SessionEvent], dict[str, int]]:
+    """The first `most` events of each kind, in order, and how many of each kind are omitted; the log has them all."""
+    seen: Counter[str] = Counter()
+    selected = []
+    for event in events:
+        seen[event.kind] += 1
+        if seen[event.kind] <= most:
+            selected.append(event)
+    return selected, {kind: count - most for kind, count in seen.items() if count > most}
 
 
 def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str) -> dict[str, Any]:

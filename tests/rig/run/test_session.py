@@ -1,24 +1,27 @@
 """The sequencer: phases in order, clean-up always, no current in the safe state, and what is told on the way."""
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from short_sequences import SHORT, job, kinds, play, stop_after
 
 from fdi.progress import ignore_progress
+from fdi.report.run_report import write_run_page
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
 from rig.network.clock import VirtualClock
-from rig.network.frame import Frame
+from rig.network.frame import Frame, Send
 from rig.network.wire import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError
-from rig.run import runner
+from rig.run import participants, runner
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 
@@ -236,3 +239,29 @@ def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
     sequence = parse_sequence(text, "x.toml", lambda name: f"t,value\n{rows}\n".encode())
     with pytest.raises(InputError, match="KiB compressed"):
         play(replace(job(), sequence=sequence), tmp_path)
+
+
+def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """20,000 of them: the verdict stays small and counts them, the log has them all."""
+    class Babbler(Firmware):
+        def __init__(self, send: Send, **more: Any) -> None:
+            super().__init__(send, **more)
+            drive = self.device.on_sync
+
+            def on_sync() -> None:
+                drive()
+                for code in range(0x5000, 0x5032):
+                    send(0x082, code.to_bytes(2, "little") + bytes(6))
+
+            self.device.on_sync = on_sync
+
+    monkeypatch.setattr(participants, "Firmware", Babbler)
+    outcome = play(job(SAFE), tmp_path)
+    assert (tmp_path / "verdict.json").stat().st_size < 100_000
+    written = json.loads((tmp_path / "verdict.json").read_text())
+    sent = sum(event.kind == "emcy" for event in outcome.events)
+    assert sent >= 20_000 and written["events_omitted"]["emcy"] == sent - 200
+    trace = Trace.read(tmp_path, all=True)
+    assert sum(event.kind == "emcy" for event in trace.events) == sent
+    write_run_page(tmp_path / "trace.mcap", tmp_path / "p.html")
+    assert (tmp_path / "p.html").stat().st_size < 2_000_000
