@@ -1,0 +1,274 @@
+"""A run of three processes on a UDP bus that is disturbed at a random moment, and what is left of it.
+
+Each trial is a run of its own: rig, plant and controller are processes on a multicast group of their own. At a random
+moment one of them is killed or stopped, the folder of the log is removed, or the disk is full. Required of each trial:
+the run ends in time, with a documented exit status and without a traceback; the current is zero in time; the log can be
+read or recovered; no process, semaphore or temporary file is left.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import zlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi.trace.trace import Trace
+from plant.errors import RigError
+from rig.network import codec
+from rig.network.bus import open_can
+from rig.network.clock import WallClock
+from rig.network.codec import Flags
+from rig.network.frame import Frame
+from rig.network.link import Link
+from rig.network.udp import PORT
+from rig.recorder.recover import recover_log
+
+PROCESSES = ("rig", "controller", "plant")
+ACTIONS = ("kill", "stop", "remove folder", "fill disk", "full tmpfs")
+SEQUENCE = """
+title = "Disturbed"
+setup = [{ kind = "hold", time = 0.1 }]
+main = [{ name = "sine", kind = "sine", amplitude = 2e-3, frequency = 2.0, time = 3.0 }]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.1 }]
+checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 5.0, unit = "mm" }]
+"""
+
+
+class Trial(NamedTuple):
+    """What came of one disturbed run."""
+
+    action: str
+    victim: str
+    moment: float  # of the disturbance, s after the first SYNC; NaN: before it
+    pause: float  # s for which a process was stopped
+    status: int  # of the rig's process; -9: killed, -1: it hung
+    end: float  # s from the disturbance to the end of the last process
+    zero: int  # SYNCs from the last frame of the victim to zero current; -1: the run ended before
+    cycles: int  # in the log, as read or recovered
+    message: str  # last line on standard error
+    problems: tuple[str, ...]
+
+
+class _Watcher:
+    """Listens to the bus of a run and notes what is needed to judge it."""
+
+    def __init__(self, bus: str, clock: WallClock) -> None:
+        self._link = Link(open_can(bus), clock.now)
+        self._stop = threading.Event()
+        self.first_sync = 0  # ns
+        self.syncs = 0
+        self.zeroed = {"plant": -1, "controller": -1}  # SYNCs from the last frame of that node to zero current
+        self._heard = {"plant": 0, "controller": 0}  # SYNCs so far when its frame came last
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while not self._stop.is_set():
+            for frame in self._link.poll(0.05):
+                self._note(frame)
+
+    def _note(self, frame: Frame) -> None:
+        if frame.cob_id == codec.SYNC:
+            self.first_sync = self.first_sync or frame.t_ns
+            self.syncs += 1
+        elif frame.cob_id == codec.FEEDBACK:
+            self._hear("plant")
+        elif frame.cob_id == codec.DRIVE and len(frame.data) == 8:
+            if codec.unpack_drive(frame.data).current == 0.0:
+                self._note_zero("plant")
+            self._hear("controller")
+        elif (frame.cob_id == codec.VALVE_STATE and len(frame.data) == 8
+              and codec.unpack_valve_state(frame.data).flags & Flags.CURRENT_ZEROED):
+            self._note_zero("controller")
+
+    def _hear(self, node: str) -> None:
+        self._heard[node], self.zeroed[node] = self.syncs, -1
+
+    def _note_zero(self, silent: str) -> None:
+        if self.zeroed[silent] < 0:
+            self.zeroed[silent] = self.syncs - self._heard[silent]
+
+    def count_since(self, node: str) -> int:
+        """SYNCs since a node was heard."""
+        return self.syncs - self._heard[node]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._stop.set()
+        self._thread.join()
+        self._link.close()
+
+
+def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", controller: str = "builtin",
+                limit: float = 30.0) -> Trial:
+    """Start a run, disturb it at a random moment, and judge what is left.
+
+    Args:
+        action: one of ACTIONS.
+        victim: one of PROCESSES, for "kill" and "stop".
+        seed: decides the moment, the length of a pause and the size of the disk.
+        pace: of the run.
+        controller: firmware of the run, "builtin" or "c".
+        limit: s in which the run must have ended after the disturbance.
+    """
+    rng = np.random.default_rng([seed, ACTIONS.index(action), PROCESSES.index(victim)])
+    is_early, delay = rng.random() < 0.15, float(rng.uniform(0.0, 4.0))  # some before the first SYNC
+    pause = float(rng.uniform(0.02, 3.0)) if action == "stop" else 0.0
+    group = "239." + ".".join(str(number) for number in rng.integers(1, 255, 3))
+    problems: list[str] = []
+    with contextlib.ExitStack() as undo:
+        place = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="eha-rig-study-")))
+        temporary, folder = place / "tmp", place / "run"
+        temporary.mkdir()
+        folder.mkdir()
+        if action == "full tmpfs":
+            undo.enter_context(_mount_small_disk(folder, int(rng.integers(16, 600))))
+        clock = WallClock()
+        watcher = _Watcher(f"udp_multicast:{group}", clock)
+        undo.callback(watcher.close)
+        most = int(rng.integers(4_000, 600_000)) if action == "fill disk" else None
+        rig = _start_rig(place, group, pace, controller, most)
+        if not is_early:
+            wait_until(lambda: bool(watcher.first_sync) or rig.poll() is not None, 120.0)
+        threading.Event().wait(delay)
+        moment = (clock.now() - watcher.first_sync) * 1e-9 if watcher.first_sync else float("nan")
+        _disturb(action, victim, rig, group, folder, pause)
+        disturbed = clock.now()
+        if not wait_until(lambda: rig.poll() is not None, limit):
+            problems.append(f"the rig has not ended {limit:g} s later")
+        status = -1 if rig.poll() is None else rig.returncode
+        if not wait_until(lambda: not find_processes(group), 10.0):
+            problems.append(f"left: {', '.join(name for _, name in find_processes(group))}")
+        end = (clock.now() - disturbed) * 1e-9
+        for process, _ in find_processes(group):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        rig.wait()
+        message = _judge_output(place / "err", status, problems, is_killed=(action, victim) == ("kill", "rig"))
+        cycles = _judge_log(action, folder, watcher, problems)
+        zero = _judge_current(victim, watcher, problems) if action == "kill" and victim != "rig" else -1
+        problems += [f"temporary file {path.name}" for path in sorted(temporary.iterdir())[:3]]
+    if has_semaphores(group):
+        problems.append("semaphores are left")
+    return Trial(action, victim, moment, pause, status, end, zero, cycles, message, tuple(problems))
+
+
+def _start_rig(place: Path, group: str, pace: str, controller: str, most: int | None) -> subprocess.Popen[bytes]:
+    """The rig as a process; `most`: bytes of its largest file."""
+    (place / "s.toml").write_text(SEQUENCE)
+
+    def limit_files(size: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    words = [sys.executable, "-m", "rig.cli.main", "run", str(place / "s.toml"), "--bus", f"udp_multicast:{group}",
+             "--pace", pace, "--controller", controller, "--quiet", "--out", str(place / "run")]
+    with (place / "err").open("wb") as errors:
+        return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors,
+                                env={**os.environ, "TMPDIR": str(place / "tmp")}, start_new_session=True,
+                                preexec_fn=None if most is None else partial(limit_files, most))
+
+
+def _disturb(action: str, victim: str, rig: subprocess.Popen[bytes], group: str, folder: Path, pause: float) -> None:
+    """Do it. A process that is not there yet, or not any more, is left alone."""
+    if action == "remove folder":
+        shutil.rmtree(folder, ignore_errors=True)
+    if action not in ("kill", "stop"):
+        return
+    found = [process for process, name in find_processes(group) if name == victim and process != rig.pid]
+    processes = [rig.pid] if victim == "rig" else found[:1]
+    for process in processes if rig.poll() is None else ():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL if action == "kill" else signal.SIGSTOP)
+            if action == "stop":
+                threading.Event().wait(pause)
+                os.kill(process, signal.SIGCONT)
+
+
+def _judge_output(file: Path, status: int, problems: list[str], *, is_killed: bool) -> str:
+    """The last line on standard error; a traceback or an unknown status is a problem."""
+    lines = file.read_text(errors="replace").splitlines()
+    if any(line.startswith("Traceback") for line in lines):
+        problems.append(f"traceback: {lines[-1]}")
+    elif len(lines) > 1:
+        problems.append(f"{len(lines)} lines on standard error")
+    if status not in (0, 1, 2, 3) and not (is_killed and status == -signal.SIGKILL) and status != -1:
+        problems.append(f"exit status {status}")
+    return lines[-1] if lines else ""
+
+
+def _judge_log(action: str, folder: Path, watcher: _Watcher, problems: list[str]) -> int:
+    """Cycles in the log, as it is or recovered; -1 if there is none. A log that cannot be read is a problem."""
+    log = folder / "trace.mcap"
+    if not log.exists() or not log.stat().st_size:
+        if action in ("kill", "stop") and watcher.syncs:
+            problems.append("there is no log")
+        return -1
+    try:
+        return len(Trace.read(log, all=True))
+    except RigError:
+        pass
+    try:
+        return recover_log(log, folder.parent / "recovered.mcap").cycles
+    except RigError as error:
+        problems.append(f"the log cannot be recovered: {error}")
+        return -1
+
+
+def _judge_current(victim: str, watcher: _Watcher, problems: list[str], most: int = 5) -> int:
+    """SYNCs from the last frame of a killed node until the other one had set the current to zero."""
+    zero = watcher.zeroed[victim]
+    if watcher.syncs and (zero > most or (zero < 0 and watcher.count_since(victim) > most)):
+        problems.append(f"current not zero within {most} SYNCs after the last frame of the {victim}")
+    return zero
+
+
+@contextlib.contextmanager
+def _mount_small_disk(folder: Path, kilobytes: int) -> Iterator[None]:
+    """A disk of that size in a folder; needs root."""
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "study", str(folder)], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def wait_until(done: Callable[[], bool], seconds: float) -> bool:
+    """Wait until `done()`; False if that takes longer than `seconds`."""
+    clock = WallClock()
+    while not done():
+        if clock.now() > seconds * 1e9:
+            return False
+        threading.Event().wait(0.02)
+    return True
+
+
+def find_processes(group: str) -> list[tuple[int, str]]:
+    """(process, "rig", "plant" or "controller") of the processes of a run on a multicast group."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+                if any(word.endswith(group.encode()) for word in words):
+                    name = "plant" if b"plant" in words else "rig" if b"run" in words else "controller"
+                    found.append((int(entry.name), name))
+    return found
+
+
+def has_semaphores(group: str) -> bool:
+    """Whether the turn to send on a group still has its semaphores (rig/network/turn.py)."""
+    key = zlib.crc32(f"eha-rig {group} {PORT}".encode()) & 0x7FFFFFFF
+    lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
+    return any(int(line.split()[0]) == key for line in lines)
