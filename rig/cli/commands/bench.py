@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
-    parser.add_argument("what", nargs="?", choices=("plant", "explain"), default="plant",
-                        help="plant: speed of the plant (default); explain: how often rig explain is right")
+    parser.add_argument("what", nargs="?", choices=("plant", "explain", "robustness"), default="plant",
+                        help="plant: speed of the plant (default); explain: how often rig explain is right; "
+                             "robustness: invented frames, killed processes, full disks, long work")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
     add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
@@ -23,12 +24,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seed of the first case; each case uses the next seed (default: 0)")
     add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
     add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
+    add = parser.add_argument_group("rig bench robustness", "hours with the figures of docs/robustness.md").add_argument
+    add("--frames", type=parse_whole_number, default=100_000, metavar="N",
+        help="invented frames for each node (default: 100000; 0: none)")
+    add("--trials", type=parse_whole_number, default=5, metavar="N",
+        help="runs with each kind of disturbance (default: 5; 0: none)")
+    add("--minutes", type=float, default=5.0, metavar="N", help="minutes of long work (default: 5; 0: none)")
+    add("--controller", choices=("builtin", "c"), default="builtin", help="firmware of these runs (default: builtin)")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Measure the speed of the plant beside C and other libraries, or how often `rig explain` is right."""
     if args.what == "explain":
         return _run_trial(args)
+    if args.what == "robustness":
+        return _study_robustness(args)
     from fdi.output import write_text
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
@@ -86,3 +96,19 @@ def _run_trial(args: argparse.Namespace) -> int:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_trial_report(figures), args)
     return 0 if all(rate["met"] or not rate["of"] for rate in figures["rates"]) else 1
+
+
+def _study_robustness(args: argparse.Namespace) -> int:
+    """Invented frames, disturbed runs and long work; exit status 1 if anything hung, crashed, grew or was left."""
+    from fdi.output import write_text
+    from rig.cli.answer import show_answer
+    from rig.cli.progress_bar import show_progress
+    from rig.studies.robustness.report import build_robustness_report
+    from rig.studies.robustness.run_study import run_study
+
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        figures = run_study(args.frames, args.trials, args.minutes, args.seed, args.controller, progress)
+    if args.out is not None:
+        write_text(args.out, json.dumps(figures, indent=1) + "\n")
+    show_answer(build_robustness_report(figures), args)
+    return 1 if figures["problems"] else 0

@@ -201,8 +201,8 @@ def _judge_output(file: Path, status: int, problems: list[str], *, is_killed: bo
     lines = file.read_text(errors="replace").splitlines()
     if any(line.startswith("Traceback") for line in lines):
         problems.append(f"traceback: {lines[-1]}")
-    elif len(lines) > 1:
-        problems.append(f"{len(lines)} lines on standard error")
+    elif not all(line.startswith("rig ") for line in lines) or len(lines) > len(PROCESSES):
+        problems.append(f"{len(lines)} lines on standard error: {lines[0]}")
     if status not in (0, 1, 2, 3) and not (is_killed and status == -signal.SIGKILL) and status != -1:
         problems.append(f"exit status {status}")
     return lines[-1] if lines else ""

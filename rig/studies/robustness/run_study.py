@@ -1,0 +1,90 @@
+"""The whole study: invented frames and datagrams, disturbed runs, long work."""
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from fdi.progress import Progress
+from rig.studies.robustness.datagrams import fuzz_datagrams
+from rig.studies.robustness.disturb import ACTIONS, PROCESSES, Trial, disturb_run
+from rig.studies.robustness.fuzz import fuzz_node, fuzz_rig
+from rig.studies.robustness.soak import soak_bench
+
+MOST_GROWTH = 16 << 20  # bytes of memory that invented frames may cost
+
+
+def run_study(frames: int, trials: int, minutes: float, seed: int, controller: str,
+              progress: Progress) -> dict[str, Any]:
+    """Run the study; its figures, with all that went wrong as "problems".
+
+    Args:
+        frames: invented frames for each node; a tenth as many datagrams.
+        trials: disturbed runs of each kind.
+        minutes: of long work; 0 for none.
+        seed: of frames and moments.
+        controller: firmware of the disturbed runs and of the long work, "builtin" or "c".
+        progress: called with the stage and the share done.
+    """
+    problems: list[str] = []
+    counts = [fuzz_node("plant", frames, seed, progress), fuzz_node("controller", frames, seed, progress),
+              fuzz_rig(frames, seed, progress)] if frames else []
+    for count in counts:
+        problems += [f"invented frames, {count.target}: {failure}" for failure in count.failures]
+        if not count.works:
+            problems.append(f"invented frames, {count.target}: does not work afterwards")
+        if count.growth > MOST_GROWTH:
+            problems.append(f"invented frames, {count.target}: {count.growth >> 20} MiB more memory")
+    datagrams = fuzz_datagrams(frames // 10, seed, _draw_group(seed, 1), controller, progress) if frames else None
+    if datagrams and datagrams.verdict != "PASS":
+        problems.append(f"invented datagrams: a run afterwards is {datagrams.verdict or 'impossible'}")
+    problems += [f"invented datagrams: {problem}" for problem in (datagrams.problems if datagrams else ())]
+    rows = []
+    kinds = list(_list_kinds())
+    for i, (action, victim) in enumerate(kinds):
+        done = []
+        for trial in range(trials):
+            progress(f"{action} {victim}", (i + trial / trials) / len(kinds))
+            done.append(disturb_run(action, victim, seed + trial, controller=controller))
+        problems += [f"{action} {victim}, seed {seed + n}: {problem}" for n, one in enumerate(done)
+                     for problem in one.problems]
+        if done:
+            rows.append(_summarise_trials(done))
+    soak = soak_bench(minutes, _draw_group(seed, 2), controller=controller, progress=progress) if minutes else None
+    if soak:
+        problems += [f"long work: {problem}" for problem in (*soak.problems, *soak.find_growth())]
+    return {"frames": [count._asdict() for count in counts], "datagrams": datagrams._asdict() if datagrams else None,
+            "disturbed": rows, "soak": _describe_soak(soak._asdict()) if soak else None, "problems": problems}
+
+
+def _list_kinds() -> Iterator[tuple[str, str]]:
+    """(action, victim) of all kinds of disturbance that this user can make."""
+    for action in ACTIONS:
+        if action in ("kill", "stop"):
+            yield from ((action, victim) for victim in PROCESSES)
+        elif action != "full tmpfs" or os.geteuid() == 0:  # mounting needs root
+            yield action, "rig"
+
+
+def _draw_group(seed: int, what: int) -> str:
+    return "239." + ".".join(str(number) for number in np.random.default_rng([seed, what]).integers(1, 255, 3))
+
+
+def _summarise_trials(trials: list[Trial]) -> dict[str, Any]:
+    """One row of the table: counts over the trials of a kind."""
+    ends = [trial.end for trial in trials]
+    zeros = [trial.zero for trial in trials if trial.zero >= 0]
+    statuses: dict[str, int] = {}
+    for trial in trials:
+        statuses[str(trial.status)] = statuses.get(str(trial.status), 0) + 1
+    return {"action": trials[0].action, "victim": trials[0].victim, "trials": len(trials),
+            "sound": sum(not trial.problems for trial in trials), "statuses": statuses,
+            "end_p50": float(np.median(ends)), "end_max": max(ends), "zero_max": max(zeros, default=None),
+            "logs": sum(trial.cycles >= 0 for trial in trials)}
+
+
+def _describe_soak(soak: dict[str, Any]) -> dict[str, Any]:
+    usage = {when: {name: held._asdict() for name, held in soak[when].items()} for when in ("start", "end")}
+    return {**soak, **usage}
