@@ -132,6 +132,8 @@ def _report_damage(path: Path, topic: str) -> Iterator[None]:
         yield
     except InputError:
         raise
+    except OSError as error:
+        raise InputError(path, "", f"a readable file ({error.strerror})") from error
     except Exception as error:  # the parsers of schemas and messages raise many kinds
         raise InputError(path, topic, f"sound messages ({type(error).__name__}: {error})") from error
 
