@@ -3,8 +3,8 @@
     bus = can.Bus(interface="eha_rig_udp", channel="239.74.163.2")
     network.connect(interface="eha_rig_udp", channel="239.74.163.2")        # canopen
 
-pyproject.toml registers it in the group `can.interface`, where python-can looks for interfaces. python-can's own
-`udp_multicast` cannot take its place: it hears its own frames, and it needs a route for multicast.
+pyproject.toml registers it in the group of entry points in which python-can looks for interfaces, "can.interface".
+python-can's own `udp_multicast` cannot take its place: it hears its own frames, and it needs a route for multicast.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class UdpBus(LoopbackBus):
         channel: the multicast group, as in `rig run --bus udp_multicast:GROUP`; default: that of `--bus udp_multicast`.
         port: UDP port.
         can_filters: as in python-can; frames are filtered in this process.
-        options: `bitrate` and others are accepted and mean nothing here; `receive_own_messages` and `fd` must be off.
+        options: bit rate and others are accepted and mean nothing here; receive_own_messages and fd must be off.
 
     Raises:
         can.CanInitializationError: no multicast group, or an option that the bus does not have.
