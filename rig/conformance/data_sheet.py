@@ -25,7 +25,6 @@ SIZES = {  # data type (CiA 301, table 44) -> bytes
     0x10: 3, REAL64: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8,
 }  # fmt: skip
 RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
-_BITS = {BOOLEAN: 1}  # in a PDO, where it is not eight times the bytes
 # Objects that start something when they are written: store, restore, verify, commands, programs, network management.
 _ACTIVE = (range(0x1010, 0x1012), range(0x1020, 0x1029), range(0x1F00, 0x2000))
 
@@ -69,7 +68,7 @@ class Variable(NamedTuple):
     @property
     def bits(self) -> int:
         """Length in a PDO."""
-        return _BITS.get(self.data_type, 8 * self.size)
+        return 1 if self.data_type == BOOLEAN else 8 * self.size
 
     @property
     def is_active(self) -> bool:

@@ -19,13 +19,9 @@ from rig.conformance.data_sheet import (
     DataSheet,
     Variable,
 )
+from rig.conformance.identifiers import is_restricted
 from rig.conformance.target import Target, join_labels
 
-LISTS = {"MandatoryObjects": range(0x1000, 0x1019), "OptionalObjects": range(0x1000, 0x10000),
-         "ManufacturerObjects": range(0x2000, 0x6000)}
-MANDATORY = (0x1000, 0x1001, 0x1018)
-OBJECT_TYPES = {0x0: "NULL", 0x2: "DOMAIN", 0x5: "DEFTYPE", 0x6: "DEFSTRUCT", 0x7: "VAR", 0x8: "ARRAY", 0x9: "RECORD"}
-ACCESS_TYPES = ("ro", "wo", "rw", "rwr", "rww", "const")
 # Data type and access of objects of the communication profile, CiA 301, 7.5.2.
 STANDARD = {
     (0x1000, 0): (UNSIGNED32, "ro const"), (0x1001, 0): (UNSIGNED8, "ro"), (0x1002, 0): (UNSIGNED32, "ro"),
@@ -64,7 +60,7 @@ def check_sections(t: Target) -> str:
 @case("1.2", "mandatory objects", "7.5.2.1, 7.5.2.2, 7.5.2.21", "0x1000, 0x1001 and 0x1018 with sub 0 and 1")
 def check_mandatory_objects(t: Target) -> str:
     """CiA 301 asks every node for three objects."""
-    missing = [f"0x{index:04X}" for index in MANDATORY if index not in t.sheet.objects]
+    missing = [f"0x{index:04X}" for index in (0x1000, 0x1001, 0x1018) if index not in t.sheet.objects]
     missing += [f"0x1018:{sub}" for sub in (0, 1) if t.sheet.find(0x1018, sub) is None and "0x1018" not in missing]
     require(not missing, f"missing: {join_labels(missing)}")
     return f"all there, of {len(t.sheet.objects)} objects"
@@ -75,7 +71,9 @@ def check_mandatory_objects(t: Target) -> str:
 def check_lists(t: Target) -> str:
     """The three lists name exactly the objects that are described."""
     text, listed, problems = t.sheet.text, [], []
-    for name, permitted in LISTS.items():
+    areas = {"MandatoryObjects": range(0x1000, 0x1019), "OptionalObjects": range(0x1000, 0x10000),
+             "ManufacturerObjects": range(0x2000, 0x6000)}
+    for name, permitted in areas.items():
         if not text.has_section(name):
             continue
         entries = [_number(t.sheet, name, key) for key in text.options(name) if key.isdigit()]
@@ -126,14 +124,15 @@ def check_types(t: Target) -> str:
     """Each variable is described with values that CiA 306 knows."""
     problems = []
     strings = (VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN)
+    access_types = ("ro", "wo", "rw", "rwr", "rww", "const")
     for index in t.sheet.objects:
         section = next((name for name in t.sheet.text.sections() if name.upper() == f"{index:04X}"), "")
-        if _number(t.sheet, section, "ObjectType", 7) not in OBJECT_TYPES:
+        if _number(t.sheet, section, "ObjectType", 7) not in (0, 2, 5, 6, 7, 8, 9):
             problems.append(f"0x{index:04X} has an unknown ObjectType")
     for variable in t.sheet.variables:
         if variable.data_type not in SIZES and variable.data_type not in strings:
             problems.append(f"{variable.label} has DataType 0x{variable.data_type:04X}")
-        if variable.access not in ACCESS_TYPES:
+        if variable.access not in access_types:
             problems.append(f"{variable.label} has AccessType {variable.access!r}")
         if not variable.is_number or not isinstance(variable.default, int | float):
             continue
@@ -262,16 +261,6 @@ def check_identifiers(t: Target) -> str:
             sent[can_id] = name
     require(not problems, join_labels(problems))
     return f"{count} COB-IDs"
-
-
-def is_restricted(can_id: int) -> bool:
-    """Whether CiA 301 keeps this identifier from every configurable object (7.3.5, table 40).
-
-    >>> is_restricted(0x5FF), is_restricted(0x182)
-    (True, False)
-    """
-    ranges = ((0x000, 0x07F), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 0x7FF))
-    return any(low <= can_id <= high for low, high in ranges)
 
 
 def _find_standard(variable: Variable) -> tuple[int, str] | None:

@@ -5,7 +5,8 @@ from functools import partial
 
 from rig.conformance.case import CaseNotApplicable, case, require, require_applicable
 from rig.conformance.data_sheet import Pdo
-from rig.conformance.pdo_cases import INVALID, RESTRICTED, operational, read_mapped, send_short
+from rig.conformance.identifiers import list_restricted_ends
+from rig.conformance.pdo_cases import INVALID, operational, read_mapped, send_short
 from rig.conformance.target import (
     COMMANDS,
     NO_DATA,
@@ -25,8 +26,7 @@ from rig.conformance.target import (
 )
 from rig.network.frame import Frame
 
-HEARTBEAT_LOST, INCOMPATIBLE = 0x8130, 0x06040043
-PRODUCER = 1 << 30  # in 0x1005
+HEARTBEAT_LOST = 0x8130
 BEAT = 0.02  # s, of the heartbeat that the tester sends
 LIMIT = 200  # ms, of the supervision that the tester sets
 
@@ -40,10 +40,10 @@ def check_sync_identifier(t: Target) -> str:
     if not variable.is_writable:
         return f"0x{word & 0x7FF:03X}, {variable.access}"
     with t.restored(variable):
-        accepted = [f"0x{can_id:03X}" for can_id in RESTRICTED
-                    if t.try_download(0x1005, 0, (word & ~(PRODUCER | 0x7FF) | can_id).to_bytes(4, "little")) != VALUE]
+        accepted = [f"0x{can_id:03X}" for can_id in list_restricted_ends()
+                    if t.try_download(0x1005, 0, (word & ~(1 << 30 | 0x7FF) | can_id).to_bytes(4, "little")) != VALUE]
     require(not accepted, f"not refused with 0x06090030: {join_labels(accepted)}")
-    return f"0x{word & 0x7FF:03X}; {len(RESTRICTED)} identifiers refused"
+    return f"0x{word & 0x7FF:03X}; {len(list_restricted_ends())} identifiers refused"
 
 
 @case("5.2", "COB-ID of EMCY", "7.5.2.17", "0x080 + node-ID unless the EDS says otherwise; fixed while it is valid")
@@ -60,12 +60,12 @@ def check_emcy_identifier(t: Target) -> str:
         require(code in (VALUE, STATE, 0x08000020, 0x08000021), f"changed while it is valid: {format_abort(code)}")
         t.write(0x1014, 0, word | INVALID)
         accepted = []
-        for can_id in RESTRICTED:
+        for can_id in list_restricted_ends():
             if t.try_download(0x1014, 0, (word & ~(0x7FF | INVALID) | can_id).to_bytes(4, "little")) != VALUE:
                 accepted.append(f"0x{can_id:03X}")
             t.try_download(0x1014, 0, (word | INVALID).to_bytes(4, "little"))
     require(not accepted, f"not refused with 0x06090030: {join_labels(accepted)}")
-    return f"0x{word & 0x7FF:03X}; {len(RESTRICTED)} identifiers refused"
+    return f"0x{word & 0x7FF:03X}; {len(list_restricted_ends())} identifiers refused"
 
 
 @case("5.3", "emergency", "7.2.7",
@@ -262,7 +262,7 @@ def check_consumer_duplicate(t: Target) -> str:
         t.write(0x1016, 2, 0)
         t.write(0x1016, 1, node << 16 | LIMIT)
         code = t.try_download(0x1016, 2, (node << 16 | LIMIT).to_bytes(4, "little"))
-        require(code == INCOMPATIBLE, format_abort(code))
+        require(code == 0x06040043, format_abort(code))
     return format_abort(code)
 
 

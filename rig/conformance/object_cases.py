@@ -22,9 +22,6 @@ from rig.conformance.target import (
     join_labels,
 )
 
-# Objects whose meaning is known, so that a wrong value can be offered without harm.
-HARMLESS = ((0x1017, 0), (0x1029, 1), (0x1016, 1), (0x1006, 0), (0x1007, 0), (0x1015, 0))
-
 
 @case("2.1", "every object can be read", "7.2.4.2", "an upload of each readable object is answered with its value")
 def check_all_readable(t: Target) -> str:
@@ -296,9 +293,11 @@ def list_readable(t: Target) -> list[Variable]:
 
 
 def _list_writable_numbers(t: Target) -> list[Variable]:
+    """Numbers to which a wrong value can be offered without harm: their meaning is known, or --write allows it."""
+    harmless = ((0x1017, 0), (0x1029, 1), (0x1016, 1), (0x1006, 0), (0x1007, 0), (0x1015, 0))
     chosen = [variable for variable in t.sheet.variables if variable.is_number and variable.is_writable
               and variable.is_readable and not variable.is_active
-              and ((variable.index, variable.sub) in HARMLESS
+              and ((variable.index, variable.sub) in harmless
                    or (t.options.may_write and not variable.is_communication))]
     if not chosen:
         raise CaseNotApplicable("the EDS has no such object")

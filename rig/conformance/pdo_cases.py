@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 from rig.conformance.case import CaseSkipped, case, require, require_applicable
 from rig.conformance.data_sheet import Pdo, Variable
+from rig.conformance.identifiers import list_restricted_ends
 from rig.conformance.target import (
     NO_OBJECT,
     OPERATIONAL,
@@ -20,8 +21,6 @@ from rig.network.frame import Frame
 INVALID, EXTENDED = 1 << 31, 1 << 29
 LAST_SYNCHRONOUS = 240
 TOO_SHORT = 0x8210
-RESTRICTED = (0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x77F, 0x780, 0x7FF)
-REFUSED_NOW = (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000)  # the standard gives no code for "while it is valid"
 CANNOT_MAP, PDO_TOO_LONG = 0x06040041, 0x06040042
 SETTLE = 0.1  # s: the time in which a frame that is not expected would come
 
@@ -144,7 +143,8 @@ def check_fixed_while_valid(t: Target) -> str:
         free = t.find_free_identifiers(1)[0]
         with _restored_pdo(t, pdo):
             code = t.try_download(pdo.parameter, 1, (word & ~0x7FF | free).to_bytes(4, "little"))
-            require(code in REFUSED_NOW, f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}: {format_abort(code)}")
+            is_refused = code in (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000)  # the standard names no code
+            require(is_refused, f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}: {format_abort(code)}")
             require(t.read(pdo.parameter, 1) == word, f"{pdo.name} has changed all the same")
         found.append(f"{pdo.name} {format_abort(code)}")
     return "; ".join(found)
@@ -158,7 +158,7 @@ def check_restricted(t: Target) -> str:
         word = t.read(pdo.parameter, 1)
         accepted = []
         with _restored_pdo(t, pdo):
-            for can_id in RESTRICTED:
+            for can_id in list_restricted_ends():
                 code = t.try_download(pdo.parameter, 1, (word | INVALID).to_bytes(4, "little"))
                 require(code == 0, f"{pdo.name} cannot be switched off: {format_abort(code)}")
                 code = t.try_download(pdo.parameter, 1, (word & ~0x7FF & ~INVALID | can_id).to_bytes(4, "little"))
@@ -166,7 +166,7 @@ def check_restricted(t: Target) -> str:
                     accepted.append(f"0x{can_id:03X} {format_abort(code)}")
         require(not accepted, f"{pdo.name}: {join_labels(accepted)}")
         found.append(pdo.name)
-    return f"{len(RESTRICTED)} identifiers refused by {', '.join(found)}"
+    return f"{len(list_restricted_ends())} identifiers refused by {', '.join(found)}"
 
 
 @case("4.9", "29-bit COB-IDs", "7.5.2.35, 7.5.2.37", "supported, or refused with 0x06090030")

@@ -14,7 +14,6 @@ from rig.conformance.runner import Outcome
 
 MOODS: dict[Verdict, Mood] = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.NOT_APPLICABLE: "muted",
                               Verdict.SKIPPED: "doubtful"}
-VERDICT_MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful"}
 
 
 class Subject(NamedTuple):
@@ -28,13 +27,14 @@ class Subject(NamedTuple):
 def build_conformance_report(outcome: Outcome, subject: Subject, files: Sequence[tuple[str, str]] = ()) -> Report:
     """Report on a conformance test: a table for each chapter, and on the terminal only what needs attention."""
     sheet = subject.sheet
+    moods: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful"}
     results = outcome.results
     counts = {verdict: outcome.count(verdict) for verdict in Verdict}
     facts = [("node", str(sheet.node)), ("EDS", sheet.path.name), ("bus", subject.bus),
              ("tests", ", ".join(f"{count} {verdict.value}" for verdict, count in counts.items() if count))]
     return Report(
         command="conformance", title=f"Conformance of node {sheet.node}, {sheet.name}", verdict=outcome.verdict,
-        mood=VERDICT_MOODS[outcome.verdict], sentence=_describe(outcome), facts=facts,
+        mood=moods[outcome.verdict], sentence=_describe(outcome), facts=facts,
         notes=[*outcome.notes, "A test against CiA 301 as far as it goes (docs/conformance.md); not a certificate."],
         sections=[_summarise_chapters(results), _list_open(results), *_list_chapters(results)],
         files=files, data=_to_data(outcome, subject))
