@@ -496,6 +496,12 @@ class RawBus:
         self.close()
 
     @property
+    def descriptors(self) -> tuple[int, int, int]:
+        """File descriptors of the sockets that receive and send, and the identifier of the turn's semaphores or -1."""
+        turn = -1 if self._turn is None else self._turn.identifier
+        return int(self.port.words[_RX]), int(self.port.words[_TX]), turn
+
+    @property
     def error_frames(self) -> int:
         return int(self.port.words[_ERROR_FRAMES])
 

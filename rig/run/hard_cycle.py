@@ -14,16 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.compile import LibraryFunction
 from rig.network import codec
 from rig.network.raw_bus import (
     FRAME,
-    TIMEOUT,
     Port,
     join_words,
     read_clock,
     receive_frame,
     send_frame,
+    sleep_until,
     split_halves,
     split_words,
 )
@@ -39,8 +38,8 @@ ALL_CAME = XJ_CAME | XS_CAME | COR_CAME
 (DUE, HEAD, CANCEL_DONE, IDLE_FROM, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES, COMPLETE_UNTIL, LOST_RECORDS) = range(
     16, 27)
 # Words of the cycle alone
-(OPEN, SYNC_AT, SEEN, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, BUSY_SINCE, SPUN, RAW, CONTROL, DELAY,
- POSITION, IS_HELD, CPU_SECONDS, CPU_NS) = range(32, 49)
+(OPEN, SYNC_AT, SEEN, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, RAW, CONTROL, DELAY,
+ POSITION, IS_HELD) = range(32, 47)
 WORDS = 64
 # Columns of an input
 RAW_DEMAND, CONTROL_WORD, COMMAND_DELAY = range(3)
@@ -53,8 +52,6 @@ COLUMNS = 19
 TIME, FRAME_HEAD, DATA = range(3)
 
 _PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
-_THREAD_CPU_TIME = 3  # linux/time.h
-_clock_gettime = LibraryFunction("clock_gettime", "iiq")
 
 
 class Buffers(NamedTuple):
@@ -84,19 +81,17 @@ def play_realtime(port: Port, buffers: Buffers) -> int:
     """
     words = buffers.words
     while True:
-        status = _receive_until(port, buffers, words[DUE] - words[LEAD])
-        if status < 0:
-            return status
+        # Asleep while the answers come: the kernel notes their times, and nobody waits for the rig to read them.
+        status = _sleep_until(port, buffers, words[DUE] - words[LEAD])
+        if status >= 0:
+            status = _receive_waiting(port, buffers)
         is_end = not _take_input(buffers)
-        if not is_end:
+        if status >= 0 and not is_end:
             status = _send_command(port, buffers)
-            if status < 0:
-                return status
-        status = _receive_until(port, buffers, words[DUE] - words[SPIN])
-        if status < 0:
-            return status
-        _wait_until_due(port, buffers)
-        status = _receive_until(port, buffers, words[DUE])
+        if status >= 0:
+            status = _wait_until_due(port, buffers)
+        if status >= 0:
+            status = _receive_waiting(port, buffers)
         if status < 0:
             return status
         _close_row(port, buffers)
@@ -118,6 +113,7 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
     """
     words = buffers.words
     if words[STAGE] == DONE:
+        _begin_work(port, words)
         _take_input(buffers)
         status = _send_command(port, buffers)
         if status >= 0:
@@ -127,6 +123,7 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
         grace = words[GRACE] if words[MISSED] < _PATIENCE else words[GRACE] // 10
         words[ANSWER_LIMIT] = words[SYNC_AT] + grace
         words[STAGE] = WAITING
+        _end_work(port, words)
     while words[SEEN] != ALL_CAME:
         status, t_ns, cob_id, length, data = receive_frame(port, min(words[ANSWER_LIMIT], until_ns))
         if status == FRAME:
@@ -137,6 +134,7 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
             break
         else:
             return WAITING
+    _begin_work(port, words)
     words[MISSED] = 0 if words[SEEN] == ALL_CAME else words[MISSED] + 1
     status = _receive_waiting(port, buffers)
     while status >= 0 and words[HELD] > 0 and buffers.held[0, 0] < words[DUE] + words[PERIOD]:
@@ -183,18 +181,44 @@ def _is_underrun(words: NDArray[np.int64]) -> bool:
     return bool(words[IS_HELD]) and not is_meant
 
 
-def _wait_until_due(port: Port, buffers: Buffers) -> None:
-    """Watch the clock until the SYNC is due: the kernel's wake-up alone is 20 to 60 us late.
+def _wait_until_due(port: Port, buffers: Buffers) -> int:
+    """Sleep until shortly before SYNC is due, then watch the clock: the kernel's wake-up alone is 20 to 60 us late.
 
-    On a single CPU only when all answers are in, for then nobody else needs it.
+    On a single CPU the watch is left out unless all answers are in, for a node may need the CPU.
     """
     words = buffers.words
-    start = read_clock(port)
-    now = start
-    if words[SPINS_ALWAYS] or words[SEEN] == ALL_CAME:
-        while now < words[DUE]:
-            now = read_clock(port)
-    words[SPUN] = now - start
+    status = _sleep_until(port, buffers, words[DUE] - words[SPIN])
+    is_command_due = words[HELD] > 0 and buffers.held[0, 0] < words[DUE]
+    if is_command_due or not (words[SPINS_ALWAYS] or words[SEEN] == ALL_CAME):
+        return min(status, _sleep_until(port, buffers, words[DUE]))
+    _end_work(port, words)
+    while read_clock(port) < words[DUE]:
+        pass
+    _begin_work(port, words)
+    return status
+
+
+def _sleep_until(port: Port, buffers: Buffers, t_ns: int) -> int:
+    """Sleep until `t_ns`, and send the late commands that are due before."""
+    words, held = buffers.words, buffers.held
+    status = DONE
+    while status >= 0 and words[HELD] > 0 and held[0, 0] < t_ns:
+        _end_work(port, words)
+        sleep_until(port, held[0, 0])
+        _begin_work(port, words)
+        status = _send_first_held(port, buffers)
+    _end_work(port, words)
+    sleep_until(port, t_ns)
+    _begin_work(port, words)
+    return status
+
+
+def _begin_work(port: Port, words: NDArray[np.int64]) -> None:
+    words[AWAKE_SINCE] = read_clock(port)
+
+
+def _end_work(port: Port, words: NDArray[np.int64]) -> None:
+    words[WORKED] += read_clock(port) - words[AWAKE_SINCE]
 
 
 def _send_command(port: Port, buffers: Buffers) -> int:
@@ -260,28 +284,6 @@ def _send(port: Port, buffers: Buffers, cob_id: int, length: int, data: int) -> 
     return min(send_frame(port, cob_id, length, data), DONE)
 
 
-def _receive_until(port: Port, buffers: Buffers, t_ns: int) -> int:
-    """Take in frames until `t_ns`, and send the late commands that are due before; reads all that has come already."""
-    words, held = buffers.words, buffers.held
-    while True:
-        limit = t_ns
-        if words[HELD] > 0 and held[0, 0] < limit:
-            limit = held[0, 0]
-        status, came, cob_id, length, data = receive_frame(port, limit)
-        if status < 0:
-            return status
-        reached = limit if status == TIMEOUT else 0
-        if status == FRAME:
-            _accept_frame(buffers, came, cob_id, length, data)
-            reached = came
-        if words[HELD] > 0 and held[0, 0] <= reached and held[0, 0] < t_ns:
-            status = _send_first_held(port, buffers)
-            if status < 0:
-                return status
-        elif reached >= t_ns:
-            return DONE
-
-
 def _receive_waiting(port: Port, buffers: Buffers) -> int:
     """Take in the frames that are here, and none that comes meanwhile."""
     now = read_clock(port)
@@ -337,13 +339,12 @@ def _record_frame(buffers: Buffers, t_ns: int, head: int, data: int) -> None:
 def _close_row(port: Port, buffers: Buffers) -> None:
     """Hand the row of the cycle under way to Python, and the frames up to now."""
     words = buffers.words
-    busy = _read_cpu_time(buffers) - words[SPUN]
+    _end_work(port, words)
     row = buffers.rows[words[ROWS] % len(buffers.rows)]
-    row[ANSWERS], row[EXECUTION] = words[SEEN], busy - words[BUSY_SINCE]
-    words[BUSY_SINCE] = busy + words[SPUN]
-    words[SPUN] = 0
+    row[ANSWERS], row[EXECUTION] = words[SEEN], words[WORKED]
+    words[WORKED] = 0
     # The compiler cannot see into a library call: all that stands above it is in memory before the counts below change.
-    read_clock(port)
+    _begin_work(port, words)
     if words[OPEN]:
         if words[ROWS] + 1 - words[ROWS_READ] < len(buffers.rows):
             words[ROWS] += 1
@@ -353,10 +354,3 @@ def _close_row(port: Port, buffers: Buffers) -> None:
     words[FRAMES] = words[FRAMES_WRITTEN]
     words[COMPLETE_UNTIL] = words[DUE]
 
-
-def _read_cpu_time(buffers: Buffers) -> int:
-    """Processor time of this thread, ns."""
-    words = buffers.words
-    _clock_gettime(_THREAD_CPU_TIME, words.ctypes.data + 8 * CPU_SECONDS)
-    now: int = words[CPU_SECONDS] * 1_000_000_000 + words[CPU_NS]
-    return now

@@ -5,6 +5,7 @@ import contextlib
 import ctypes
 import gc
 import os
+import struct
 import sys
 import threading
 from collections.abc import Collection, Iterator
@@ -68,6 +69,22 @@ def lock_memory() -> Iterator[bool]:
     finally:
         if is_locked:
             library.munlockall()
+
+
+@contextlib.contextmanager
+def prevent_deep_sleep() -> Iterator[None]:
+    """Keep idle CPUs in states that they leave at once, where the machine allows it (root); as cyclictest does."""
+    try:
+        request = os.open("/dev/cpu_dma_latency", os.O_WRONLY)  # holds as long as it is open
+    except OSError:
+        yield
+        return
+    try:
+        with contextlib.suppress(OSError):
+            os.write(request, struct.pack("=i", 0))  # us
+        yield
+    finally:
+        os.close(request)
 
 
 def list_cpus() -> list[int]:

@@ -21,7 +21,14 @@ from rig.run.history import History
 from rig.run.job import Job
 from rig.run.outcome import Outcome, summarise_timing
 from rig.run.participants import open_wire
-from rig.run.priority import LOOP_PRIORITY, lock_memory, name_scheduler, raise_priority, suspend_garbage_collection
+from rig.run.priority import (
+    LOOP_PRIORITY,
+    lock_memory,
+    name_scheduler,
+    prevent_deep_sleep,
+    raise_priority,
+    suspend_garbage_collection,
+)
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.protocol import judge_protocol
@@ -48,6 +55,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
                 is_hard = session.loop.kind == "hard"  # then Python only has to keep up; the cycle's thread is above it
                 rights.enter_context(raise_priority(1 if is_hard else LOOP_PRIORITY))
                 rights.enter_context(lock_memory())
+                rights.enter_context(prevent_deep_sleep())
                 rights.enter_context(suspend_garbage_collection())
             scheduled = name_scheduler()
             session.run_phases()

@@ -13,11 +13,17 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
-    parser.add_argument("what", nargs="?", choices=("plant", "explain", "robustness"), default="plant",
-                        help="plant: speed of the plant (default); explain: how often rig explain is right; "
+    parser.add_argument("what", nargs="?", choices=("plant", "realtime", "explain", "robustness"), default="plant",
+                        help="plant: speed of the plant (default); realtime: lateness and response of the cycle beside "
+                             "cyclictest and C; explain: how often rig explain is right; "
                              "robustness: invented frames, killed processes, full disks, long work")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
+    add = parser.add_argument_group("rig bench realtime").add_argument
+    add("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+        help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)")
+    add("--seconds", type=float, default=60.0, metavar="S", help="time for each contender (default: 60)")
+    add("--blocks", type=int, default=6, metavar="N", help="blocks by turns that the time is divided into (default: 6)")
     add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
     add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
     add("--seed", type=parse_whole_number, default=0, metavar="N",
@@ -39,6 +45,8 @@ def run_command(args: argparse.Namespace) -> int:
         return _run_trial(args)
     if args.what == "robustness":
         return _study_robustness(args)
+    if args.what == "realtime":
+        return _run_realtime(args)
     from fdi.output import write_text
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
@@ -57,6 +65,35 @@ def run_command(args: argparse.Namespace) -> int:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_plant_report(figures), args)
     return 0
+
+
+def _run_realtime(args: argparse.Namespace) -> int:
+    """The cycle in real time; exit status 0 if every target that could be measured is met, 1 otherwise.
+
+    Raises:
+        InputError: a bus that compiled code cannot use, or a time or number of blocks that is too small.
+    """
+    import os
+
+    from fdi.output import write_text
+    from plant.errors import InputError
+    from rig.cli.answer import show_answer
+    from rig.cli.progress_bar import show_progress
+    from rig.studies.benchmarks.realtime import measure_realtime
+    from rig.studies.benchmarks.realtime_report import build_realtime_report
+
+    if args.blocks < 1:
+        raise InputError("--blocks", str(args.blocks), "1 or more")
+    if not args.seconds >= 0.5 * args.blocks:
+        raise InputError("--seconds", f"{args.seconds:g}", "half a second or more for each block")
+    number = os.getpid()
+    own = f"udp_multicast:239.74.{number >> 8 & 255}.{number & 255}"
+    with show_progress(is_silent=args.json or args.quiet, is_realtime=True) as progress:
+        figures = measure_realtime(own if args.bus == "auto" else args.bus, args.seconds, args.blocks, progress)
+    if args.out is not None:
+        write_text(args.out, json.dumps(figures, indent=1) + "\n")
+    show_answer(build_realtime_report(figures), args)
+    return 0 if all(target["is_met"] for target in figures["targets"] if target["value"] is not None) else 1
 
 
 def _run_trial(args: argparse.Namespace) -> int:
