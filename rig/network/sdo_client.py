@@ -12,6 +12,7 @@ from typing import Any
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from plant.errors import RigError
 from rig.network.wire import Wire
 
 _HEAD = struct.Struct("<BHB")
@@ -22,19 +23,26 @@ _TOGGLE = 0x10
 _TIMED_OUT, _TOGGLE_WRONG, _COMMAND_INVALID, _LENGTH_WRONG = 0x05040000, 0x05030000, 0x05040001, 0x06070010
 
 
+class ConfirmationError(RigError):
+    """A node confirms something other than the SDO request. One line: node, what came, what was expected.
+
+    It is neither a refusal nor silence, which a master may take for "not implemented": such a node cannot be used.
+    """
+
+
 class CheckedSdoClient(SdoClient):
     """An SDO client on a wire; while it waits, the wire delivers frames.
 
     A confirmation with a wrong command specifier, index, sub-index, toggle bit or length ends the transfer: the client
-    sends an abort and raises SdoCommunicationError, whose text is one line. An abort by the server raises
-    SdoAbortedError.
+    sends an abort and raises ConfirmationError. No response within RESPONSE_TIMEOUT raises SdoCommunicationError, an
+    abort by the server SdoAbortedError.
     """
 
     _object = bytes(3)  # index and sub-index of the transfer, as the frames carry them
     largest_upload = 1 << 24  # bytes; a server that never ends an upload must not fill the memory
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return its confirmation, 8 bytes. Raises SdoCommunicationError, SdoAbortedError."""
+        """Send a request and return its confirmation, 8 bytes. Raises as the class says."""
         while not self.responses.empty():  # left over from a transfer that was given up
             self.responses.get_nowait()
         if sdo_request[0] >> 5 in (_DOWNLOAD, _UPLOAD):
@@ -43,17 +51,19 @@ class CheckedSdoClient(SdoClient):
         network: Any = self.network
         wire: Wire = network.wire
         if not wire.wait(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT):
-            self._give_up(_TIMED_OUT, "No SDO response received")
+            self._send_abort(_TIMED_OUT)
+            raise SdoCommunicationError("No SDO response received")
         response: bytes = self.responses.get_nowait()
         code, problem = find_problem(sdo_request, response)
         if problem:
-            self._give_up(code, problem)
+            self._send_abort(code)
+            raise ConfirmationError(f"{self._describe_transfer()}: {problem}")
         if response[0] == _ABORT:
             raise SdoAbortedError(int.from_bytes(response[4:], "little"))
         return response
 
     def upload(self, index: int, subindex: int) -> bytes:
-        """Read an object's bytes. Raises SdoCommunicationError, SdoAbortedError."""
+        """Read an object's bytes. Raises as the class says."""
         response = self.request_response(_HEAD.pack(_UPLOAD << 5, index, subindex) + bytes(4))
         size = int.from_bytes(response[4:], "little")
         if response[0] & 2:  # expedited
@@ -65,7 +75,7 @@ class CheckedSdoClient(SdoClient):
         if expected and response[0] & 3 == 2 and len(data) > expected:
             data = data[:expected]  # expedited without a length: the object's own length counts
         if expected and len(data) != expected:
-            raise SdoCommunicationError(f"the node sent {len(data)} bytes, the object has {expected}")
+            raise ConfirmationError(f"{self._describe_transfer()}: {len(data)} bytes, expected {expected}")
         return data
 
     def _upload_segments(self, announced: int | None) -> bytes:
@@ -77,14 +87,15 @@ class CheckedSdoClient(SdoClient):
             toggle ^= _TOGGLE
             last = response[0] & 1
             if len(data) > (self.largest_upload if announced is None else announced):
-                self._give_up(_LENGTH_WRONG, f"more than {self.largest_upload} bytes" if announced is None
-                              else f"more than the {announced} bytes announced")
+                self._send_abort(_LENGTH_WRONG)
+                most = f"{self.largest_upload} bytes" if announced is None else f"the {announced} bytes announced"
+                raise ConfirmationError(f"{self._describe_transfer()}: more than {most}")
         if announced is not None and len(data) != announced:
-            raise SdoCommunicationError(f"{len(data)} bytes came, {announced} were announced")
+            raise ConfirmationError(f"{self._describe_transfer()}: {len(data)} bytes, {announced} were announced")
         return bytes(data)
 
     def download(self, index: int, subindex: int, data: bytes, force_segment: bool = False) -> None:
-        """Write an object's bytes. Raises SdoCommunicationError, SdoAbortedError."""
+        """Write an object's bytes. Raises as the class says."""
         size = len(data)
         if 0 < size <= 4 and not force_segment:
             head = _HEAD.pack(_DOWNLOAD << 5 | (4 - size) << 2 | 3, index, subindex)
@@ -111,10 +122,13 @@ class CheckedSdoClient(SdoClient):
         variable = self.od.get_variable(index, sub)
         return len(variable) // 8 if variable is not None and variable.fixed_size else 0
 
-    def _give_up(self, code: int, problem: str) -> None:
-        """Abort the transfer. Raises SdoCommunicationError."""
+    def _send_abort(self, code: int) -> None:
         self.send_request(bytes((_ABORT,)) + self._object + code.to_bytes(4, "little"))
-        raise SdoCommunicationError(problem)
+
+    def _describe_transfer(self) -> str:
+        """Node and object, as a message begins."""
+        index, sub = struct.unpack("<HB", self._object)
+        return f"node {self.rx_cobid - 0x600}, SDO of object 0x{index:04X} sub {sub}"
 
 
 def find_problem(request: bytes, response: bytes) -> tuple[int, str]:
@@ -123,20 +137,17 @@ def find_problem(request: bytes, response: bytes) -> tuple[int, str]:
     >>> find_problem(bytes.fromhex("4000100000000000"), bytes.fromhex("4300100092010000"))
     (0, '')
     >>> find_problem(bytes.fromhex("4000100000000000"), bytes.fromhex("4301100092010000"))[1]
-    'the node answered for object 0x1001 sub 0, asked was 0x1000 sub 0'
+    'confirmation of object 0x1001 sub 0'
     """
     asked = request[0] >> 5
     is_initiate = asked in (_DOWNLOAD, _UPLOAD)
     expected = _CONFIRMATION[asked]
     if response[0] != _ABORT and response[0] >> 5 != expected:
-        return _COMMAND_INVALID, (f"the node answered with command specifier {response[0] >> 5} "
-                                  f"(0x{response[0]:02X}), expected {expected}")
+        return _COMMAND_INVALID, f"command specifier {response[0] >> 5} (0x{response[0]:02X}), expected {expected}"
     if is_initiate and response[1:4] != request[1:4]:
         _, index, sub = _HEAD.unpack_from(response)
-        _, asked_index, asked_sub = _HEAD.unpack_from(request)
-        what = "aborted" if response[0] == _ABORT else "answered for"
-        return _COMMAND_INVALID, (f"the node {what} object 0x{index:04X} sub {sub}, asked was "
-                                  f"0x{asked_index:04X} sub {asked_sub}")
+        what = "abort" if response[0] == _ABORT else "confirmation"
+        return _COMMAND_INVALID, f"{what} of object 0x{index:04X} sub {sub}"
     if response[0] != _ABORT and not is_initiate and (response[0] ^ request[0]) & _TOGGLE:
-        return _TOGGLE_WRONG, "the node answered with the wrong toggle bit"
+        return _TOGGLE_WRONG, "wrong toggle bit"
     return 0, ""

@@ -9,8 +9,8 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.master import PLANT, BusError, Master
-from rig.network.sdo_client import CheckedSdoClient
+from rig.network.master import PLANT, Master
+from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import EmbeddedWire
 
 TYPE = bytes.fromhex("4300100000000000")  # of 0x1000
@@ -71,14 +71,13 @@ def download_scenario(sdo: CheckedSdoClient) -> None:
 
 
 @pytest.mark.parametrize(("transfer", "script", "line", "code"), [
-    (upload, ["4301100000000000"], "the node answered for object 0x1001 sub 0, asked was 0x1000 sub 0", 0x05040001),
-    (upload, ["4300100100000000"], "the node answered for object 0x1000 sub 1, asked was 0x1000 sub 0", 0x05040001),
-    (upload, ["8001100000000206"], "the node aborted object 0x1001 sub 0, asked was 0x1000 sub 0", 0x05040001),
+    (upload, ["4301100000000000"], "SDO of object 0x1000 sub 0: confirmation of object 0x1001 sub 0", 0x05040001),
+    (upload, ["4300100100000000"], "SDO of object 0x1000 sub 0: confirmation of object 0x1000 sub 1", 0x05040001),
+    (upload, ["8001100000000206"], "SDO of object 0x1000 sub 0: abort of object 0x1001 sub 0", 0x05040001),
     (upload, ["6000100000000000"], r"command specifier 3 \(0x60\), expected 2", 0x05040001),
     (upload, ["c200100000000000"], r"command specifier 6 \(0xC2\), expected 2", 0x05040001),
-    (upload, [None], "No SDO response received", 0x05040000),
-    (download, ["6017100100000000"], "answered for object 0x1017 sub 1, asked was 0x1017 sub 0", 0x05040001),
-    (download, ["6018100000000000"], "answered for object 0x1018 sub 0, asked was 0x1017 sub 0", 0x05040001),
+    (download, ["6017100100000000"], "SDO of object 0x1017 sub 0: confirmation of object 0x1017 sub 1", 0x05040001),
+    (download, ["6018100000000000"], "SDO of object 0x1017 sub 0: confirmation of object 0x1018 sub 0", 0x05040001),
     (download, ["4317100000000000"], r"command specifier 2 \(0x43\), expected 3", 0x05040001),
     (download, ["a017100000000000"], r"command specifier 5 \(0xA0\), expected 3", 0x05040001),
     (upload_name, ["4108100009000000", "1061626364656667"], "wrong toggle bit", 0x05030000),
@@ -92,9 +91,9 @@ def test_wrong_confirmation_ends_the_transfer(
     transfer: Callable[[CheckedSdoClient], object], script: Script, line: str, code: int
 ) -> None:
     sdo, server = client(*script)
-    with pytest.raises(SdoCommunicationError, match=line) as caught:
+    with pytest.raises(ConfirmationError, match=line) as caught:
         transfer(sdo)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("node 3, SDO of object ") and "\n" not in str(caught.value)
     flush(sdo)
     last = bytes.fromhex(server.requests[-1])
     assert (last[0], struct.unpack_from("<I", last, 4)[0]) == (0x80, code)
@@ -103,15 +102,15 @@ def test_wrong_confirmation_ends_the_transfer(
 
 
 @pytest.mark.parametrize(("transfer", "script", "line"), [
-    (upload, ["4b00100000000000"], "the node sent 2 bytes, the object has 4"),
-    (upload, ["4100100006000000", "0361626364656600"], "the node sent 6 bytes, the object has 4"),
-    (upload_name, ["4108100009000000", "0161626364656667"], "7 bytes came, 9 were announced"),
+    (upload, ["4b00100000000000"], "2 bytes, expected 4"),
+    (upload, ["4100100006000000", "0361626364656600"], "6 bytes, expected 4"),
+    (upload_name, ["4108100009000000", "0161626364656667"], "7 bytes, 9 were announced"),
 ])  # fmt: skip
 def test_wrong_length_of_a_finished_upload(
     transfer: Callable[[CheckedSdoClient], object], script: Script, line: str
 ) -> None:
     sdo, _ = client(*script)
-    with pytest.raises(SdoCommunicationError, match=line):
+    with pytest.raises(ConfirmationError, match=line):
         transfer(sdo)
 
 
@@ -135,7 +134,7 @@ def test_what_is_right_passes() -> None:
 def test_an_endless_upload_is_ended() -> None:
     sdo, server = client("4008100000000000", *["0061626364656667", "1061626364656667"] * 10)
     sdo.largest_upload = 100
-    with pytest.raises(SdoCommunicationError, match="more than 100 bytes"):
+    with pytest.raises(ConfirmationError, match="more than 100 bytes"):
         upload_name(sdo)
     flush(sdo)
     assert server.requests[-1].startswith("80")
@@ -166,7 +165,33 @@ def test_streams_and_block_transfer_are_not_offered() -> None:
     assert server.requests == []
 
 
-def test_the_master_names_node_and_object_in_one_line() -> None:
-    master = Master(EmbeddedWire(VirtualClock(), [lambda send: Server(send, ["6011220000000000"])]), lambda: 0)
-    with pytest.raises(BusError, match=r"node 3 \(plant\), object 0x2210: the node answered for object 0x2211 sub 0"):
+def test_silence_is_told_from_a_wrong_answer() -> None:
+    sdo, server = client(None)
+    with pytest.raises(SdoCommunicationError, match="No SDO response received"):
+        upload(sdo)
+    flush(sdo)
+    assert server.requests[-1] == "8000100000000405"  # the abort 0x05040000
+
+
+def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
+    """A foreign controller may refuse an object, or not answer; it may not confirm another one."""
+    def make(send: Send) -> Server:
+        return Server(send, ["6011220000000000"])
+
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    line = r"node 3, SDO of object 0x2210 sub 0: confirmation of object 0x2211 sub 0"
+    with pytest.raises(ConfirmationError, match=line):
         master.configure(b"12345678", None, 0)
+
+    class Controller(Server):
+        """Confirms 0x1006 with the index of another object, as node 2."""
+
+        def receive(self, frame: Frame) -> None:
+            if frame.cob_id == 0x602:
+                self._send(0x582, bytes.fromhex("6007100000000000"))
+            elif frame.cob_id == 0x603 and frame.data[0] != 0x80:
+                self._send(0x583, b"\x60" + frame.data[1:4] + bytes(4))
+
+    master = Master(EmbeddedWire(VirtualClock(), [lambda send: Controller(send, [])]), lambda: 0)
+    with pytest.raises(ConfirmationError, match="node 2, SDO of object 0x1006 sub 0: confirmation of object 0x1007"):
+        master.configure(b"1234", None, 0)
