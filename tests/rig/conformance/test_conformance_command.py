@@ -154,3 +154,15 @@ def test_a_foreign_node_is_not_written_to() -> None:
     outcome = examine(nothing, 2, options=Options(may_write=False))
     skipped = [result.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
     assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["4.15", "6.12"], [])
+
+
+@pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
+@pytest.mark.parametrize("node", ["controller", "plant", "c"])
+def test_our_nodes_pass_on_a_can_interface(bus_kind: str, node: str) -> None:
+    """SDO, PDO and NMT over the kernel's CAN; the rest takes minutes on a slow guest and is the same code."""
+    if node == "c":
+        skip_without_compiler()
+    chapters = [word for chapter in (1, 3, 4, 6) for word in ("--chapter", chapter)]
+    said = rig("conformance", node, "--bus", spec(bus_kind), "--json", "--timeout", 5, "--tolerance", 2000, *chapters)
+    failed = [(test["number"], test["measured"]) for test in said.json["tests"] if test["verdict"] == "fail"]
+    assert (failed, said.status) == ([], 0)
