@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from effect_files import COGGING, MEMORY, restored_catalogue
-from llvmlite.binding import get_host_cpu_features
+from other_cpus import compiles_for
 
 from plant import Actuator, InputError, Model, simulate
 from plant import lanes as lanes_module
@@ -207,7 +207,7 @@ def test_no_runs_and_no_cycles() -> None:
     assert lanes.closed_loop(np.array([[400.0]]), np.empty(0), np.empty(0)).shape == (1, 0, 4)
 
 
-@pytest.mark.skipif(not get_host_cpu_features().get("avx2"), reason="no wide registers for doubles here (AVX2)")
+@pytest.mark.skipif(not compiles_for("avx2"), reason="no code for wide registers here (AVX2)")
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly

@@ -21,6 +21,13 @@ WITHOUT_FMA = "glibc.cpu.hwcaps=" + ",".join(
 HASWELL = ("sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "avx", "avx2", "fma", "bmi", "bmi2", "lzcnt", "f16c", "movbe")
 
 
+def compiles_for(feature: str) -> bool:
+    """Whether numba compiles for a CPU with this feature: this one, or the one that NUMBA_CPU_NAME names."""
+    from numba.core.registry import cpu_target
+
+    return f"+{feature}" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+
+
 def list_disabled_features(*kept: str) -> str:
     """Switches off the vector code of NumPy that this CPU has, but for that of the `kept` instruction sets."""
     core = np._core._multiarray_umath  # type: ignore[attr-defined]
