@@ -39,6 +39,7 @@ class Link:
         self.error_frames = self.dropped = self.unsent = 0
         self._bus, self._clock = bus, clock
         self._in_controller = self._in_kernel = 0  # where frames overflowed
+        self._latest = 0  # ns: a frame came no earlier than the one before, even if somebody has set the clock since
         self._socket: socket.socket | None = None
         self._left_out: frozenset[int] = frozenset()
         if isinstance(bus, SocketcanBus):
@@ -119,9 +120,10 @@ class Link:
             for _, kind, value in ancillary:
                 if kind == _SO_TIMESTAMPNS:
                     seconds, ns = _TIMESPEC.unpack(value)
-                    t_ns = seconds * 1_000_000_000 + ns - epoch
+                    t_ns = max(self._latest, min(t_ns, seconds * 1_000_000_000 + ns - epoch))
                 elif kind == _SO_RXQ_OVFL:
                     self._in_kernel = int.from_bytes(value, "little")
+            self._latest = t_ns
             identifier, length, payload = _CAN_FRAME.unpack(data)
             if identifier < _ERROR:
                 frames.append(Frame(t_ns, identifier, payload[:length]))
