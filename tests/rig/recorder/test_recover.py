@@ -21,9 +21,9 @@ from rig.recorder.recover import recover_log
 WRITER = """
 import sys, time
 from pathlib import Path
-from synthetic_run import ATTACHMENTS, METADATA, cycles
+from synthetic_run import ATTACHMENTS, METADATA, build_cycles
 from rig.recorder import Recorder
-run = list(cycles())
+run = list(build_cycles())
 recorder = Recorder(Path(sys.argv[1]), ATTACHMENTS, METADATA)
 start = time.monotonic_ns()
 for t_ns, frames, signals, timing in run:
