@@ -39,7 +39,8 @@ def _read_git_state(root: Path) -> dict[str, str]:
     """Commit and whether files differ from it; nothing when this is no checkout or git is missing."""
     if not (root / ".git").exists():
         return {}
-    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
+    command = ["git", "--no-optional-locks",  # which a killed process would leave behind
+               "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
     try:
         lines = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
