@@ -22,7 +22,9 @@ def read_verdict(trace: Trace) -> Verdict:
     notes = trace.provenance
     failed = [check.name for check in trace.checks if not check.passed]
     word, why = notes.get("verdict.verdict") or _judge_checks(trace), notes.get("verdict.why", "")
-    if word == "INVALID_TIMING":
+    if word == "INVALID_TIMING" and notes.get("verdict.timing"):
+        return Verdict(word, notes["verdict.timing"])
+    if word == "INVALID_TIMING":  # logs of earlier versions
         late = notes.get("verdict.overruns") or str(int(trace.timing.overrun.sum()))
         limit = ""
         with contextlib.suppress(KeyError, ValueError):  # a log of another program may lack it

@@ -20,7 +20,7 @@ _CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
 _TIMESPEC = struct.Struct("@qq")
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
-_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40  # asm-generic/socket.h
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33  # asm-generic/socket.h
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
@@ -42,8 +42,10 @@ class Link:
         self._latest = 0  # ns: a frame came no earlier than the one before, even if somebody has set the clock since
         self._socket: socket.socket | None = None
         self._left_out: frozenset[int] = frozenset()
+        self._foreign = 0  # bits of a COB-ID that a frame must not have
         if isinstance(bus, SocketcanBus):
             self._socket = bus.socket
+            _enlarge_receive_buffer(self._socket)
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     @property
@@ -81,13 +83,25 @@ class Link:
     def leave_out(self, cob_ids: Collection[int]) -> None:
         """Frames with these COB-IDs are no longer received (another socket does); an empty collection: all are."""
         self._left_out = frozenset(cob_ids)
+        self._set_filters()
+
+    def select_nodes(self, most: int | None) -> None:
+        """Receive only the frames of nodes 0 to `most`, a power of two less one; None: all frames.
+
+        On socketcan the kernel drops the others, so that their number does not matter.
+        """
+        self._foreign = 0 if most is None else 0x7F & ~most
+        self._set_filters()
+
+    def _set_filters(self) -> None:
         if isinstance(self._bus, LoopbackBus):
-            attach_filter(self._bus.receiver, self._bus.own_port, sorted(cob_ids), refuses=True)
+            attach_filter(self._bus.receiver, self._bus.own_port, sorted(self._left_out), refuses=True)
         elif self._socket is not None:
             exact = _IDENTIFIER | _EXTENDED | _REMOTE
-            others = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(cob_ids)]
-            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(others)))
-            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(others) or _FILTER.pack(0, 0))
+            filters = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(self._left_out)]
+            filters += [_FILTER.pack(0, self._foreign)] if self._foreign else []
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, int(bool(filters)))
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
 
     def close(self) -> None:
         """Give the bus back."""
@@ -101,7 +115,7 @@ class Link:
                 self.error_frames += 1
             elif message.is_extended_id or message.is_remote_frame or message.is_fd:
                 self.dropped += 1
-            elif message.arbitration_id not in self._left_out:
+            elif message.arbitration_id not in self._left_out and not message.arbitration_id & self._foreign:
                 frames.append(Frame(self._clock(), message.arbitration_id, bytes(message.data)))
             message = self._bus.recv(0)
         return frames
@@ -137,3 +151,14 @@ class Link:
             self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
         else:
             self.dropped += 1
+
+
+def _enlarge_receive_buffer(raw: socket.socket, size: int = 4 << 20) -> None:
+    """Room for thousands of frames: by default the kernel drops what comes after 477 of them.
+
+    `size` in bytes; beyond the system's limit only with the right to (CAP_NET_ADMIN).
+    """
+    try:
+        raw.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
+    except OSError:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)

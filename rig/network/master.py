@@ -5,7 +5,8 @@ frames in, so one thread does all and the embedded bus needs no other.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Container
 from typing import Any
 
 import canopen
@@ -15,9 +16,10 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from dbc import EDS
 from plant.errors import RigError
 from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from rig.device.nmt import NmtState
+from rig.device.nmt import NmtCommand, NmtState
 from rig.network import codec
 from rig.network.frame import Frame
+from rig.network.identity import Identity, read_identity
 from rig.network.sdo_client import CheckedSdoClient
 from rig.network.wire import Wire
 from rig.nodes import firmware
@@ -26,6 +28,7 @@ from rig.nodes.firmware import GAINS, Gains
 
 NODE, CONTROLLER, PLANT = 1, 2, 3
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
+QUICK_HEARTBEAT = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
@@ -75,10 +78,14 @@ class Master:
         self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
         self.silent = False  # a fault: no heartbeat of ours
         self.states = {CONTROLLER: -1, PLANT: -1}
+        self.heard_ns: dict[int, int] = {}  # node: when its last heartbeat came, by the wire's clock
         self._booted: set[int] = set()
+        self._started_ns = 0  # when the nodes were told to become OPERATIONAL
+        self._operational: dict[int, float] = {}  # node: seconds from then to the heartbeat that says OPERATIONAL
+        self._before: dict[tuple[int, int, int], bytes] = {}  # objects that the run changes: node, index, sub
         self._rivals: set[int] = set()  # our own COB-IDs that another node sends
         self.network = _Network(wire, self.send)
-        self._nodes = {node: self._join(node) for node in (CONTROLLER, PLANT)}
+        self._nodes = {node: self._join(node) for node in (PLANT, CONTROLLER)}
         self._beat = HeartbeatProducer(NODE, lambda cob_id, data: None if self.silent else self.send(cob_id, data))
         self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
         self._state = NmtState.PRE_OPERATIONAL
@@ -97,6 +104,8 @@ class Master:
     def _heard(self, node: int, state: int) -> None:
         if state == NmtState.INITIALISING:
             self._booted.add(node)
+        if state == NmtState.OPERATIONAL:
+            self._operational.setdefault(node, (self.wire.clock.now() - self._started_ns) * 1e-9)
         if self.states[node] != state:
             self.states[node] = state
             self.on_state(node, state)
@@ -121,7 +130,7 @@ class Master:
         if self._services.get(frame.cob_id) != len(frame.data):
             return
         if frame.cob_id in self._watch.cob_ids:
-            now = self.wire.clock.now()
+            self.heard_ns[frame.cob_id - 0x700] = now = self.wire.clock.now()
             self._watch.receive(Frame(now, frame.cob_id, frame.data))
             if frame.data[0] != NmtState.INITIALISING:  # not a boot-up
                 self.on_heartbeat(frame.cob_id - 0x700, frame.t_ns if self._stamped else now)
@@ -133,34 +142,50 @@ class Master:
         self._beat.tick(now, self._state)
         self._watch.tick(now)
 
+    def boot(self) -> None:
+        """Send the boot-up message of the rig (CiA 301, 7.2.8.3.3)."""
+        self._beat.send_boot_up()
+
     def reset(self) -> None:
-        """Reset communication of all nodes and wait for their boot-up.
+        """Reset communication of the nodes of the bench and wait for their boot-up.
 
         Raises:
             BusError: a node did not boot.
         """
+        self._empty_receive_buffer()
         self._booted.clear()
-        self.network.nmt.send_command(130)
+        for node in self._nodes:
+            self._command_node(node, NmtCommand.RESET_COMMUNICATION)
         self.wire.wait(lambda: self._booted >= {CONTROLLER, PLANT}, BOOT_TIMEOUT)
         silent = [f"node {node} ({NAMES[node]})" for node in (CONTROLLER, PLANT) if node not in self._booted]
         if silent:
             raise BusError(f"no boot-up from {' and '.join(silent)} within {BOOT_TIMEOUT:g} s of an NMT reset")
 
+    def _empty_receive_buffer(self) -> None:
+        """Take in the frames that wait: a full buffer would have no room for the answers to come."""
+        self.wire.run_until(self.wire.clock.now())
+
     def is_present(self, node: int, seconds: float) -> bool:
         """Whether a node answers an NMT reset of its communication."""
+        self._empty_receive_buffer()
         self._booted.discard(node)
-        self._nodes[node].nmt.send_command(130)
+        self._command_node(node, NmtCommand.RESET_COMMUNICATION)
         return self.wire.wait(lambda: node in self._booted, seconds)
 
     def hears_rival(self, seconds: float) -> bool:
         """Whether another rig is active on the bus; only listens, at most `seconds`."""
         return self.wire.wait(lambda: bool(self._rivals), seconds)
 
-    def configure(self, scenario: bytes, gains: Gains | None, period_ns: int, limit_ms: int = HEARTBEAT_LIMIT) -> None:
+    def read_identity(self, node: int) -> Identity:
+        """What a node says about itself; objects that it does not have are None."""
+        return read_identity(lambda index, sub: self._upload(node, index, sub))
+
+    def configure(self, scenario: bytes, gains: Gains | None, sync_period_us: int,
+                  limit_ms: int = HEARTBEAT_LIMIT) -> None:
         """Load the scenario into the plant and, for our own firmware, its gains; set heartbeats and cycle period.
 
-        `period_ns` 0 switches the supervision of SYNC off: in lockstep SYNC has no fixed period. `limit_ms` is the
-        heartbeat timeout. A foreign controller (no `gains`) may refuse objects that it does not have.
+        `sync_period_us` goes to 0x1006; 0 switches the supervision of SYNC off: in lockstep SYNC has no fixed period.
+        `limit_ms` is the heartbeat timeout. A foreign controller (no `gains`) may refuse objects that it does not have.
 
         Raises:
             BusError: a node refused or did not answer.
@@ -170,8 +195,9 @@ class Master:
             self._write(CONTROLLER, GAINS, sub, value)
         for node in (CONTROLLER, PLANT):
             foreign = node == CONTROLLER and gains is None
-            settings = ((0x1006, 0, period_ns // 1000), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, HEARTBEAT))
+            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, QUICK_HEARTBEAT))
             for index, sub, value in settings:
+                self._keep(node, index, sub)
                 try:
                     self._write(node, index, sub, value)
                 except BusError:
@@ -180,18 +206,74 @@ class Master:
         self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
         self._beat.configure(HEARTBEAT, self.wire.clock.now())
 
+    def restore(self, gone: Container[int] = ()) -> list[str]:
+        """Set 0x1006 and 0x1016 back to what they were before `configure`, except in nodes that are gone.
+
+        Otherwise a node that stays on the bus would go on watching a rig that has left. Returns the failures in words.
+        """
+        failures = []
+        for (node, index, sub), data in self._before.items():
+            if node in gone:
+                continue
+            try:
+                self._nodes[node].sdo.download(index, sub, data)
+            except (SdoAbortedError, SdoCommunicationError) as error:
+                failures.append(f"node {node} {NAMES[node]}: 0x{index:04X} sub {sub} was not set back ({error})")
+        self._before.clear()
+        return failures
+
+    def _keep(self, node: int, index: int, sub: int) -> None:
+        """Remember what an object was, for `restore`; 0x1017 may stay, for a heartbeat does no harm."""
+        if index != 0x1017 and (data := self._upload(node, index, sub)) is not None:
+            self._before.setdefault((node, index, sub), data)
+
     def start(self) -> None:
-        """Set all nodes, this one included, to OPERATIONAL."""
-        self.command(1, NmtState.OPERATIONAL)
+        """Tell the nodes to become OPERATIONAL; the rig is from now on."""
+        self._operational.clear()
+        self._started_ns = self.wire.clock.now()
+        self._command(NmtCommand.START, NmtState.OPERATIONAL)
+
+    def wait_for_operational(self, seconds: float) -> dict[int, float]:
+        """Wait until the heartbeat of each node says OPERATIONAL, at most `seconds`, and slow the heartbeats down.
+
+        Returns the seconds since `start` by node; a node that did not become OPERATIONAL is missing.
+        """
+        def are_operational() -> bool:
+            self.tick()  # the nodes watch the rig's heartbeat meanwhile
+            return self._operational.keys() >= self._nodes.keys()
+
+        self.wire.wait(are_operational, seconds)
+        for node in self._operational:
+            with contextlib.suppress(BusError):  # of a foreign node whose heartbeat time is fixed
+                self._write(node, 0x1017, 0, HEARTBEAT)
+        return dict(self._operational)
+
+    def find_silent(self, seconds: float) -> list[int]:
+        """Wait for a heartbeat of each node, at most `seconds`; returns the nodes that sent none."""
+        begin = self.wire.clock.now()
+
+        def are_heard() -> bool:
+            self.tick()
+            return not find_unheard()
+
+        def find_unheard() -> list[int]:
+            return [node for node in self._nodes if self.heard_ns.get(node, -1) < begin]
+
+        self.wire.wait(are_heard, seconds)
+        return find_unheard()
 
     def stop(self) -> None:
-        """Set all nodes to PRE-OPERATIONAL."""
-        self.command(128, NmtState.PRE_OPERATIONAL)
+        """Tell the nodes to become PRE-OPERATIONAL; the rig is from now on."""
+        self._command(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
 
-    def command(self, specifier: int, state: NmtState) -> None:
-        """Send an NMT command to all nodes."""
+    def _command(self, command: NmtCommand, state: NmtState) -> None:
+        """Send an NMT command to each node of the bench. Node 0, all nodes, would reach others on the bus as well."""
         self._state = state
-        self.network.nmt.send_command(specifier)
+        for node in self._nodes:
+            self._command_node(node, command)
+
+    def _command_node(self, node: int, command: NmtCommand) -> None:
+        self._nodes[node].nmt.send_command(int(command))
 
     def read_gains(self) -> Gains | None:
         """The gains of the controller (object 0x2110); None if it does not have them."""
@@ -204,6 +286,15 @@ class Master:
     def errors(self) -> list[int]:
         """Nodes whose last EMCY has an error register."""
         return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
+
+    def _upload(self, node: int, index: int, sub: int) -> bytes | None:
+        """An object's bytes; None if the node does not have it or does not answer."""
+        sdo = self._nodes[node].sdo
+        try:
+            data: bytes = sdo.upload(index, sub)
+        except (SdoAbortedError, SdoCommunicationError):
+            return None
+        return data
 
     def _write(self, node: int, index: int, sub: int, value: Any) -> None:
         try:

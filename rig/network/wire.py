@@ -20,6 +20,7 @@ class Wire(Protocol):
     clock: Clock
     send: Send
     receive: Callable[[Frame], None]  # where incoming frames go; set by the master
+    is_node_gone: Done  # whether a node will not answer any more; set by the session
 
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
@@ -30,6 +31,9 @@ class Wire(Protocol):
     def run_until(self, t_ns: int) -> None:
         """Real time: let frames come in until the clock says `t_ns`."""
 
+    def hear_all(self) -> None:
+        """Let the frames of nodes that are not of the bench in, for the log; during bring-up they stay out."""
+
     def close(self) -> None:
         """Give the bus back."""
 
@@ -38,12 +42,18 @@ def _ignore_frame(frame: Frame) -> None:
     """Nobody listens yet."""
 
 
+def _is_false() -> bool:
+    """Nobody watches the nodes yet."""
+    return False
+
+
 class EmbeddedWire:
     """All nodes in this process and thread. With a virtual clock a run repeats bit for bit."""
 
     def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
         self.clock, self._period = clock, period_ns
         self.receive: Callable[[Frame], None] = _ignore_frame
+        self.is_node_gone: Done = _is_false
         self._bus = EmbeddedBus()
         self.send = self._bus.attach(lambda frame: self.receive(frame))
         self._nodes = [self._bus.add(make) for make in makers]
@@ -72,6 +82,9 @@ class EmbeddedWire:
             self.clock.sleep_until(min(t_ns, self.clock.now() + MS))
             self._deliver(self.clock.now())
 
+    def hear_all(self) -> None:
+        """See `Wire`; all frames come in here."""
+
     def close(self) -> None:
         """See `Wire`; nothing to give back."""
 
@@ -92,6 +105,7 @@ class LinkWire:
         self.link, self._grace = link, grace
         self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _ignore_frame
+        self.is_node_gone: Done = _is_false
         self.send: Send = link.send
 
     def wait(self, done: Done, seconds: float) -> bool:
@@ -105,9 +119,15 @@ class LinkWire:
         return True
 
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
-        """See `Wire`; a frame that does not come within the grace time is missing; after several, it waits less."""
+        """See `Wire`; a frame that does not come within the grace time is missing; after several, it waits less.
+
+        When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
+        """
         is_patient = self._missed < _PATIENCE
-        is_answered = self.wait(done, self._grace if is_patient else 0.1 * self._grace)
+        grace = self._grace if is_patient else 0.1 * self._grace
+        is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
+        if self.is_node_gone():
+            self.wait(done, 1e-3)
         self._missed = 0 if is_answered else self._missed + 1
 
     def run_until(self, t_ns: int) -> None:
@@ -115,6 +135,10 @@ class LinkWire:
         self.poll(0.0)
         while (left := t_ns - self.clock.now()) > 0:
             self.poll(left * 1e-9)
+
+    def hear_all(self) -> None:
+        """See `Wire`."""
+        self.link.select_nodes(None)
 
     def close(self) -> None:
         """See `Wire`."""

@@ -104,8 +104,8 @@ class Emulator:
                 heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
             if action is not None:
                 return
-        elif cob_id == _HEARTBEAT and not self._faults.is_heartbeat_alive("plant", self._cycle):
-            return
+        elif cob_id == _HEARTBEAT and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
+            return  # before the first SYNC there is no cycle: bring-up needs the heartbeat
         self._send(cob_id, data)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:

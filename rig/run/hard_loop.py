@@ -216,6 +216,10 @@ class HardLoop:
         while status == hc.WAITING:
             status = self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US)
             self._wire.poll(0.0)
+            if self._wire.is_node_gone():  # it will not answer; the others can within a period
+                limit = self._origin + self._wire.clock.now() + self._period
+                self._words[hc.ANSWER_LIMIT] = min(self._words[hc.ANSWER_LIMIT], limit)
+                self._words[hc.GRACE] = self._period
         if status < 0:
             raise self._bus.explain_failure(status)
         self._drain()

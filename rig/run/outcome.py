@@ -2,9 +2,11 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,10 @@ import numpy as np
 
 from fdi.output import write_text
 from fdi.report.json import to_plain
-from plant.segments import Array
+from plant.segments import RATE, Array
+from rig.network.identity import Identity
+from rig.network.master import NAMES
+from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.loop import Loop
@@ -31,19 +36,22 @@ class Outcome:
     folder: Path
     checks: Sequence[CheckResult]
     events: Sequence[SessionEvent]
-    aborted: str  # why, or ""
+    aborted: str  # why main ended early, or ""
     safe: bool  # the safe state was entered
     interrupted: bool
     timing: dict[str, Any]
     counters: dict[str, int]
     speed: float  # multiple of real time, of the cycles alone
+    attribution: Attribution
+    due_ns: Sequence[int]  # log time of each cycle
+    start_times: dict[int, float]  # s from NMT start to OPERATIONAL, by node
+    identities: dict[int, Identity]
     fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
 
     @property
     def verdict(self) -> str:
         """PASS, FAIL, INVALID_TIMING or ABORTED. If the bench itself was late, the controller is not judged."""
-        late = self.job.realtime and self.timing["overruns"] > self.job.max_overruns * self.timing["cycles"]
-        if late and not self.interrupted:
+        if self.timing_problem and not self.interrupted:
             return "INVALID_TIMING"
         if self.aborted:
             return "ABORTED"
@@ -57,11 +65,74 @@ class Outcome:
         return failed if self.safe or not meant else [*failed, "the run did not end in the safe state"]
 
     @property
+    def timing_problem(self) -> str:
+        """Why the bench itself was too late to judge the controller; empty if it was not."""
+        cause = self.attribution.cause
+        if cause is not None and cause.is_lateness:
+            return self.describe_cause()
+        if self.job.realtime and (problem := self._find_excess()):
+            return problem
+        if self.aborted or not self.failures:
+            return ""
+        failed = [check for check in self.checks if not check.passed]
+        is_affected = len(failed) == len(self.failures) and all(map(self._is_affected, failed))
+        if self.attribution.by_bench or is_affected:
+            return (f"the bench was late, and the checks that failed depend on it: {'; '.join(self.failures)}; "
+                    f"{self._describe_first_lateness()}")
+        return ""
+
+    def _find_excess(self) -> str:
+        """Whether there were more overruns than the sequence accepts, up to the first cause of trouble; in words."""
+        policy, overruns = self.job.sequence.timing, self.attribution.overruns.copy()
+        overruns[:round(policy.grace * RATE)] = 0
+        if self.attribution.cause is not None and self.aborted:
+            overruns = overruns[:self.attribution.cause.cycle]
+        total, most = int(overruns.sum()), policy.most_in_a_row
+        accepted = self.job.max_overruns * self.timing["cycles"]
+        if total > accepted:
+            return (f"the bench itself was late: {total} overruns in {self.timing['cycles']} cycles, more than "
+                    f"{100 * self.job.max_overruns:g} %: the controller cannot be judged; "
+                    f"{self._describe_first_lateness()}")
+        if most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
+            return (f"the bench itself was late: {in_a_row} overruns in a row, {most} are accepted: the controller "
+                    f"cannot be judged; {self._describe_first_lateness()}")
+        return ""
+
+    def _is_affected(self, check: CheckResult) -> bool:
+        """Whether a check saw rows that lateness of the bench changed."""
+        first, last = (0.0 if isnan(t) else t for t in (check.t0, check.t1))
+        start = self.job.scenario.plan.start
+        rows = slice(start + round(first * RATE), start + round(last * RATE) if last > first else None)
+        return bool(self.attribution.affected[rows].any())
+
+    def _describe_first_lateness(self) -> str:
+        first = min(self.attribution.disturbances, key=lambda found: found.first, default=None)
+        return f"first t = {self.find_time(first.first):.3f} s: {first.text}" if first else ""
+
+    def find_time(self, cycle: int) -> float:
+        """The time of a cycle, s of main."""
+        return (cycle - self.job.scenario.plan.start) / RATE
+
+    def describe_cause(self) -> str:
+        """The first cause with its time, and what followed from it; empty if there was no trouble."""
+        cause = self.attribution.cause
+        if cause is None:
+            return ""
+        if cause.text == self.aborted and not self.attribution.consequences:
+            return self.aborted
+        then = [f"{trouble.text} at {self.find_time(self._find_cycle(trouble)):.3f} s"
+                for trouble in self.attribution.consequences[:4]]
+        text = f"t = {self.find_time(cause.cycle):.3f} s: {cause.text}"
+        return f"{text}; then: {', '.join(then)}" if then else text
+
+    def _find_cycle(self, trouble: Trouble) -> int:
+        return max(bisect_right(self.due_ns, trouble.t_ns) - 1, 0)
+
+    @property
     def why(self) -> str:
         """The reason of a verdict other than PASS, in words."""
-        late = (f"the bench itself was late: {self.timing['overruns']} overruns in {self.timing['cycles']} cycles, "
-                f"more than {100 * self.job.max_overruns:g} %: the controller cannot be judged")
-        words = {"FAIL": "; ".join(self.failures), "ABORTED": self.aborted, "INVALID_TIMING": late}
+        words = {"FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
+                 "ABORTED": self.describe_cause() or self.aborted}
         return words.get(self.verdict, "")
 
     @property
@@ -75,8 +146,30 @@ class Outcome:
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [to_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
+                **self._attribution_to_json(),
+                "nodes": {str(node): self._node_to_json(node) for node in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
                 "run": self.job.settings(), "fdi": self.fdi}
+
+    def _attribution_to_json(self) -> dict[str, Any]:
+        found = self.attribution
+        cause = None if found.cause is None else {
+            "source": name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
+            "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
+        consequences = [{"t": self.find_time(self._find_cycle(trouble)), "source": name_node(trouble.node),
+                         "kind": trouble.kind, "text": trouble.text} for trouble in found.consequences]
+        cycles = len(found.judged)
+        judged = {"cycles": cycles, "judged": int(found.judged.sum()), "invalid": found.invalid,
+                  "overruns": int(found.overruns.sum()),
+                  "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
+                                "source": name_node(each.source), "text": each.text}
+                               for each in found.disturbances[:100]]}
+        return {"cause": cause, "consequences": consequences[:100], "judged": judged}
+
+    def _node_to_json(self, node: int) -> dict[str, Any]:
+        seconds = self.start_times.get(node)
+        return {"name": NAMES[node], "identity": self.identities[node]._asdict(),
+                "operational_ms": None if seconds is None else round(1e3 * seconds, 1)}
 
     def save(self) -> None:
         """Write verdict.json."""
@@ -92,6 +185,18 @@ def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list
         if seen[event.kind] <= most:
             selected.append(event)
     return selected, {kind: count - most for kind, count in seen.items() if count > most}
+
+
+def name_source(cause: Cause) -> str:
+    """Who a cause names: a node, "sequence" for a fault of the sequence, else the kind of the trouble."""
+    if cause.kind == "injected":
+        return "sequence"
+    return name_node(cause.source) or cause.kind
+
+
+def name_node(node: int) -> str:
+    """A node in words, such as "node 2 controller"; empty for none."""
+    return f"node {node} {NAMES[node]}" if node in NAMES else ""
 
 
 def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str) -> dict[str, Any]:

@@ -3,10 +3,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import NamedTuple
 
 from plant import InputError, Model
 from plant.effects import CATALOGUE
@@ -20,6 +20,7 @@ from rig.network.wire import EmbeddedWire, LinkWire, Wire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
+from rig.run.processes import NodeProcesses
 
 EMBEDDED_NAMES = ("embedded", "virtual")
 RIVAL_TIMEOUT = 0.25  # s: a rig at work is heard within this
@@ -28,11 +29,16 @@ LOST_FRAME_TIMEOUT = 0.2  # s: the same where frames are to be lost, so that the
 BOOT_TIMEOUT = 0.7  # s: a node that is there boots within this
 START_TIMEOUT = 60.0  # s: a node of our own may have to compile the plant first
 
-Child = subprocess.Popen[bytes]
+
+class Participants(NamedTuple):
+    """The rig's end of the bus, and the nodes that the rig started as processes of their own."""
+
+    wire: Wire
+    processes: NodeProcesses
 
 
 @contextlib.contextmanager
-def open_wire(job: Job) -> Iterator[Wire]:
+def open_participants(job: Job) -> Iterator[Participants]:
     """Open the bus and start the nodes of this job on it: inside this process, or as processes of their own.
 
     Raises:
@@ -48,24 +54,26 @@ def open_wire(job: Job) -> Iterator[Wire]:
         if job.controller != "builtin" or job.plant == "external":
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
         makers: list[Callable[[Send], Node]] = [Emulator, partial(Firmware, model=job.model)]
-        yield EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
+        wire = EmbeddedWire(WallClock() if job.realtime else VirtualClock(), makers, job.period_ns)
+        yield Participants(wire, NodeProcesses())
         return
     if job.controller == "c":
         require_firmware_bus(job.bus)
         build_controller()  # now, where an error is still reported before anything is on the bus
     clock = WallClock()
     timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
-    wire = LinkWire(Link(open_can(job.bus), clock.now), clock, timeout)
-    children: list[Child] = []
+    link_wire = LinkWire(Link(open_can(job.bus), clock.now), clock, timeout)
+    link_wire.link.select_nodes(3)  # until bring-up is over: boot-ups must not be lost among the frames of others
+    processes = NodeProcesses()
     try:
-        _start_missing_nodes(job, Master(wire, clock.now), children)
-        yield wire
+        _start_missing_nodes(job, Master(link_wire, clock.now), processes)
+        yield Participants(link_wire, processes)
     finally:
-        _stop_processes(children)
-        wire.close()
+        processes.stop()
+        link_wire.close()
 
 
-def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> None:
+def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses) -> None:
     """Start the nodes of this job that do not answer on the bus. Raises BusError."""
     if master.hears_rival(RIVAL_TIMEOUT):  # before sending anything: a reset would end the other rig's test
         raise BusError(f"another rig is active on {job.bus}: received a SYNC or heartbeat of node 1")
@@ -76,20 +84,8 @@ def _start_missing_nodes(job: Job, master: Master, children: list[Child]) -> Non
         if node == CONTROLLER and wanted != "external" and there:
             raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
         if not there:
-            children.append(_start_node(job, NAMES[node]))
-            _wait_for_node(master, node, children[-1])
-
-
-def _stop_processes(children: Sequence[Child]) -> None:
-    """Terminate the processes that we started; kill those that do not end within 5 s."""
-    for child in children:
-        child.terminate()
-    for child in children:
-        try:
-            child.wait(5)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
+            processes.start(node, _make_command(job, node))
+            _wait_for_node(master, node, processes)
 
 
 def require_firmware_bus(bus: str) -> None:
@@ -104,28 +100,24 @@ def find_firmware_parameters(model: Model) -> dict[str, float]:
     return {name: model[name] for effect in acting if effect.acts(model.values) for name in effect.parameters}
 
 
-def _start_node(job: Job, name: str) -> Child:
-    """A node of our own in its own process, which ends when this one does.
-
-    It has its own session, so that Ctrl-C reaches the rig alone: clean-up needs its plant.
-    """
-    if name == NAMES[CONTROLLER] and job.controller == "c":
-        words = [str(build_controller()), job.bus, "--parent", str(os.getpid())]
-        return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
-    effects = [word for path in job.effects for word in ("--effects", str(path))]
-    if name == NAMES[CONTROLLER]:  # all else about the model comes by SDO
+def _make_command(job: Job, node: int) -> list[str]:
+    """The command that runs a node of this job as a process of its own, which ends when this one does."""
+    parent = ["--parent", str(os.getpid())]
+    if node == CONTROLLER and job.controller == "c":
+        return [str(build_controller()), job.bus, *parent]
+    words = [sys.executable, "-m", "rig.cli.main", "node", NAMES[node], "--bus", job.bus, "--quiet", *parent]
+    words += [word for path in job.effects for word in ("--effects", str(path))]
+    if node == CONTROLLER:  # all else about the model comes by SDO
         for parameter, value in find_firmware_parameters(job.model).items():
-            effects += ["--set", f"{parameter}={value!r}"]
-    command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", job.bus, "--quiet", "--parent",
-               str(os.getpid()), *effects]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+            words += ["--set", f"{parameter}={value!r}"]
+    return words
 
 
-def _wait_for_node(master: Master, node: int, child: Child) -> None:
+def _wait_for_node(master: Master, node: int, processes: NodeProcesses) -> None:
     """Until a node of our own answers. Raises BusError when it does not."""
     for _ in range(round(START_TIMEOUT)):
         if master.is_present(node, 1.0):
             return
-        if child.poll() is not None:
+        if node in processes.find_ended():
             break
     raise BusError(f"our own node {node} ({NAMES[node]}) did not start")

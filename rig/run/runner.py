@@ -16,11 +16,12 @@ from rig.network.codec import Flags
 from rig.network.raw_bus import can_open
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
+from rig.run.attribution import CycleRecords, Mask, attribute, find_injected
 from rig.run.hard_loop import compile_cycle
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.outcome import Outcome, summarise_timing
-from rig.run.participants import open_wire
+from rig.run.participants import open_participants
 from rig.run.priority import (
     LOOP_PRIORITY,
     lock_memory,
@@ -31,6 +32,7 @@ from rig.run.priority import (
 )
 from rig.run.session import MAIN, Session
 from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 
 
@@ -44,8 +46,8 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         Actuator(job.scenario.model).warm()
     if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
         compile_cycle(job.realtime)
-    with lock_folder(folder), open_wire(job) as wire, open_recorder(job, folder) as recorder:
-        session = Session(job, wire, recorder, progress, stop)
+    with lock_folder(folder), open_participants(job) as participants, open_recorder(job, folder) as recorder:
+        session = Session(job, participants, recorder, progress, stop)
         progress("bring-up", 0.0)
         session.bring_up()
         assert session.loop is not None
@@ -65,27 +67,43 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         kind = f"{loop.kind} real time" if job.realtime else "lockstep"
         recorder.metadata("timing", {"kind": kind})
         history = session.history
-        checks = judge_run(job, session)
+        attribution = attribute(collect_records(job, session), session.troubles, job.sequence.timing, session.gone)
+        checks = judge_run(job, session, attribution.judged)
         for check in checks:
             recorder.put(session.now(), _make_check_record(check))
         outcome = Outcome(
             job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
             interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind),
-            counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent)
-        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.aborted or "; ".join(outcome.failures),
-                                      "overruns": str(loop.overruns)})
+            counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
+            attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
+            identities=session.identities)
+        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
+                                      "timing": outcome.timing_problem})
     outcome.save()
     return outcome
 
 
-def judge_run(job: Job, session: Session) -> list[CheckResult]:
+def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
     """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks."""
     main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
                               sequence.fault_starts())
-    return [*results, *judge_protocol(session.read_protocol_record(), sequence.protocol)]
+    return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
+
+
+def collect_records(job: Job, session: Session) -> CycleRecords:
+    """The records of all cycles for the attribution. In lockstep nothing is late; frames are there or missing."""
+    history = session.history
+    columns = {name: history.column(name) for name in ("lateness", "feedback_response", "valve_response", "response")}
+    if not job.realtime:
+        columns = {name: np.where(np.isnan(values), values, 0.0) for name, values in columns.items()}
+    plan = job.scenario.plan
+    injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
+    return CycleRecords(np.array(session.due_ns, dtype=np.int64), columns["lateness"], columns["feedback_response"],
+                        columns["valve_response"], columns["response"], history.column("flags").astype(np.int64),
+                        injected)
 
 
 @contextlib.contextmanager

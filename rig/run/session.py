@@ -7,27 +7,34 @@ every other sequence ends main.
 from __future__ import annotations
 
 import bisect
+from array import array
 from collections.abc import Callable
+from itertools import filterfalse
 from typing import NamedTuple
 
 from canopen.emcy import EmcyError
 
 from fdi.progress import Progress
-from plant.profile import Profile
-from plant.segments import RATE
+from plant.errors import InputError
+from plant.profile import Profile, build_profile
+from plant.segments import RATE, Hold
 from rig.device.nmt import NmtState
 from rig.network.clock import WallClock
 from rig.network.codec import Control
+from rig.network.identity import Identity
 from rig.network.master import CONTROLLER, HEARTBEAT, HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, PLANT, Master
-from rig.network.wire import EmbeddedWire, Wire
+from rig.network.wire import EmbeddedWire
 from rig.nodes import firmware
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
+from rig.run.attribution import Mask, Trouble
 from rig.run.hard_loop import open_loop
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.loop import CycleInput, Loop
+from rig.run.overruns import OverrunWatch
+from rig.run.participants import Participants
 from rig.run.probe import (
     AFTER,
     BEFORE,
@@ -41,6 +48,7 @@ from rig.run.probe import (
     make_probe_scenario,
     read_rows,
 )
+from rig.run.processes import describe_exit
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import GuardWatch
 from rig.sequences.protocol import Emergency, ProtocolRecord, Rows
@@ -60,9 +68,11 @@ class SessionEvent(NamedTuple):
 
 
 class Session:
-    """Runs a job's sequence on a wire. `stop()`, called every cycle, is True when the operator wants to end."""
+    """Runs a job's sequence on a bus. `stop()`, called every cycle, is True when the operator wants to end."""
 
-    def __init__(self, job: Job, wire: Wire, recorder: Recorder, progress: Progress, stop: Callable[[], bool]) -> None:
+    def __init__(self, job: Job, participants: Participants, recorder: Recorder, progress: Progress,
+                 stop: Callable[[], bool]) -> None:
+        wire, self._processes = participants
         self.job, self.recorder, self._progress, self._stop = job, recorder, progress, stop
         self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
         self.scenario = job.scenario
@@ -72,6 +82,12 @@ class Session:
         self.loop: Loop | None = None
         self.events: list[SessionEvent] = []
         self.history = History()
+        self.due_ns = array("q")  # log time of each cycle
+        self.troubles: list[Trouble] = []
+        self.gone: dict[int, str] = {}  # nodes that do not answer any more, and how that is known
+        self.identities: dict[int, Identity] = {}
+        self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
+        self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9)
         self._probes: list[History] = []  # played before set-up
         self._after = History()  # the probe after clean-up
         self._is_probing = False  # before set-up: nothing that happens there ends the run
@@ -91,6 +107,9 @@ class Session:
         self._agenda: list[tuple[int, str, str, str]] = []  # events of cycles that are queued: cycle, level, kind, text
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
         self._clock = wire.clock
+        self._last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of the node
+        self._next_look = 0  # when to look again whether the processes of the nodes are alive
+        wire.is_node_gone = self._is_node_gone
         self._master = Master(wire, self.now, job.realtime)
         self._master.on_frame = recorder.frame
         self._master.on_emcy = self._emcy
@@ -99,7 +118,7 @@ class Session:
         self._master.on_lost = self._handle_silence
         self._master.on_rival = lambda cob_id: self._handle_trouble(
             "bus", f"another node sends 0x{cob_id:03X}, a frame of node {NODE} {NAMES[NODE]}")
-        self._master.on_back = lambda node: self.log_event("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+        self._master.on_back = self._handle_return
 
     def now(self) -> int:
         """Time for the log, ns since the run began."""
@@ -130,6 +149,12 @@ class Session:
             cycle, *words = self._agenda.pop(0)
             self._record_event(t_ns, SessionEvent(self._main_time(cycle), *words))
         self.history.add(signals, timing)
+        self.due_ns.append(t_ns)
+        if signals.xs == signals.xs:  # not NaN
+            self._last_answers[PLANT] = signals.cycle
+        if signals.cor == signals.cor:
+            self._last_answers[CONTROLLER] = signals.cycle
+        self._overruns.add(timing)
         if self._watch and signals.phase != CLEANUP:
             self._unjudged.append(signals)
         self.recorder.cycle(t_ns, signals, timing)
@@ -141,25 +166,32 @@ class Session:
             BusError: a node does not answer or refuses.
         """
         self.log_event("INFO", "phase", "bring-up")
+        self._master.boot()
         if self.job.sequence.protocol.probe:
             self._play_probes()
-        self._start_nodes(self.scenario)
+        if not self.aborted:
+            self._start_nodes(self.scenario)
+        self._master.wire.hear_all()
         self.loop = self._make_loop(self._faults)
         for times in self._heartbeats.values():
             times.clear()
         self._begun_ns, self._playing = self._clock.now(), True
 
     def _start_nodes(self, scenario: Scenario) -> None:
-        """Reset, configure and start the nodes. Raises BusError."""
+        """Reset, identify, configure and start the nodes. Raises BusError and InputError."""
         job = self.job
         self._master.reset()
+        if not self.identities:
+            self._identify_nodes()
         gains = firmware.read_gains(job.model) if job.controller != "external" else None
         if self._gains is None:
             self._gains = gains or self._master.read_gains()
         patient = not job.realtime and isinstance(self._clock, WallClock)
-        self._master.configure(scenario.to_bytes(), gains, job.period_ns if job.realtime else 0,
+        self._master.configure(scenario.to_bytes(), gains,
+                               job.sequence.timing.choose_sync_period() if job.realtime else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
+        self._wait_for_operational(job.sequence.timing.operational)
 
     def _make_loop(self, faults: Schedule) -> Loop:
         return open_loop(self._master, faults, self, self.job.bus, self.job.period_ns, self.job.realtime)
@@ -170,6 +202,8 @@ class Session:
         self._is_probing = True
         for _ in range(PROBES):
             self._start_nodes(scenario)
+            if self.aborted:
+                break
             self._probes.append(History())
             self.loop = self._make_loop(Schedule(scenario.plan, scenario.model.values))
             try:
@@ -193,16 +227,17 @@ class Session:
         for step in list_inputs(LAST_STEPS, AFTER, self._demand):
             self.loop.cycle(step)
 
-    def read_protocol_record(self) -> ProtocolRecord:
-        """All that the protocol checks of this run are judged by."""
+    def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
+        """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
         job, model = self.job, self.job.model
         seconds = job.period_ns * 1e-9
 
-        def read(history: History, faults: Schedule | None = None) -> Rows:
-            return read_rows(history, find_on_time(history, faults, job.realtime, seconds))
+        def read(history: History) -> Rows:
+            return read_rows(history, find_on_time(history, None, job.realtime, seconds))
 
+        run = read_rows(self.history, judged & find_on_time(self.history, self._faults, job.realtime, seconds))
         return ProtocolRecord(
-            run=read(self.history, self._faults), probes=[read(probe) for probe in self._probes if len(probe)],
+            run=run, probes=[read(probe) for probe in self._probes if len(probe)],
             after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
             heartbeats={NAMES[node]: [t_ns * 1e-9 for t_ns in times] for node, times in self._heartbeats.items()},
             heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9), heartbeat_period=HEARTBEAT * 1e-3,
@@ -210,29 +245,80 @@ class Session:
             gains=None if has_firmware_effects(model) else self._gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)
 
+    def _identify_nodes(self) -> None:
+        """Read and log what the nodes say about themselves; refuse a firmware that the sequence is not meant for.
+
+        Raises:
+            InputError: another firmware.
+        """
+        for node in (CONTROLLER, PLANT):
+            identity = self._master.read_identity(node)
+            self.identities[node] = identity
+            self.log_event("INFO", "identity", f"node {node} {NAMES[node]}: {identity}")
+            self.recorder.metadata(f"node{node}", {key: str(value) for key, value in identity._asdict().items()
+                                                   if value is not None})
+        sequence = self.job.sequence
+        key, difference = sequence.firmware.find_difference(self.identities[CONTROLLER]._asdict())
+        if difference:
+            raise InputError(sequence.name, f"firmware.{key}", difference)
+
+    def _wait_for_operational(self, limit: float) -> None:
+        """Wait until each node says that it is OPERATIONAL, and log how long that took; too long ends the run.
+
+        A node that is too slow is given three times the limit, so that the time it needs is known.
+        """
+        self.start_times = self._master.wait_for_operational(3 * limit)
+        for node in (CONTROLLER, PLANT):
+            seconds = self.start_times.get(node)
+            name = f"node {node} {NAMES[node]}"
+            if seconds is not None:
+                self.log_event("INFO", "nmt", f"{name} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
+            if seconds is None or seconds > limit:
+                was = "has not said so" if seconds is None else f"took {seconds:.2f} s"
+                self._handle_trouble(
+                    "bring_up", f"{name} must be OPERATIONAL within {limit:g} s of NMT start and {was}", node)
+
     def run_phases(self) -> None:
         """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
         assert self.loop is not None
         try:
-            if self._run(SETUP, self._setup) and self._run(MAIN, self._main):
+            if not self.aborted and self._run(SETUP, self._setup) and self._run(MAIN, self._main):
                 self.loop.wait_until_played(self._must_end)
         finally:
             try:
                 self._demand = self.loop.hold(CLEANUP)
                 self._agenda = [event for event in self._agenda if event[0] < self.loop.queued]
                 self._powered = self._restore_nodes()
-                self._run(CLEANUP, self.job.sequence.cleanup_profile(self._demand))
+                self._run(CLEANUP, self._choose_cleanup())
                 self._play_last_probe()
                 self.loop.finish()
             finally:
                 self._playing = False
                 self.loop.close()
+                self._find_silent_nodes()
                 self._master.stop()
+                for failure in self._master.restore(self.gone):
+                    self.log_event("WARN", "restore", failure)
                 self.log_event("INFO", "phase", "end")
+
+    def _choose_cleanup(self) -> Profile:
+        """The clean-up of the sequence; a tenth of a second without current if a node does not answer any more."""
+        self._next_look = 0
+        if self._is_node_gone() or not self.start_times.keys() >= {CONTROLLER, PLANT}:
+            self._powered = False
+            return build_profile((Hold(time=0.1),), self._demand)
+        return self.job.sequence.cleanup_profile(self._demand)
+
+    def _find_silent_nodes(self) -> None:
+        """After trouble: find out which nodes still answer, for the first cause depends on it."""
+        if self.aborted and not self.interrupted:
+            seconds = HEARTBEAT_LIMIT * 1e-3
+            for node in filterfalse(self._is_answering, self._master.find_silent(seconds)):
+                self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
 
     def _restore_nodes(self) -> bool:
         """Try to set all nodes to OPERATIONAL without errors; return whether clean-up may use current."""
-        if self.safe and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
+        if self.safe and not self.gone and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
             self._master.start()
         return not self.safe or not self._master.errors()
 
@@ -268,6 +354,9 @@ class Session:
         return float(self.scenario.force[cycle] * FORCE_RESOLUTION) if cycle < len(self.scenario.force) else 0.0
 
     def _must_end(self) -> bool:
+        self._is_node_gone()
+        if self._overruns.problem and not self.aborted:
+            self._abort("overrun", self._overruns.problem)
         if self._stop() and not self.aborted:
             self.interrupted = True
             self._abort("operator", "stopped by the operator")
@@ -276,7 +365,9 @@ class Session:
             passed = self._watch.find_passed({"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12,
                                               "xs": row.xs, "load": row.load, "error": row.com - row.xj})
             if passed:
-                self._abort("guard", f"guard {passed.name!r} was passed by {passed.signal}")
+                why = f"guard {passed.name!r} was passed by {passed.signal}"
+                self._note_trouble("guard", why)
+                self._abort("guard", why)
                 break
         return bool(self.aborted)
 
@@ -284,18 +375,25 @@ class Session:
         self.aborted = self.aborted or why
         self.log_event("ERROR", kind, why)
 
-    def _handle_trouble(self, kind: str, what: str) -> None:
+    def _note_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
+        """Keep a trouble for the attribution after the run."""
+        self.troubles.append(Trouble(self.now() if t_ns is None else t_ns, node, kind, code, what))
+
+    def _handle_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
         """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""
-        if self._is_probing:
+        if self._is_probing and kind not in ("process", "bring_up"):
             self.log_event("WARN", kind, f"{what} (in a probe)")
             return
+        if self._playing or self._is_probing:
+            self._note_trouble(kind, what, node, code, t_ns)
         self.log_event("ERROR", kind, what)
         if not self.safe:
             self.safe = True
             if self.loop:
                 self.loop.override_control(0)
             self.log_event("WARN", "safe_state", f"no current from here on: {what}")
-        if self.job.sequence.ends != "safe_state" and not self.aborted:
+        is_over = kind in ("process", "bring_up")  # whatever the sequence tests, it needs its nodes
+        if (is_over or self.job.sequence.ends != "safe_state") and not self.aborted:
             self._abort("abort", what)
 
     def _emcy(self, node: int, error: EmcyError) -> None:
@@ -305,10 +403,36 @@ class Session:
             left = "an error is gone, others stand" if error.register else "no error any more"
             self.log_event("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
         else:
-            self._handle_trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip())
+            self._handle_trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip(),
+                                 node, error.code, round(error.timestamp * 1e9))
 
     def _handle_silence(self, node: int) -> None:
-        self._handle_trouble("heartbeat", f"node {node} {NAMES[node]} is silent")
+        limit = "" if node not in self._master.heard_ns else (
+            f": last heartbeat {1e-9 * (self._clock.now() - self._master.heard_ns[node]):.2f} s ago")
+        if not self._is_answering(node):
+            self.gone.setdefault(node, f"no heartbeat any more{limit}")
+        self._handle_trouble("heartbeat", f"node {node} {NAMES[node]} is silent", node)
+
+    def _is_answering(self, node: int, recent: int = 20) -> bool:
+        """Whether a node sent a cyclic frame in one of the `recent` cycles: its heartbeat alone may be missing."""
+        return self.loop is not None and self._last_answers[node] >= self.loop.k - recent
+
+    def _handle_return(self, node: int) -> None:
+        if node not in self._processes.find_ended():
+            self.gone.pop(node, None)
+        self.log_event("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+
+    def _is_node_gone(self) -> bool:
+        """Whether a node will not answer any more; looks every 20 ms whether a process that we started has ended."""
+        now = self._clock.now()
+        if now >= self._next_look:
+            self._next_look = now + 20_000_000
+            for node, status in self._processes.find_ended().items():
+                how = describe_exit(status)
+                if self.gone.get(node) != how:
+                    self.gone[node] = how
+                    self._handle_trouble("process", f"node {node} {NAMES[node]}: {how}", node)
+        return bool(self.gone)
 
     def _state(self, node: int, state: int) -> None:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
@@ -319,7 +443,7 @@ class Session:
         elif node in self._operational:
             self._operational.discard(node)
             if self._playing:  # a watchdog reset, a power cycle, or an NMT command of another master
-                self._handle_trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}")
+                self._handle_trouble("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}", node, state)
 
     def _announce_faults(self) -> None:
         assert self.loop is not None

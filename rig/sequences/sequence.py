@@ -25,8 +25,10 @@ from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
 from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
 from rig.sequences.protocol import ProtocolLimits
+from rig.sequences.required_firmware import RequiredFirmware
 from rig.sequences.run_data import MAIN
 from rig.sequences.tables import Place
+from rig.sequences.timing import TimingPolicy
 
 ReadFile = Callable[[str], bytes]
 
@@ -62,6 +64,8 @@ class Sequence:
     ends: Literal["completed", "safe_state"] = "completed"
     model: ModelChoice = ModelChoice()
     protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
+    timing: TimingPolicy = field(default_factory=TimingPolicy)
+    firmware: RequiredFirmware = field(default_factory=RequiredFirmware)
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)
     files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV files, by name in source

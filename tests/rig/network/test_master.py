@@ -161,4 +161,5 @@ def test_every_frame_is_seen_once() -> None:
     frames: list[Frame] = []
     master.on_frame = frames.append
     master.reset()
-    assert frames == [(7, 0x000, b"\x82\x00"), (7, 0x703, b"\0"), (7, 0x702, b"\0")]
+    boots = [(7, 0x703, b"\0"), (7, 0x702, b"\0")]
+    assert frames == [*boots, (7, 0x000, b"\x82\x03"), (7, 0x000, b"\x82\x02"), *boots]  # each node by its number

@@ -22,6 +22,8 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError
 from rig.run import participants, runner
+from rig.run.participants import Participants
+from rig.run.processes import NodeProcesses
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 
@@ -164,7 +166,7 @@ def play_with(intruder: Intruder, tmp_path: Path) -> Session:
 
     wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, join])  # type: ignore[list-item]
     with runner.open_recorder(job(), tmp_path) as recorder:
-        session = Session(job(), wire, recorder, ignore_progress, lambda: False)
+        session = Session(job(), Participants(wire, NodeProcesses()), recorder, ignore_progress, lambda: False)
         session.bring_up()
         session.run_phases()
     return session

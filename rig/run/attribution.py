@@ -1,0 +1,406 @@
+"""Fault attribution: which cycles the controller may be judged on, and what was the first cause of trouble.
+
+The bench and the controller share one bus, and each can make the other look bad: a late SYNC lets the controller report
+a lost SYNC, a stalled plant emulator lets it report missing feedback, and a dead controller lets the plant report a
+missing drive frame. All functions here are pure: they see the records of a finished run and no clock.
+
+A cycle is judged only if the bench was on time in it: its SYNC and the next one were sent within the limit, and the
+plant's feedback came within the limit. Cycles that follow a late one are not judged as far as its consequences reach:
+nodes that were stalled first work off the frames that waited, which takes at most as long as the stall did.
+"""
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.segments import Array
+from rig.network.codec import Flags
+from rig.network.master import CONTROLLER, NAMES, NODE, PLANT
+from rig.sequences.faults import Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.timing import PERIOD, TimingPolicy
+
+Mask = NDArray[np.bool_]
+
+_NO_DRIVE = int(Flags.DRIVE_MISSING | Flags.DRIVE_LATE)
+_RPDO_TIMEOUT = 0x8250
+_HEARTBEAT = 150  # cycles: a change of the NMT state is known with the next heartbeat
+_SETTLING = 100  # cycles: after a lost frame the position loop needs less than this to forget it
+
+
+class Injected(NamedTuple):
+    """Cycles that the faults of the sequence itself disturb, masks of shape (cycles,)."""
+
+    sync: Mask  # SYNC, or the whole bus
+    plant: Mask  # feedback or valve state
+    any: Mask  # any frame or heartbeat, now or a moment ago
+
+
+class CycleRecords(NamedTuple):
+    """What was measured in each cycle, columns of shape (cycles,); times in s from SYNC, NaN: no such frame came."""
+
+    due_ns: NDArray[np.int64]  # log time at which SYNC was due
+    lateness: Array  # SYNC sent after it was due
+    feedback: Array  # the plant's feedback frame
+    valve: Array  # the plant's valve state
+    response: Array  # the controller's drive frame
+    flags: NDArray[np.int64]  # of the valve state
+    injected: Injected
+    plant_delay: Array | None = None  # the plant's own record: SYNC taken up after it came
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles."""
+        return len(self.lateness)
+
+
+class Trouble(NamedTuple):
+    """Something that a node or the rig reported; `node` 0 where no node is meant."""
+
+    t_ns: int  # log time
+    node: int
+    kind: str  # kind of the event: emcy, nmt, heartbeat, process, guard, bus, bring_up, operator
+    code: int  # of an EMCY; NMT state of kind nmt; else 0
+    text: str
+
+
+class Disturbance(NamedTuple):
+    """Cycles `first` to `last` in which the bench was late; consequences can come until cycle `reach`."""
+
+    first: int
+    last: int
+    reach: int
+    source: int  # node 1 rig or node 3 plant
+    overruns: int
+    text: str
+
+
+class Cause(NamedTuple):
+    """The first cause of trouble: who, in which cycle, and how that is known."""
+
+    source: int  # node; 0: not a node
+    kind: str  # "late" for the bench's own lateness, "stopped", "injected", or the kind of the trouble
+    cycle: int
+    text: str
+    evidence: tuple[str, ...] = ()
+
+    @property
+    def is_lateness(self) -> bool:
+        """Whether the bench itself was late."""
+        return self.kind == "late"
+
+
+class Attribution(NamedTuple):
+    """The result: which cycles the controller was judged on, the first cause of trouble, and what followed from it."""
+
+    judged: Mask  # (cycles,)
+    invalid: dict[str, int]  # reason: number of cycles that were not judged
+    disturbances: tuple[Disturbance, ...]
+    cause: Cause | None
+    consequences: tuple[Trouble, ...]  # the other troubles, in order
+    affected: Mask  # (cycles,) rows in which lateness of the bench changed the signals
+    by_bench: int  # troubles that followed from lateness of the bench
+    overruns: NDArray[np.int64]  # (cycles,)
+
+
+def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: TimingPolicy,
+              gone: Mapping[int, str] | None = None) -> Attribution:
+    """Find the cycles that may be judged, and the first cause of the troubles of a run.
+
+    Args:
+        records: what was measured in each cycle.
+        troubles: everything that was reported, in any order.
+        policy: limits of the sequence.
+        gone: nodes that did not answer any more at the end of the run, and how that is known.
+    """
+    gone = gone or {}
+    late = find_late_cycles(records, policy, find_plant_stops(records, troubles, gone))
+    disturbances = find_disturbances(records, late)
+    judged, invalid = select_judged(records, late, disturbances)
+    ordered = sorted(troubles, key=lambda trouble: trouble.t_ns)
+    causes = [find_cause(trouble, records, disturbances, gone) for trouble in ordered]
+    cause = min(causes, key=lambda found: found.cycle, default=None)
+    consequences = tuple(trouble for trouble in ordered if cause is None or trouble.text != cause.text)
+    return Attribution(judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
+                       sum(found.is_lateness for found in causes), count_overruns(records, late))
+
+
+class LateCycles(NamedTuple):
+    """Masks of shape (cycles,): in which way the bench was late."""
+
+    sync: Mask  # SYNC sent too late
+    feedback: Mask  # the plant's frames came too late, or not
+    stalled: Mask  # by its own record, the plant took SYNC up too late
+
+    @property
+    def any(self) -> Mask:
+        """Cycles in which the bench was late."""
+        return self.sync | self.feedback | self.stalled
+
+
+def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterable[int] = ()) -> LateCycles:
+    """Find the cycles in which the bench was late.
+
+    Args:
+        records: what was measured in each cycle.
+        policy: the limits.
+        stops: cycles in which the plant was found to have stopped. The frames that were missing then are not late: a
+            plant that has stopped is another cause.
+    """
+    sync = (records.lateness > policy.sync) & ~records.injected.sync
+    is_in_time = (records.feedback <= policy.feedback) & ~np.isnan(records.valve)
+    feedback = ~is_in_time & ~records.injected.plant & ~records.injected.sync
+    missing = np.isnan(records.feedback) & np.isnan(records.valve)
+    for cycle in stops:
+        first = _find_run_start(missing, min(cycle, records.cycles - 1), near=_HEARTBEAT)
+        present = np.flatnonzero(~missing[first:])
+        feedback[first:first + int(present[0]) if len(present) else None] = False
+    delay = records.plant_delay
+    stalled = np.zeros(records.cycles, dtype=bool) if delay is None else delay > policy.feedback
+    return LateCycles(sync, feedback, stalled)
+
+
+def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: Container[int]) -> list[int]:
+    """Cycles in which the plant was found to have stopped: it is gone, has an error of its own, or left OPERATIONAL."""
+    stops = [find_cycle(records, trouble.t_ns) for trouble in troubles
+             if trouble.node == PLANT and not _is_communication(trouble)]
+    return [*stops, records.cycles - 1] if PLANT in gone else stops
+
+
+def find_last_stop(missing: Mask) -> int:
+    """First of the cycles at the end that are all missing; the number of cycles if the last one is not.
+
+    >>> find_last_stop(np.array([False, True, False, True, True]))
+    3
+    """
+    present = np.flatnonzero(~missing)
+    return int(present[-1]) + 1 if len(present) else 0
+
+
+def find_disturbances(records: CycleRecords, late: LateCycles, joined: int = 2) -> tuple[Disturbance, ...]:
+    """Group late cycles that are at most `joined` cycles apart: a stall of one process makes the others late too."""
+    cycles = np.flatnonzero(late.any)
+    if not len(cycles):
+        return ()
+    breaks = np.flatnonzero(np.diff(cycles) > joined + 1) + 1
+    return tuple(_describe_disturbance(records, late, int(group[0]), int(group[-1]))
+                 for group in np.split(cycles, breaks))
+
+
+def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, last: int) -> Disturbance:
+    """A disturbance with its reach: three cycles, and as long again as it lasted."""
+    span = slice(first, last + 1)
+    skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / PERIOD).sum())
+    overruns = count_overruns(records, late)[span].sum()
+    reach = last + 3 + (last - first + 1) + skipped
+    # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
+    if late.sync[first] or (late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2):
+        worst = float(np.nanmax(records.lateness[span])) if span.stop > span.start else 0.0
+        return Disturbance(first, last, reach, NODE, int(overruns), f"the rig sent SYNC {1e3 * worst:.1f} ms late")
+    return Disturbance(first, last, reach, PLANT, int(overruns), _describe_plant(records, late, span))
+
+
+def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
+    delay = records.plant_delay
+    if delay is not None and late.stalled[span].any():
+        return f"by its own record the plant took SYNC up {1e3 * float(np.nanmax(delay[span])):.1f} ms late"
+    missing = int(np.isnan(records.feedback[span]).sum() or np.isnan(records.valve[span]).sum())
+    if missing:
+        return f"the plant sent no feedback for {missing} {'cycle' if missing == 1 else 'cycles'}"
+    return f"the plant's feedback came {1e3 * float(np.nanmax(records.feedback[span])):.1f} ms after SYNC"
+
+
+def count_overruns(records: CycleRecords, late: LateCycles) -> NDArray[np.int64]:
+    """Overruns in each cycle, (cycles,): one for a late cycle, and the whole periods that were skipped if more."""
+    skipped = np.floor(np.nan_to_num(records.lateness) / PERIOD).astype(np.int64)
+    return np.maximum(skipped, late.any.astype(np.int64))
+
+
+def count_most_in_a_row(overruns: NDArray[np.int64]) -> int:
+    """Most overruns in a row.
+
+    >>> count_most_in_a_row(np.array([0, 1, 1, 0, 5, 0]))
+    5
+    """
+    most = current = 0
+    for number in overruns.tolist():
+        current = current + number if number else 0
+        most = max(most, current)
+    return most
+
+
+def select_judged(records: CycleRecords, late: LateCycles,
+                  disturbances: Iterable[Disturbance]) -> tuple[Mask, dict[str, int]]:
+    """Select the cycles on which the controller may be judged; with the number of the others by reason."""
+    n = records.cycles
+    shortened = np.zeros(n, dtype=bool)
+    shortened[:-1] = late.sync[1:]  # the whole machine may have stood still between the two SYNCs
+    following = np.zeros(n, dtype=bool)
+    for disturbance in disturbances:
+        following[disturbance.last + 1:disturbance.reach - 1] = True
+    taken = np.zeros(n, dtype=bool)
+    counts = {}
+    for reason, mask in (("sync_late", late.sync), ("feedback_late", late.feedback), ("plant_stalled", late.stalled),
+                         ("next_sync_late", shortened), ("following", following)):
+        counts[reason] = int((mask & ~taken).sum())
+        taken |= mask
+    return ~taken, counts
+
+
+def find_affected(records: CycleRecords, disturbances: Iterable[Disturbance]) -> Mask:
+    """Rows whose signals differ because the bench was late: from a lost or late frame on, until the loop has settled.
+
+    A late SYNC alone changes no signal: the plant moves one period a SYNC, however late it comes.
+    """
+    affected = np.zeros(records.cycles, dtype=bool)
+    lost = np.isnan(records.feedback) | np.isnan(records.response) | (records.flags & _NO_DRIVE != 0)
+    for disturbance in disturbances:
+        cycles = np.flatnonzero(lost[disturbance.first:disturbance.reach + 1])
+        if len(cycles):
+            first = disturbance.first + int(cycles[0])
+            affected[first:disturbance.first + int(cycles[-1]) + _SETTLING] = True
+    return affected
+
+
+def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[Disturbance],
+               gone: Mapping[int, str]) -> Cause:
+    """The first cause of one trouble.
+
+    What is not about communication is its own cause. Otherwise, in this order: a node that is gone explains the frames
+    that no longer come; a fault of the sequence explains what follows from it; lateness of the bench explains what
+    falls into its reach; a node that sent no frames explains that others miss them.
+    """
+    cycle = find_cycle(records, trouble.t_ns)
+    itself = Cause(trouble.node, trouble.kind, cycle, trouble.text)
+    if not _is_communication(trouble):
+        return itself
+    silent, origin = _find_silent_node(trouble, records, cycle)
+    for node in (silent, trouble.node):
+        if node in gone:
+            return _describe_stop(node, records, min(origin, _find_stop(node, records)), cycle, gone[node])
+    window = records.injected.any[max(origin - 1, 0):cycle + 1]
+    if window.any() and trouble.kind != "guard":
+        return itself._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
+                               text="a fault of the sequence disturbs frames")
+    for disturbance in disturbances:
+        reach = disturbance.reach + (_SETTLING if trouble.kind == "guard" else 0)
+        if any(disturbance.first - 1 <= at <= reach for at in (origin, cycle)):
+            return Cause(disturbance.source, "late", disturbance.first, disturbance.text)
+    return _describe_stop(silent, records, origin, cycle, "") if silent else itself
+
+
+def _is_communication(trouble: Trouble) -> bool:
+    """Whether lateness or silence of another node can be behind a trouble.
+
+    An error of a node's own device, its reset, another rig on the bus and the operator are causes by themselves. So is
+    a plant that leaves OPERATIONAL: no frame of the others makes it do so.
+    """
+    if trouble.kind == "emcy":
+        return 0x8100 <= trouble.code < 0x8300
+    if trouble.kind == "nmt":
+        return trouble.node == CONTROLLER and trouble.code != 0
+    return trouble.kind in ("heartbeat", "process", "guard")
+
+
+def find_cycle(records: CycleRecords, t_ns: int) -> int:
+    """The cycle under way at a log time; 0 before the first."""
+    return max(int(np.searchsorted(records.due_ns, t_ns, "right")) - 1, 0)
+
+
+def _find_silent_node(trouble: Trouble, records: CycleRecords, cycle: int) -> tuple[int, int]:
+    """The node whose missing frames a trouble is about, and the first cycle without them; 0 and `cycle` for none."""
+    if trouble.kind in ("heartbeat", "process"):
+        stop = _find_stop(trouble.node, records)
+        is_answering = trouble.kind == "heartbeat" and stop > cycle  # only the heartbeat is missing
+        return (0, cycle) if is_answering else (trouble.node, min(cycle, stop))
+    if trouble.kind != "emcy" or trouble.code != _RPDO_TIMEOUT:
+        return 0, cycle
+    no_feedback = np.isnan(records.feedback) & np.isnan(records.valve)
+    no_drive = np.isnan(records.response) | _shift_back(records.flags & _NO_DRIVE != 0)
+    origin = _find_run_start(no_drive if trouble.node == PLANT else no_feedback, cycle)
+    if trouble.node == PLANT:
+        # Without feedback the controller has nothing to answer: then the plant was first.
+        first = max(origin - 1, 0)
+        return (PLANT, first) if no_feedback[first:origin + 1].any() else (CONTROLLER, origin)
+    return (PLANT, origin) if no_feedback[min(origin, len(no_feedback) - 1):][:1].any() else (0, cycle)
+
+
+def _shift_back(mask: Mask) -> Mask:
+    """The plant's flags of cycle k + 1 speak of the drive frame of cycle k."""
+    return np.append(mask[1:], False) if len(mask) else mask
+
+
+def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
+    """First cycle of the last run of missing frames that reaches to within `near` cycles of `cycle`."""
+    before = np.flatnonzero(missing[:cycle + 1])
+    if not len(before) or before[-1] < cycle - near:
+        return cycle
+    last = int(before[-1])
+    present = np.flatnonzero(~missing[:last + 1])
+    return int(present[-1]) + 1 if len(present) else 0
+
+
+def _find_stop(node: int, records: CycleRecords) -> int:
+    """The first cycle from which a node sent none of its cyclic frames any more."""
+    if node == CONTROLLER:
+        return find_last_stop(np.isnan(records.response))
+    return find_last_stop(np.isnan(records.feedback) & np.isnan(records.valve))
+
+
+def _describe_stop(node: int, records: CycleRecords, first: int, cycle: int, how: str) -> Cause:
+    """A node that stopped answering in cycle `first`, with the evidence that the bench did its part."""
+    missing = np.isnan(records.response if node == CONTROLLER else records.feedback)
+    frames = "drive" if node == CONTROLLER else "feedback"
+    count = int(np.argmin(missing[first:])) if not missing[first:].all() else 0  # 0: until the end
+    if how:
+        text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}; {how}"
+    elif count or first >= records.cycles:
+        text = f"node {node} {NAMES[node]} did not answer in time: no {frames} frame for {count} cycles from {first}"
+    else:
+        text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}"
+    return Cause(node, "stopped", first, text, _show_punctuality(records, first, cycle) if node == CONTROLLER else ())
+
+
+def _show_punctuality(records: CycleRecords, first: int, cycle: int) -> tuple[str, ...]:
+    """Evidence that SYNC and feedback came on time in the cycles before a trouble that was reported in `cycle`."""
+    span = slice(first, max(first + 1, min(cycle, first + 3)))
+    feedback = records.feedback[span]
+    if not len(feedback) or np.isnan(feedback).any():
+        return ()
+    return (f"in cycles {first} to {first + len(feedback) - 1} SYNC was sent at most "
+            f"{1e3 * float(records.lateness[span].max()):.2f} ms late and feedback came within "
+            f"{1e3 * float(feedback.max()):.2f} ms",)
+
+
+def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: int = 400,
+                  watchdog_limit: int = 4) -> Injected:
+    """Find the cycles that the faults of a sequence disturb.
+
+    Args:
+        plan, schedule: the faults, and in which cycles they act.
+        cycles: number of cycles of the run.
+        heartbeat_limit: cycles after which a lost heartbeat has been reported.
+        watchdog_limit: cycles after which missing frames have been reported.
+    """
+    sync, plant, anything = (np.zeros(cycles, dtype=bool) for _ in range(3))
+    for fault in plan.faults:
+        if isinstance(fault, Parameter | Offset | Stuck):
+            continue
+        first, last = plan.cycles(fault)
+        frame = getattr(fault, "frame", "")
+        if not frame:
+            anything[first:last + heartbeat_limit] = True
+            if not isinstance(fault, Silent):
+                sync[first:last + watchdog_limit] = True
+            continue
+        for k in range(first, min(last, cycles)):
+            action = schedule.frame(frame, k)
+            if action is not None:
+                delay = -(-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else 0
+                span = slice(k, k + delay + watchdog_limit)
+                anything[span] = True
+                if frame in ("feedback", "valve_state"):
+                    plant[k:k + delay + 1] = True
+    return Injected(sync, plant, anything)
