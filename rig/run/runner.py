@@ -16,7 +16,7 @@ from rig.network.codec import Flags
 from rig.network.raw_bus import can_open
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
-from rig.run.attribution import CycleRecords, Mask, attribute, find_injected
+from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
 from rig.run.hard_loop import compile_cycle
 from rig.run.history import History
 from rig.run.job import Job
@@ -67,7 +67,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         kind = f"{loop.kind} real time" if job.realtime else "lockstep"
         recorder.metadata("timing", {"kind": kind})
         history = session.history
-        attribution = attribute(collect_records(job, session), session.troubles, job.sequence.timing, session.gone)
+        attribution = attribute_run(job, session)
         checks = judge_run(job, session, attribution.judged)
         for check in checks:
             recorder.put(session.now(), _make_check_record(check))
@@ -91,6 +91,11 @@ def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
                               sequence.fault_starts())
     return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
+
+
+def attribute_run(job: Job, session: Session) -> Attribution:
+    """Find the cycles of a run that may be judged, and the first cause of its troubles."""
+    return attribute(collect_records(job, session), session.troubles, job.sequence.timing, session.gone)
 
 
 def collect_records(job: Job, session: Session) -> CycleRecords:

@@ -302,9 +302,9 @@ class Session:
                 self.log_event("INFO", "phase", "end")
 
     def _choose_cleanup(self) -> Profile:
-        """The clean-up of the sequence; a tenth of a second without current if a node does not answer any more."""
+        """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
         self._next_look = 0
-        if self._is_node_gone() or not self.start_times.keys() >= {CONTROLLER, PLANT}:
+        if self._is_node_gone() or any(trouble.kind == "bring_up" for trouble in self.troubles):
             self._powered = False
             return build_profile((Hold(time=0.1),), self._demand)
         return self.job.sequence.cleanup_profile(self._demand)
@@ -376,8 +376,9 @@ class Session:
         self.log_event("ERROR", kind, why)
 
     def _note_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
-        """Keep a trouble for the attribution after the run."""
-        self.troubles.append(Trouble(self.now() if t_ns is None else t_ns, node, kind, code, what))
+        """Keep a trouble for the attribution after the run; the first thousand say enough."""
+        if len(self.troubles) < 1000:
+            self.troubles.append(Trouble(self.now() if t_ns is None else t_ns, node, kind, code, what))
 
     def _handle_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
         """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""

@@ -20,7 +20,9 @@ from rig.network.wire import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
-from rig.run.runner import judge_run, open_recorder
+from rig.run.participants import Participants
+from rig.run.processes import NodeProcesses
+from rig.run.runner import attribute_run, judge_run, open_recorder
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 from rig.studies.robustness.frames import invent_frames
@@ -185,10 +187,12 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
     try:
         with open_recorder(job, folder) as recorder:
             makers: list[Callable[[Send], Node]] = [Emulator, Firmware, *strangers]
-            session = Session(job, EmbeddedWire(VirtualClock(), makers), recorder, ignore_progress, lambda: False)
+            participants = Participants(EmbeddedWire(VirtualClock(), makers), NodeProcesses())
+            session = Session(job, participants, recorder, ignore_progress, lambda: False)
             session.bring_up()
             session.run_phases()
-            failed = [check.name for check in judge_run(job, session) if not check.passed]
+            checks = judge_run(job, session, attribute_run(job, session).judged)
+            failed = [check.name for check in checks if not check.passed]
     except BusError:
         return "" if strangers else "the nodes did not start"  # a stranger may send the very frame that forbids it
     except Exception as error:

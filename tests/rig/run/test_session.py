@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from fdi.progress import ignore_progress
 from fdi.report.run_report import write_run_page
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
-from rig.network.clock import VirtualClock
+from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame, Send
 from rig.network.wire import EmbeddedWire
 from rig.nodes.emulator import Emulator
@@ -267,3 +268,108 @@ def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: 
     assert sum(event.kind == "emcy" for event in trace.events) == sent
     write_run_page(tmp_path / "trace.mcap", tmp_path / "p.html")
     assert (tmp_path / "p.html").stat().st_size < 2_000_000
+
+
+class Reluctant(Firmware):
+    """A firmware that becomes OPERATIONAL only some time after it was told to."""
+
+    delay_ns = 0
+
+    def __init__(self, send: Send) -> None:
+        super().__init__(send)
+        self._waiting: list[tuple[int, Frame]] = []
+        self._now = 0
+        self.receive, self.tick = self._receive, self._tick  # type: ignore[method-assign]
+
+    def _receive(self, frame: Frame) -> None:
+        if frame.cob_id == 0 and frame.data == b"\x01\x02":
+            self._waiting.append((self._now + self.delay_ns, frame))
+        else:
+            self.device.receive(frame)
+
+    def _tick(self, t_ns: int) -> None:
+        self._now = t_ns
+        while self._waiting and self._waiting[0][0] <= t_ns:
+            self.device.receive(self._waiting.pop(0)[1])
+        self.device.tick(t_ns)
+
+
+@pytest.mark.parametrize(("delay", "verdict"), [(0.03, "PASS"), (0.3, "PASS"), (1.5, "ABORTED"), (9.0, "ABORTED")])
+def test_bring_up_waits_until_the_nodes_are_operational(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, delay: float,
+                                                        verdict: str) -> None:
+    monkeypatch.setattr(Reluctant, "delay_ns", round(delay * 1e9))
+    monkeypatch.setattr("rig.run.participants.Firmware", lambda send, model: Reluctant(send))
+    outcome = play(job(), tmp_path)
+    assert outcome.verdict == verdict, outcome.why
+    if delay < 3:  # three times the limit
+        assert outcome.start_times[2] == pytest.approx(delay, abs=0.012)  # a heartbeat every 10 ms
+    if verdict == "ABORTED":
+        assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.why
+        assert outcome.to_json()["cause"]["source"] == "node 2 controller" and set(control_words(tmp_path)) == {0}
+
+
+def frames_sent(folder: Path) -> list[tuple[int, bytes]]:
+    from fdi.trace.mcap_log import open_log
+
+    return [(message.cob_id, message.data) for _, _, message in open_log(folder / "trace.mcap").messages("/can")]
+
+
+def test_bring_up_begins_with_the_rigs_boot_up_and_addresses_its_own_nodes(tmp_path: Path) -> None:
+    play(job(), tmp_path)
+    frames = frames_sent(tmp_path)
+    assert frames[0] == (0x701, b"\0") and (0x701, b"\0") not in frames[1:]
+    assert {data[1] for cob_id, data in frames if cob_id == 0} == {2, 3}
+
+
+def test_what_the_run_changed_in_the_nodes_is_set_back(tmp_path: Path) -> None:
+    """Otherwise a node that stays would go on watching a rig that has left."""
+    nodes: dict[int, Emulator | Firmware] = {}
+
+    def keep(make: type[Emulator] | type[Firmware], node: int) -> Callable[[Send], Emulator | Firmware]:
+        def build(send: Send) -> Emulator | Firmware:
+            nodes[node] = make(send)
+            return nodes[node]
+
+        return build
+
+    def read(index: int, sub: int) -> list[object]:
+        return [node.device.read(index, sub) for node in nodes.values()]
+
+    wire = EmbeddedWire(WallClock(), [keep(Emulator, 3), keep(Firmware, 2)])
+    one = job(pace="realtime")
+    before = read(0x1006, 0), read(0x1016, 1)
+    with runner.open_recorder(job(), tmp_path) as recorder:
+        session = Session(one, Participants(wire, NodeProcesses()), recorder, ignore_progress, lambda: False)
+        session.bring_up()
+        assert (read(0x1006, 0), read(0x1016, 1)) == ([8000, 8000], [1 << 16 | 300] * 2)
+        session.run_phases()
+    assert (read(0x1006, 0), read(0x1016, 1)) == before != ([8000, 8000], [1 << 16 | 300] * 2)
+
+
+def test_who_the_nodes_are(tmp_path: Path) -> None:
+    outcome = play(job(SHORT + '[firmware]\nname = "EHA controller"\nproduct = 2\n'), tmp_path)
+    nodes = outcome.to_json()["nodes"]
+    assert outcome.verdict == "PASS" and nodes["2"]["identity"]["product"] == 2
+    assert nodes["3"]["identity"]["name"] == "EHA plant emulator" and nodes["2"]["operational_ms"] > 0
+    assert Trace.read(tmp_path).provenance["node2.name"] == "EHA controller"
+    assert any(kind == "identity" and "node 2 controller: device type" in text for kind, text in kinds(outcome))
+
+
+def test_another_firmware_than_the_sequence_asks_for_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"firmware\.product: expected 0x00000007, but the controller has 0x00000002"):
+        play(job(SHORT + "[firmware]\nproduct = 7\n"), tmp_path)
+
+
+def test_too_many_overruns_in_a_row_end_main(tmp_path: Path) -> None:
+    """The policy "abort", with limits that no machine keeps: the controller is not judged, the status is 3."""
+    text = SHORT + '[timing]\noverruns = "abort"\ntolerate = 5\nsync = 1e-9\ngrace = 0.0\n'
+    outcome = play(job(text, pace="realtime", max_overruns=1.0), tmp_path)
+    assert (outcome.verdict, outcome.status) == ("INVALID_TIMING", 3)
+    assert "overruns in a row, 5 are accepted" in outcome.why
+    assert phases(tmp_path)[1] == 0 and outcome.to_json()["judged"]["judged"] == 0
+
+
+def test_overruns_within_the_grace_do_not_count(tmp_path: Path) -> None:
+    text = SHORT + "[timing]\ntolerate = 0\nsync = 1e-9\ngrace = 10.0\n"
+    outcome = play(job(text, pace="realtime", max_overruns=0.0), tmp_path)
+    assert outcome.verdict == "PASS", outcome.why
