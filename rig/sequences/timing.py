@@ -26,7 +26,6 @@ class TimingPolicy:
     grace: Second = 0.1  # from the first cycle; overruns in it do not count
     sync: Second = 0.5e-3  # SYNC after it was due
     feedback: Second = 0.5e-3  # from SYNC to the feedback frame
-    response: Second = 1e-3  # from SYNC to the drive frame: the limit of the firmware under test
     operational: Second = 1.0  # from NMT start to OPERATIONAL
 
     def __post_init__(self) -> None:
@@ -34,7 +33,7 @@ class TimingPolicy:
                  f"a number of overruns from 0 to 1000000, not {self.tolerate}")
         _require(0 <= self.share <= 1, "share", f"a fraction from 0 to 1, not {self.share:g}")
         _require(0 <= self.grace <= LONGEST, "grace", f"0 s or more, at most {LONGEST:g}, not {self.grace:g}")
-        for key in ("sync", "feedback", "response"):
+        for key in ("sync", "feedback"):
             limit = getattr(self, key)
             _require(0 < limit <= PERIOD, key, f"above 0 s and at most the cycle of {PERIOD:g} s, not {limit:g}")
         _require(0 < self.operational <= 60, "operational", f"above 0 s and at most 60 s, not {self.operational:g}")

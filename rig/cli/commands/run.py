@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--plant", choices=PLANTS, default=None,
         help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)")
     add("--max-overruns", type=float, default=None, metavar="FRACTION",
-        help="largest share of overruns in a real-time run; more make its timing invalid (default 0.001)")
+        help="largest share of overruns in a real-time run; more make its timing invalid "
+             "(default: that of the sequence, 0.001)")
     add("--fdi", action="store_true", help="also diagnose the servovalve like rig fdi, against a nominal unit")
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run recorded in this log")
 
@@ -153,7 +154,8 @@ def build_job(args: argparse.Namespace) -> Job:
     foreign = [name for name in model.differences() if name.startswith("controller.")]
     if args.controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
-    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=effects)
+    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=effects,
+              max_overruns=sequence.timing.share)
     return replace_settings(job, pace=args.pace, controller=args.controller, plant=args.plant,
                             max_overruns=args.max_overruns)
 

@@ -270,3 +270,47 @@ def test_a_sound_plant_passes_the_preflight(seed: int) -> None:
 def test_faults_are_visible_in_the_preflight(changes: dict[str, float], felt: set[str]) -> None:
     failed = {result.name for result in judge_preflight(changes, 1) if not result.passed}
     assert felt <= failed
+
+
+BARE = 'title = "x"\nmain = [{ kind = "hold", time = 1.0 }]\n'
+
+
+def test_timing_and_firmware_are_tables_of_the_sequence() -> None:
+    timing = '[timing]\noverruns = "abort"\ntolerate = 3\nshare = 0.01\n'
+    text = BARE + timing + '[firmware]\nproduct = 2\nsoftware = "1.0"\n'
+    sequence = parse_sequence(text, "x.toml", lambda name: b"")
+    assert (sequence.timing.most_in_a_row, sequence.timing.share) == (3, 0.01)
+    identity = {"product": 2, "software": "1.0", "vendor": 9}
+    assert sequence.firmware.find_difference(identity) == ("", "")
+    assert sequence.firmware.find_difference(identity | {"software": "1.1"}) == (
+        "software", "'1.0', but the controller has '1.1'")
+    assert sequence.firmware.find_difference({"software": "1.0"}) == (
+        "product", "0x00000002, but the controller has no such object")
+
+
+@pytest.mark.parametrize(("table", "says"), [
+    ('overruns = "ignore"', r"x\.toml:4: timing\.overruns: expected 'abort' or 'count'"),
+    ("tolerate = -1", r"timing\.tolerate: expected a number of overruns from 0 to 1000000, not -1"),
+    ("share = 1.5", r"timing\.share: expected a fraction from 0 to 1, not 1\.5"),
+    ("sync = 2e-3", r"timing\.sync: expected above 0 s and at most the cycle of 0\.001 s"),
+    ("feedback = 0.0", r"timing\.feedback: expected above 0 s"),
+    ("operational = 100.0", r"timing\.operational: expected above 0 s and at most 60 s"),
+    ("grace = -1.0", r"timing\.grace: expected 0 s or more"),
+    ("late = 1", r"timing\.late: expected a key"),
+])
+def test_a_timing_table_that_cannot_be_used(table: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        parse_sequence(f"{BARE}[timing]\n{table}\n", "x.toml", lambda name: b"")
+
+
+def test_a_firmware_number_that_fits_no_object() -> None:
+    with pytest.raises(InputError, match=r"firmware\.vendor: expected a number from 0 to 0xFFFFFFFF, not -1"):
+        parse_sequence(f"{BARE}[firmware]\nvendor = -1\n", "x.toml", lambda name: b"")
+
+
+@pytest.mark.parametrize(("timing", "period"), [("", 8000), ("tolerate = 3", 8000), ("tolerate = 50", 35000)])
+def test_sync_is_lost_only_after_the_longest_pause_that_the_sequence_accepts(timing: str, period: int) -> None:
+    """CANopenNode says so 1.5 periods after the last SYNC."""
+    policy = parse_sequence(f"{BARE}[timing]\n{timing}\n", "x.toml", lambda name: b"").timing
+    assert policy.choose_sync_period() == period
+    assert 1.5e-6 * period >= 1e-3 * (max(policy.most_in_a_row or 0, 10) + 1) + policy.sync
