@@ -19,10 +19,9 @@ from plant.model import parse_model
 from plant.parameters import parse_toml
 from plant.segments import RATE
 from rig.nodes.scenario import Scenario
+from rig.run.choices import CONTROLLERS, PACES, PLANTS
 from rig.sequences import Sequence
 
-PACES, PLANTS = ("lockstep", "realtime"), ("auto", "builtin", "external")
-CONTROLLERS = ("builtin", "c", "external")
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the attachments
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig run`."""
-    from rig.run.job import CONTROLLERS, PACES, PLANTS
+    from rig.run.choices import CONTROLLERS, PACES, PLANTS
 
     add = parser.add_argument
     add("sequence", nargs="?", metavar="SEQUENCE",

@@ -87,7 +87,9 @@ def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[flo
     assert [str(word).split()[0] for _, word in lanes.pop("2_command")] == [s.kind for s in trace.sections()]
     for node in (2, 3):
         states = lanes.pop(f"3_node_{node}_NMT")
-        assert [word for _, word in states] == ["boot-up", "operational"] and states[-1][0] < 0
+        words = [word for _, word in states]  # the probes begin with a reset as well
+        assert words[0] == "boot-up" and words[-1] == "operational" and states[-1][0] < 0
+        assert words.count("boot-up") == words.count("operational") == 3
     assert len(lanes) == len(trace.sequence_checks) == 17
     for (lane, ((t0, word), (t1, end))), check in zip(sorted(lanes.items()), trace.sequence_checks, strict=True):
         assert lane[:5] == f"5.{trace.sequence_checks.index(check) + 1:02}_" and end == ""
