@@ -176,7 +176,7 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
                    str(os.getpid())]
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
-        for _ in range(60):  # s: it may have to compile the plant first
+        for _ in range(120):  # s: it may have to compile the plant first
             if wire.wait(lambda: boot_up in booted, 1.0) or child.poll() is not None:
                 break
         if boot_up not in booted:

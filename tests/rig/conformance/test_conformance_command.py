@@ -149,6 +149,23 @@ def test_a_node_that_is_not_there() -> None:
     assert "node 9 does not answer" in said.err and said.err.count("\n") == 1
 
 
+def test_a_node_by_its_number_and_data_sheet() -> None:
+    """Any node on the bus; it is not ours to start or to end, and its values are not changed without --write."""
+    bus = spec("udp_multicast")
+    node = started("node", "controller", "--bus", bus)
+    try:
+        assert node.stdout is not None and "controller on" in node.stdout.readline()
+        words = ("conformance", 2, "--eds", EDS[2], "--bus", bus, "--json", "--timeout", 5, "--tolerance", 2000,
+                 "--chapter", "2", "--chapter", "4.15", "--chapter", "6.12")
+        said, more = rig(*words), rig(*words, "--write")
+        assert (said.status, more.status, node.poll()) == (0, 0, None)
+    finally:
+        node.terminate()
+        node.communicate(timeout=30)
+    assert [test["number"] for test in said.json["tests"] if test["verdict"] == "skipped"] == ["4.15", "6.12"]
+    assert (said.json["write"], more.json["write"], more.json["counts"]["skipped"]) == (False, True, 0)
+
+
 def test_a_foreign_node_is_not_written_to() -> None:
     """Without --write no value of a manufacturer object changes: the cases that need it are skipped."""
     outcome = examine(nothing, 2, options=Options(may_write=False))
