@@ -376,7 +376,7 @@ def check_mapping_rules(t: Target) -> str:
 @contextmanager
 def operational(t: Target) -> Iterator[None]:
     """Within, the node is OPERATIONAL; afterwards PRE-OPERATIONAL. Raises CaseFailed if it does not follow."""
-    if t.sheet.is_writable(0x1017):
+    if t.fixed_heartbeat is None:
         t.beat()
     t.enter(OPERATIONAL)
     try:

@@ -276,21 +276,40 @@ class Target:
             raise CaseFailed(f"no boot-up within {self.options.boot_timeout:g} s of an NMT reset")
         return boot
 
+    @property
+    def fixed_heartbeat(self) -> float | None:
+        """Its period in s where a master cannot change it, 0 for none; None where a master can."""
+        variable = self.sheet.find(0x1017)
+        if variable is not None and variable.is_writable:
+            return None
+        return float(variable.default) * 1e-3 if variable and isinstance(variable.default, int) else 0.0
+
     def beat(self, milliseconds: int = 20) -> None:
         """Let the node send heartbeats often, so that its state is seen soon. Raises CaseNotApplicable, Refusal."""
-        self.require_writable(0x1017)
-        self.write(0x1017, 0, milliseconds)
+        if self.fixed_heartbeat is None:
+            self.write(0x1017, 0, milliseconds)
+        elif not self.fixed_heartbeat:
+            raise CaseNotApplicable("the node sends no heartbeat")
 
     def read_state(self) -> int:
-        """The state in its heartbeat, after the present frames have had their effect. Raises CaseFailed."""
-        frame = self.wait_for(self.heartbeat_id, self.options.timeout + 1.0, lambda frame: frame.data != b"\0", 2)
+        """The state in its heartbeat, after the present frames have had their effect.
+
+        Raises CaseFailed, or CaseNotApplicable for a node without heartbeat.
+        """
+        if self.fixed_heartbeat == 0.0:
+            raise CaseNotApplicable("the node sends no heartbeat")
+        seconds = self.options.timeout + 1.0 + 3 * (self.fixed_heartbeat or 0.0)
+        frame = self.wait_for(self.heartbeat_id, seconds, lambda frame: frame.data != b"\0", 2)
         if frame is None:
             raise CaseFailed("no heartbeat came")
         return frame.data[0] & 0x7F if len(frame.data) == 1 else -1
 
     def enter(self, state: int) -> None:
-        """Command a state, and see that the node takes it on. Raises CaseFailed."""
+        """Command a state, and see that the node takes it on, if it says so. Raises CaseFailed."""
         self.command(COMMANDS[state])
+        if self.fixed_heartbeat == 0.0:
+            self.wait(0.1)
+            return
         found = self.read_state()
         if found != state:
             raise CaseFailed(f"commanded {STATES[state]}, the heartbeat says {STATES.get(found, found)}")

@@ -47,6 +47,7 @@ def check_first_request(t: Target) -> str:
       is_timed=True)
 def check_heartbeat_jitter(t: Target) -> str:
     """Thirty periods. CiA 301 gives no limit; consumers allow half a period at least."""
+    t.require_writable(0x1017)
     t.beat(50)
     t.wait_for(t.heartbeat_id, 1.0)
     mark = len(t.frames)

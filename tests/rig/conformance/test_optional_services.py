@@ -140,3 +140,21 @@ def test_mapping_rules(tmp_path: Path, rules: tuple[str, ...], said: str) -> Non
     assert said in measured(outcome, "4.17")[1]
     assert outcome.verdict == ("PASS" if len(rules) == 4 else "FAIL")
     assert outcome.notes == []
+
+
+def test_a_heartbeat_that_a_master_cannot_change(tmp_path: Path) -> None:
+    """Its period is awaited; what would change it is not applicable."""
+    sheet = write_sheet(tmp_path, ("[1017]\n", "AccessType=rw", "AccessType=const"))
+    outcome = examine(nothing, eds=sheet)
+    assert failures(outcome) == []
+    assert measured(outcome, "5.7") == (Verdict.NOT_APPLICABLE, "0x1017:0 is const in the EDS")
+    assert measured(outcome, "6.4") == (Verdict.PASS, "9 transitions")
+
+
+def test_a_node_without_heartbeat(tmp_path: Path) -> None:
+    sheet = write_sheet(tmp_path, ("[1017]\n", "AccessType=rw", "AccessType=const"),
+                        ("[1017]\n", "DefaultValue=100", "DefaultValue=0"))
+    outcome = examine(nothing, eds=sheet)
+    assert failures(outcome) == []
+    assert measured(outcome, "6.4") == (Verdict.NOT_APPLICABLE, "the node sends no heartbeat")
+    assert measured(outcome, "4.3")[0] is Verdict.PASS
