@@ -232,8 +232,8 @@ def check_error_behaviour(t: Target) -> str:
             require(code == 0, f"0x1029:1 = {value}: {format_abort(code)}")
         t.enter(OPERATIONAL)
         _beat_as(t, node, 15)
-        heard = [frame.data for frame in t.frames if frame.cob_id == t.heartbeat_id]
-        require(heard[-1] == bytes((OPERATIONAL,)), f"value {value}: not OPERATIONAL although the heartbeat comes")
+        heard = [frame.data[0] & 0x7F for frame in t.frames if frame.cob_id == t.heartbeat_id and frame.data]
+        require(heard[-1:] == [OPERATIONAL], f"value {value}: not OPERATIONAL although the heartbeat comes")
         t.wait(1.5 * LIMIT / 1e3 + 0.1)
         t.wait_for(t.heartbeat_id, t.options.timeout, partial(_says_state, state))
         after = t.read_state()
