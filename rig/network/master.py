@@ -20,7 +20,7 @@ from rig.device.nmt import NmtCommand, NmtState
 from rig.network import codec
 from rig.network.frame import Frame
 from rig.network.identity import Identity, read_identity
-from rig.network.sdo_client import CheckedSdoClient
+from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import Wire
 from rig.nodes import firmware
 from rig.nodes.emulator import SCENARIO
@@ -217,7 +217,7 @@ class Master:
                 continue
             try:
                 self._nodes[node].sdo.download(index, sub, data)
-            except (SdoAbortedError, SdoCommunicationError) as error:
+            except (SdoAbortedError, SdoCommunicationError, ConfirmationError) as error:
                 failures.append(f"node {node} {NAMES[node]}: 0x{index:04X} sub {sub} was not set back ({error})")
         self._before.clear()
         return failures

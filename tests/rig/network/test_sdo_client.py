@@ -184,10 +184,12 @@ def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
         master.configure(b"12345678", None, 0)
 
     class Controller(Server):
-        """Confirms 0x1006 with the index of another object, as node 2."""
+        """Confirms a download to node 2 with the index of another object."""
 
         def receive(self, frame: Frame) -> None:
-            if frame.cob_id == 0x602:
+            if frame.cob_id == 0x602 and frame.data[0] == 0x40:
+                self._send(0x582, b"\x43" + frame.data[1:4] + bytes(4))
+            elif frame.cob_id == 0x602:
                 self._send(0x582, bytes.fromhex("6007100000000000"))
             elif frame.cob_id == 0x603 and frame.data[0] != 0x80:
                 self._send(0x583, b"\x60" + frame.data[1:4] + bytes(4))
@@ -195,3 +197,18 @@ def test_a_wrong_confirmation_is_no_object_that_is_not_implemented() -> None:
     master = Master(EmbeddedWire(VirtualClock(), [lambda send: Controller(send, [])]), lambda: 0)
     with pytest.raises(ConfirmationError, match="node 2, SDO of object 0x1006 sub 0: confirmation of object 0x1007"):
         master.configure(b"1234", None, 0)
+
+
+def test_at_the_end_a_wrong_confirmation_is_a_failure_to_set_back() -> None:
+    """The other objects are still set back."""
+    servers: list[Server] = []
+
+    def make(send: Send) -> Server:
+        servers.append(Server(send, ["6007100000000000", "6016100100000000"]))
+        return servers[0]
+
+    master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0)
+    master._before = {(PLANT, 0x1006, 0): bytes(4), (PLANT, 0x1016, 1): bytes(4)}
+    assert master.restore() == ["node 3 plant: 0x1006 sub 0 was not set back (node 3, SDO of object 0x1006 sub 0: "
+                                "confirmation of object 0x1007 sub 0)"]
+    assert [request[:8] for request in servers[0].requests] == ["23061000", "80061000", "23161001"]
