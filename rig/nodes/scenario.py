@@ -71,8 +71,8 @@ class Scenario(NamedTuple):
             model = Model(str(named["name"])).having(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
             plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
-            if seed < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
-                raise InputError(WHERE, "plan", f"a seed from 0, and at most {LONGEST_PLAN} cycles")
+            if min(seed, plan.seed) < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:
+                raise InputError(WHERE, "plan", f"seeds from 0, and at most {LONGEST_PLAN} cycles")
             require_sensible(plan, model)
             return cls(model, plan, tuple(force), seed)
         except InputError:

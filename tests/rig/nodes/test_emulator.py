@@ -206,7 +206,9 @@ REFUSED = {
     "impossible value": table(model={"name": "eha", "effects": [], "values": {"spool.mass": -1.0}}),
     "values no table": table(model={"name": "eha", "effects": [], "values": 5}),
     "load beyond numbers": table(load=[10**30]), "load no list": table(load={"a": 1}), "seed": table(seed="x"),
-    "negative seed": table(seed=-1), "no stop": table(plan={"faults": []}),
+    "negative seed": table(seed=-1), "negative seed of a fault": table(plan={"faults": [
+        {"kind": "noise", "signal": "xj", "value": 1.0, "start": 0.0}], "stop": 10, "seed": -1}),
+    "no stop": table(plan={"faults": []}),
     "plan without end": table(plan={"faults": [{"kind": "noise", "signal": "xj", "value": 1.0, "start": 0.0}],
                                     "stop": 10**13}),
     "fault in the controller": table(plan={"faults": [
