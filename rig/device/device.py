@@ -32,6 +32,7 @@ class Device:
     on_rpdo(n)                   an asynchronous RPDO arrived and is in `od`
     on_write(index, sub, data)   SDO download about to be stored; may raise SdoAbort
     on_nmt(old, new)             the state has changed
+    on_sync_lost()               SYNC has stopped (0x1006; EMCY 0x8100 is already sent)
     on_heartbeat_lost(node)      the heartbeat of a monitored node stopped (EMCY and 0x1029 are already handled)
 
     Raises InputError for an EDS that cannot be read or maps what it does not hold.
@@ -44,6 +45,7 @@ class Device:
         self.on_rpdo: Callable[[int], None] = _nothing
         self.on_write: Callable[[int, int, bytes], None] = _nothing
         self.on_nmt: Callable[[NmtState, NmtState], None] = _nothing
+        self.on_sync_lost: Callable[[], None] = _nothing
         self.on_heartbeat_lost: Callable[[int], None] = _nothing
 
         self.od = Dictionary(eds_path, node_id)
@@ -51,7 +53,7 @@ class Device:
         self.emcy = Emcy(self.od, send, lambda: self.nmt.state in _COMMUNICATING)
         self.heartbeat = HeartbeatProducer(node_id, send)
         self.consumer = HeartbeatConsumer(self._heartbeat_lost, self._heartbeat_back)
-        self.sync = SyncConsumer(self.emcy, self._cycle)
+        self.sync = SyncConsumer(self.emcy, self._cycle, lambda: self.on_sync_lost())
         self.sdo = SdoServer(0x580 + node_id, send, self._upload, self.od.size, self._download)
         self.pdo = Pdos(self.od, self.emcy, send, lambda n: self.on_rpdo(n))
         self._handlers: dict[int, Handler] = {}

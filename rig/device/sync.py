@@ -7,15 +7,16 @@ from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.network.frame import Frame
 
 # 0x1006 gives the period of SYNC but not when SYNC counts as lost. The bench measures the lateness of a single SYNC
-# itself; a hundred missing in a row mean that the producer is gone.
-_LOST_AFTER = 100  # periods
+# itself; a dozen missing in a row mean that the producer is gone. The rig writes 8 ms.
+_LOST_AFTER = 12  # periods
 
 
 class SyncConsumer:
     """Runs `cycle` at each SYNC; raises EMCY 0x8100 when they stop and 0x8240 for one that carries data."""
 
-    def __init__(self, emcy: Emcy, cycle: Callable[[], None]) -> None:
-        self._emcy, self._cycle = emcy, cycle
+    def __init__(self, emcy: Emcy, cycle: Callable[[], None], lost: Callable[[], None]) -> None:
+        """`cycle()` at each SYNC; `lost()` when they stop, after the EMCY."""
+        self._emcy, self._cycle, self._report_lost = emcy, cycle, lost
         self._limit_ns = 0
         self._deadline = 0  # 0: not waiting
         self._lost = self._malformed = False
@@ -47,3 +48,4 @@ class SyncConsumer:
             self._deadline = 0
             self._lost = True
             self._emcy.raise_error(EmcyCode.COMMUNICATION, ErrorRegister.COMMUNICATION)
+            self._report_lost()

@@ -8,7 +8,8 @@
 enum { GAINS = 0x2110, CURRENT_LIMIT = 4, PERIOD = 5 };
 /* control word 0x6040 and status word 0x6041 (CiA 408): the three levels build on each other */
 enum { LEVELS = 0x7, RESET = 0x8, LOOP_CLOSED = 0x4, READY = 0x8 };
-enum { LOST_AFTER = 3 }; /* SYNCs in a row without feedback */
+enum { LOST_AFTER = 3 }; /* SYNCs in a row without feedback, or without a command */
+static const uint8_t COMMAND_RPDO = 1, FEEDBACK_RPDO = 2; /* first information byte of EMCY 0x8250 */
 
 static double real_from_bits(uint64_t bits)
 {
@@ -51,6 +52,7 @@ static void restart_loop(struct controller *controller)
         .period = real_from_bits(values[OBJECT_2110_05]),
     };
     controller->silent_cycles = 0;
+    controller->uncommanded_cycles = 0;
     controller->has_fault = false;
     controller->is_reset_seen = true;
 }
@@ -77,18 +79,38 @@ static void send_drive(struct controller *controller, double current, uint16_t s
     device_transmit(&controller->device, DRIVE_TPDO);
 }
 
-/* SYNC: the command of this cycle is latched and feedback follows. Without feedback for too long, raise a fault. */
+/* SYNC: without a new command for too long, raise a fault. */
+static void watch_command(struct controller *controller)
+{
+    struct emcy *emcy = &controller->device.emcy;
+    if (controller->device.pdos.rpdos[COMMAND_RPDO - 1].is_fresh) {
+        controller->uncommanded_cycles = 0;
+        if (controller->is_command_lost)
+            emcy_clear(emcy, EMCY_RPDO_TIMEOUT, COMMAND_RPDO);
+        controller->is_command_lost = false;
+        return;
+    }
+    if (controller->uncommanded_cycles <= LOST_AFTER)
+        controller->uncommanded_cycles++;
+    if (controller->uncommanded_cycles <= LOST_AFTER)
+        return;
+    controller->is_command_lost = true;
+    controller->has_fault = true;
+    emcy_raise(emcy, EMCY_RPDO_TIMEOUT, ERROR_COMMUNICATION, &COMMAND_RPDO, 1);
+}
+
+/* SYNC: the command of this cycle is latched and feedback follows. Without either for too long, raise a fault. */
 static void on_sync(void *context)
 {
     struct controller *controller = context;
+    watch_command(controller);
     if (controller->silent_cycles <= LOST_AFTER)
         controller->silent_cycles++;
     if (controller->silent_cycles <= LOST_AFTER)
         return;
-    const uint8_t feedback_rpdo = 2;
     controller->is_feedback_lost = true;
     controller->has_fault = true;
-    emcy_raise(&controller->device.emcy, EMCY_RPDO_TIMEOUT, ERROR_COMMUNICATION, &feedback_rpdo, 1);
+    emcy_raise(&controller->device.emcy, EMCY_RPDO_TIMEOUT, ERROR_COMMUNICATION, &FEEDBACK_RPDO, 1);
     send_drive(controller, 0.0, update_status(controller));
 }
 
@@ -99,7 +121,7 @@ static void on_rpdo(void *context, uint16_t number)
     (void)number;
     if (controller->is_feedback_lost) {
         controller->is_feedback_lost = false;
-        emcy_clear(&controller->device.emcy, EMCY_RPDO_TIMEOUT, EMCY_ANY_DETAIL);
+        emcy_clear(&controller->device.emcy, EMCY_RPDO_TIMEOUT, FEEDBACK_RPDO);
     }
     controller->silent_cycles = 0;
     const uint16_t status = update_status(controller);
@@ -130,7 +152,15 @@ static void on_nmt(void *context, enum nmt_state old, enum nmt_state new)
     if (new == NMT_OPERATIONAL)
         restart_loop(controller);
     else if (new == NMT_INITIALISING)
-        controller->is_feedback_lost = false;
+        controller->is_feedback_lost = controller->is_command_lost = false;
+}
+
+/* SYNC has stopped, so no feedback will ask for an answer: say at once that there is no current any more. */
+static void on_sync_lost(void *context)
+{
+    struct controller *controller = context;
+    controller->has_fault = true;
+    send_drive(controller, 0.0, update_status(controller));
 }
 
 static void on_heartbeat_lost(void *context, uint8_t node)
@@ -144,7 +174,7 @@ bool controller_init(struct controller *controller, struct output output)
 {
     memset(controller, 0, sizeof *controller);
     const struct dictionary od = {OBJECT_TABLE, OBJECT_COUNT, controller->values};
-    const struct hooks hooks = {controller, on_sync, on_rpdo, on_write, on_nmt, on_heartbeat_lost};
+    const struct hooks hooks = {controller, on_sync, on_rpdo, on_write, on_nmt, on_sync_lost, on_heartbeat_lost};
     bool is_consistent = device_init(&controller->device, CONTROLLER_NODE, od, output, hooks, controller->buffer,
                                      sizeof controller->buffer);
     restart_loop(controller);

@@ -23,8 +23,8 @@ struct controller {
     uint8_t buffer[8]; /* the largest object that can be written, a REAL64, comes in segments */
     struct control_law law;
     struct gains gains;     /* taken over at NMT start */
-    unsigned silent_cycles; /* SYNCs since the last feedback */
-    bool is_feedback_lost;  /* and announced by EMCY; a restart of the loop does not take that back */
+    unsigned silent_cycles, uncommanded_cycles; /* SYNCs since the last feedback, and since the last command */
+    bool is_feedback_lost, is_command_lost; /* and announced by EMCY; a restart of the loop does not take that back */
     bool has_fault;
     bool is_reset_seen; /* the reset bit was up already: no rising edge */
 };

@@ -140,7 +140,8 @@ void device_tick(struct device *device, int64_t t_ns)
     for (uint8_t node = heartbeat_find_lost(&device->consumer, t_ns); node != 0;
          node = heartbeat_find_lost(&device->consumer, t_ns))
         report_lost_heartbeat(device, node);
-    sync_tick(&device->sync, t_ns);
+    if (sync_tick(&device->sync, t_ns) && device->hooks.on_sync_lost != NULL)
+        device->hooks.on_sync_lost(device->hooks.context);
     sdo_tick(&device->sdo, t_ns);
 }
 

@@ -29,6 +29,8 @@ struct hooks {
     uint32_t (*on_write)(void *context, uint16_t index, uint8_t sub, const uint8_t *data, uint32_t length);
     /* The NMT state has changed. */
     void (*on_nmt)(void *context, enum nmt_state old, enum nmt_state new);
+    /* SYNC has stopped (0x1006); EMCY 0x8100 is already sent. */
+    void (*on_sync_lost)(void *context);
     /* The heartbeat of a watched node stopped; EMCY and 0x1029 are already handled. */
     void (*on_heartbeat_lost)(void *context, uint8_t node);
 };

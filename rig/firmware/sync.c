@@ -3,8 +3,8 @@
 #include <stddef.h>
 
 /* 0x1006 gives the period of SYNC but not when SYNC counts as lost. The bench measures the lateness of a single SYNC
- * itself; a hundred missing in a row mean that the producer is gone. */
-static const int64_t LOST_AFTER = 100; /* periods */
+ * itself; a dozen missing in a row mean that the producer is gone. The rig writes 8 ms. */
+static const int64_t LOST_AFTER = 12; /* periods */
 
 void sync_configure(struct sync_consumer *sync, uint64_t period_us)
 {
@@ -34,11 +34,12 @@ bool sync_receive(struct sync_consumer *sync, const struct frame *frame)
     return true;
 }
 
-void sync_tick(struct sync_consumer *sync, int64_t t_ns)
+bool sync_tick(struct sync_consumer *sync, int64_t t_ns)
 {
     if (sync->deadline_ns == 0 || t_ns <= sync->deadline_ns)
-        return;
+        return false;
     sync->deadline_ns = 0;
     sync->is_lost = true;
     emcy_raise(sync->emcy, EMCY_COMMUNICATION, ERROR_COMMUNICATION, NULL, 0);
+    return true;
 }

@@ -24,7 +24,7 @@ void sync_stop(struct sync_consumer *sync);
 /* A SYNC came: EMCY 0x8240 if it carries data. True if the cycle is to run. */
 bool sync_receive(struct sync_consumer *sync, const struct frame *frame);
 
-/* EMCY 0x8100 when SYNC has stopped. */
-void sync_tick(struct sync_consumer *sync, int64_t t_ns);
+/* EMCY 0x8100 when SYNC has stopped. True at that moment. */
+bool sync_tick(struct sync_consumer *sync, int64_t t_ns);
 
 #endif

@@ -77,6 +77,7 @@ class Master:
         self.on_rival: Callable[[int], None] = lambda cob_id: None
         self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
         self.silent = False  # a fault: no heartbeat of ours
+        self.is_deaf = False  # a fault: the rig receives nothing
         self.states = {CONTROLLER: -1, PLANT: -1}
         self.heard_ns: dict[int, int] = {}  # node: when its last heartbeat came, by the wire's clock
         self._booted: set[int] = set()
@@ -117,6 +118,8 @@ class Master:
 
     def receive(self, frame: Frame) -> None:
         """A frame came in."""
+        if self.is_deaf:
+            return
         if not self._stamped and frame.t_ns != (now := self._now()):
             frame = Frame(now, frame.cob_id, frame.data)
         self.on_frame(frame)
@@ -274,6 +277,10 @@ class Master:
 
     def _command_node(self, node: int, command: NmtCommand) -> None:
         self._nodes[node].nmt.send_command(int(command))
+
+    def reset_controller(self, reset: str) -> None:
+        """Send the controller an NMT reset, "node" or "communication", and do not wait."""
+        self._nodes[CONTROLLER].nmt.send_command({"node": 129, "communication": 130}[reset])
 
     def read_gains(self) -> Gains | None:
         """The gains of the controller (object 0x2110); None if it does not have them."""

@@ -18,7 +18,7 @@ from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.frame import Frame, Send
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Delay, Plan, Schedule
+from rig.sequences.faults import Delay, Double, Plan, Schedule, apply_action
 
 NODE = 3
 SCENARIO, COUNTERS = 0x2210, 0x2211
@@ -65,6 +65,7 @@ class Emulator:
         self._first = True  # of the cycles after a start: no drive can have answered yet
         self._moved = True
         self._missed = 0  # drive frames missing in a row
+        self._synced = -1  # the cycle of the last SYNC
         self._current = 0.0
         self._counts = {"missing": 0, "late": 0}
         self._held.clear()
@@ -78,13 +79,58 @@ class Emulator:
             action = self._faults.frame("drive", self._cycle - 1)
             if isinstance(action, Delay):
                 heapq.heappush(self._late, (frame.t_ns + action.ns, len(self._late), frame))
-            if action is not None:
                 return
-        elif frame.cob_id == codec.SYNC and self._begun and self.device.state is not NmtState.OPERATIONAL:
-            self._cycle += 1  # time goes on while the plant pauses
+            for data in apply_action(action, frame.data):
+                self.device.receive(frame._replace(data=data))
+            return
+        if self._is_deaf(frame):
+            return
+        if frame.cob_id == codec.SYNC and self._begun:
+            self._pass_lost_syncs()
+            if self._is_second_sync():
+                self._answer_again()
+                return
+            if self.device.state is not NmtState.OPERATIONAL:
+                self._cycle += 1  # time goes on while the plant pauses
         self.device.receive(frame)
         if not self._moved:  # after the answer to a SYNC has gone out
             self._move()
+
+    def _is_deaf(self, frame: Frame) -> bool:
+        """Whether a fault has the node bus-off: it receives nothing, but its plant goes on."""
+        if not self._faults.is_bus_off("plant", self._cycle if frame.cob_id == codec.SYNC else self._cycle - 1):
+            return False
+        if frame.cob_id == codec.SYNC and self._begun:
+            self._pass_cycle()
+        return True
+
+    def _pass_lost_syncs(self) -> None:
+        """Make up for the SYNCs that a fault kept from arriving since the last one: time went on for the plant."""
+        for _ in range(self._faults.count_lost_syncs(self._cycle)):
+            self._pass_cycle()
+
+    def _pass_cycle(self) -> None:
+        """A cycle of which the node heard no SYNC: the current stays, and is zeroed after three."""
+        k = self._cycle
+        if self.device.state is not NmtState.OPERATIONAL:
+            self._cycle += 1
+            return
+        self._miss("missing")
+        self._change_parameters(k)
+        self._plant.sample()  # the transducers go on as well
+        self._move()
+
+    def _is_second_sync(self) -> bool:
+        """Whether this SYNC is the duplicate of the last one, by a fault."""
+        is_second = (self._synced == self._cycle - 1 and isinstance(self._faults.frame("sync", self._synced), Double))
+        self._synced = -1 if is_second else self._cycle
+        return is_second
+
+    def _answer_again(self) -> None:
+        """Send the PDOs of this SYNC once more; the plant does not move twice."""
+        if self.device.state is NmtState.OPERATIONAL:
+            for tpdo in self.device.pdo.cyclic:
+                tpdo.send()
 
     def tick(self, t_ns: int) -> None:
         """Deliver the delayed frames that are due at `t_ns`."""
@@ -102,11 +148,14 @@ class Emulator:
             action = self._faults.frame(name, self._cycle)
             if isinstance(action, Delay):
                 heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
-            if action is not None:
                 return
-        elif cob_id == _HEARTBEAT and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
+            for what in apply_action(action, data):
+                self._send(cob_id, what)
+            return
+        if cob_id == _HEARTBEAT and not self._first and not self._faults.is_heartbeat_alive("plant", self._cycle):
             return  # before the first SYNC there is no cycle: bring-up needs the heartbeat
-        self._send(cob_id, data)
+        if not self._faults.is_bus_off("plant", self._cycle - 1):
+            self._send(cob_id, data)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         """The first start begins a run; after a pause the plant continues from its last state."""
@@ -130,9 +179,7 @@ class Emulator:
         k, od = self._cycle, self._od
         flags = _NO_FLAGS if self._first else self._judge(k)
         self._first = False
-        for name, value in self._faults.parameters_at(k, self._changed).items():
-            self._plant.set(name, value)
-        self._changed = k
+        self._change_parameters(k)
         xj, p12, xs = self._plant.sample()
         if not isfinite(xj + p12 + xs):
             self._diverged()
@@ -144,6 +191,12 @@ class Emulator:
         od[0x2203, 0] = int(flags)
         od[0x2204, 0] = k & 0xFFFF
         self._moved = False
+
+    def _change_parameters(self, k: int) -> None:
+        """Set what faults have made of the plant's parameters since the last cycle."""
+        for name, value in self._faults.parameters_at(k, self._changed).items():
+            self._plant.set(name, value)
+        self._changed = k
 
     def _judge(self, k: int) -> Flags:
         """Whether the latched drive answers the cycle before this one; the current to use until the next SYNC.
@@ -158,14 +211,18 @@ class Emulator:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
             return _NO_FLAGS
-        self._missed += 1
-        self._count("late" if fresh else "missing")
         flags = Flags.DRIVE_LATE if fresh else Flags.DRIVE_MISSING
-        if self._missed >= MISSED_LIMIT:
-            self._current = 0.0
-            flags |= Flags.CURRENT_ZEROED
-            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
-        return flags
+        return flags | Flags.CURRENT_ZEROED if self._miss("late" if fresh else "missing") else flags
+
+    def _miss(self, what: str) -> bool:
+        """No answer to the last cycle; returns whether it was one too many: then there is no current."""
+        self._missed += 1
+        self._count(what)
+        if self._missed < MISSED_LIMIT:
+            return False
+        self._current = 0.0
+        self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
+        return True
 
     def _diverged(self) -> None:
         """The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value."""

@@ -24,7 +24,8 @@ GAINS = 0x2110
 _RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
 _LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
 _CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
-LOST_AFTER = 3  # SYNCs in a row without feedback
+LOST_AFTER = 3  # SYNCs in a row without feedback, or without a command
+_COMMAND_PDO, _FEEDBACK_PDO = b"\x01", b"\x02"  # RPDO numbers, first information byte of EMCY 0x8250
 
 
 class Gains(NamedTuple):
@@ -55,10 +56,12 @@ class Firmware:
         self.device.on_rpdo = self._on_rpdo
         self.device.on_nmt = self._on_nmt
         self.device.on_heartbeat_lost = self._trip
+        self.device.on_sync_lost = self._on_sync_lost
         self.device.on_write = self._on_write
         self._od = self.device.od.values
         self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
         self._lost = False  # feedback, announced by EMCY; a restart does not take that back
+        self._is_command_lost = False  # the same for the command
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick
 
@@ -67,6 +70,7 @@ class Firmware:
         self._taken.restart()
         self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
         self._silent = 0  # SYNCs since the last feedback
+        self._uncommanded = 0  # SYNCs since the last command
         self._fault = False
         self._acknowledged = True
 
@@ -74,7 +78,7 @@ class Firmware:
         if new is NmtState.OPERATIONAL:
             self._restart()
         elif new is NmtState.INITIALISING:
-            self._lost = False
+            self._lost = self._is_command_lost = False
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         """Reject NaN and infinite gains (they would produce a NaN current), a negative limit and a period of 0."""
@@ -89,19 +93,41 @@ class Firmware:
         self._fault = True
 
     def _on_sync(self) -> None:
-        """The command of this cycle is latched and feedback follows. After LOST_AFTER cycles without feedback, trip."""
+        """The command of this cycle is latched and feedback follows.
+
+        After LOST_AFTER cycles without feedback, or without a command, trip: the current is zero from the next on.
+        """
+        self._watch_command()
         self._silent += 1
         if self._silent > LOST_AFTER:
             self._lost = True
             self._trip()
-            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x02")
+            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, _FEEDBACK_PDO)
             self._drive(0.0, self._status())
+
+    def _watch_command(self) -> None:
+        if self.device.pdo.rpdos[1].fresh:
+            self._uncommanded = 0
+            if self._is_command_lost:
+                self._is_command_lost = False
+                self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT, _COMMAND_PDO)
+            return
+        self._uncommanded += 1
+        if self._uncommanded > LOST_AFTER:
+            self._is_command_lost = True
+            self._trip()
+            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, _COMMAND_PDO)
+
+    def _on_sync_lost(self) -> None:
+        """No SYNC, so no feedback will ask for an answer: say at once that there is no current any more."""
+        self._trip()
+        self._drive(0.0, self._status())
 
     def _on_rpdo(self, n: int) -> None:
         """Feedback arrived: close the loop."""
         if self._lost:
             self._lost = False
-            self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
+            self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT, _FEEDBACK_PDO)
         self._silent = 0
         status = self._status()
         if status & _LOOP_CLOSED:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from plant.segments import Array
 from rig.network.codec import Flags
 from rig.network.master import CONTROLLER, NAMES, NODE, PLANT
-from rig.sequences.faults import Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.faults import BusOff, Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.timing import PERIOD, TimingPolicy
 
 Mask = NDArray[np.bool_]
@@ -394,6 +394,8 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
             anything[first:last + heartbeat_limit] = True
             if not isinstance(fault, Silent):
                 sync[first:last + watchdog_limit] = True
+            if isinstance(fault, BusOff):
+                plant[first:last + 1] = True
             continue
         for k in range(first, min(last, cycles)):
             action = schedule.frame(frame, k)
@@ -401,6 +403,9 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
                 delay = -(-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else 0
                 span = slice(k, k + delay + watchdog_limit)
                 anything[span] = True
-                if frame in ("feedback", "valve_state"):
+                if frame in ("feedback", "valve_state", "sync"):
                     plant[k:k + delay + 1] = True
+                if frame == "sync":
+                    sync[k:k + delay + 1] = True
+                    anything[k:k + heartbeat_limit] = True
     return Injected(sync, plant, anything)

@@ -29,7 +29,7 @@ from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import Delay, Schedule
+from rig.sequences.faults import Delay, Drop, Schedule
 
 RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
 _US = 1000  # ns
@@ -38,12 +38,19 @@ _US = 1000  # ns
 def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, period_ns: int, realtime: bool) -> Loop:
     """The cycle loop for a bus: the hard one where compiled code can use the bus, else `CycleLoop`.
 
+    `CycleLoop` also plays the faults on the bus that the compiled cycle does not have (`needs_soft_loop`).
+
     Raises:
         RigError: the bus cannot be opened.
     """
-    if can_open(bus) and isinstance(master.wire, LinkWire):
+    if can_open(bus) and isinstance(master.wire, LinkWire) and not needs_soft_loop(faults):
         return HardLoop(master, faults, log, open_raw_bus(bus, RECEIVED), period_ns, realtime)
     return CycleLoop(master, faults, log, period_ns, realtime)
+
+
+def needs_soft_loop(faults: Schedule) -> bool:
+    """Whether faults change frames of the rig in a way that the compiled cycle cannot: it loses and delays commands."""
+    return bool(faults.list_actions("sync") or faults.list_actions("command") - {Drop, Delay})
 
 
 @cache

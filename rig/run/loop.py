@@ -19,7 +19,7 @@ from rig.network.frame import Frame
 from rig.network.master import Master
 from rig.recorder import Signals, Timing
 from rig.run.priority import name_scheduler
-from rig.sequences.faults import Delay, Schedule
+from rig.sequences.faults import Delay, Drop, Schedule, apply_action
 
 _XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
 _ALL = _XJ | _XS | _COR
@@ -149,12 +149,12 @@ class CycleLoop:
         timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
         self._open, self._seen = (self._t_ns, row, timing), 0
         master.silent = not self._faults.is_heartbeat_alive("rig", k)
+        master.is_deaf = self._faults.is_bus_off("rig", k)
         self._command(codec.pack_command(step.demand, step.control, k))
-        self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
-        master.send(codec.SYNC, b"")
+        delay = self._send_sync()
         timing.execution = (self._wall.now() - began) * 1e-9
         if not self._realtime:
-            self._wire.wait_for_answers(self._t_ns, lambda: self._seen == _ALL)
+            self._wait_for_answers(delay)
             self._send_held(self._t_ns + self._period)
         master.tick()
         self.k += 1
@@ -184,12 +184,31 @@ class CycleLoop:
         """Late by more than half a cycle: the controller is left too little of it to answer in."""
         return 2 * late_ns > self._period
 
+    def _send_sync(self) -> int | None:
+        """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
+        action = self._faults.frame("sync", self.k)
+        delay = action.ns if isinstance(action, Delay) else 0
+        if delay and self._realtime:
+            self._wire.run_until(self._t_ns + delay)
+        self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
+        for _ in apply_action(action, b""):
+            self._master.send(codec.SYNC, b"")
+        return None if isinstance(action, Drop) else delay
+
+    def _wait_for_answers(self, delay: int | None) -> None:
+        """Lockstep: let the answers come in; without a SYNC there are none, and a cycle's time passes."""
+        if delay is None:
+            self._wire.run_until(self._wire.clock.now() + self._period)
+        else:
+            self._wire.wait_for_answers(self._t_ns + delay, lambda: self._seen == _ALL)
+
     def _command(self, data: bytes) -> None:
         action = self._faults.frame("command", self.k)
-        if action is None:
-            self._master.send(codec.COMMAND, data)
-        elif isinstance(action, Delay):
+        if isinstance(action, Delay):
             heapq.heappush(self._held, (self._t_ns + action.ns, self.k, data))
+            return
+        for what in apply_action(action, data):
+            self._master.send(codec.COMMAND, what)
 
     def _send_held(self, before_ns: int) -> None:
         """Late commands whose time has come."""

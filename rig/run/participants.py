@@ -21,6 +21,7 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
 from rig.run.processes import NodeProcesses
+from rig.sequences.faults import is_noticed_by_time
 
 EMBEDDED_NAMES = ("embedded", "virtual")
 RIVAL_TIMEOUT = 0.25  # s: a rig at work is heard within this
@@ -50,6 +51,7 @@ def open_participants(job: Job) -> Iterator[Participants]:
         raise InputError("--controller", job.controller, f"a model without effects in the firmware, which only the "
                                                          f"builtin one has: not "
                                                          f"{', '.join(find_firmware_parameters(job.model))}")
+    _require_time(job)
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
         if job.controller != "builtin" or job.plant == "external":
             raise InputError("--bus", job.bus, "a bus that an external node can be on, such as socketcan:can0")
@@ -71,6 +73,15 @@ def open_participants(job: Job) -> Iterator[Participants]:
     finally:
         processes.stop()
         link_wire.close()
+
+
+def _require_time(job: Job) -> None:
+    """Refuse faults that nodes notice by the time, where there is none: in lockstep between processes."""
+    is_embedded = job.bus.partition(":")[0] in EMBEDDED_NAMES
+    timed = [fault.label for fault in job.sequence.faults if is_noticed_by_time(fault)]
+    if timed and not job.realtime and not is_embedded:
+        raise InputError("--pace", "lockstep", f"realtime, or the embedded bus, for the fault {timed[0]!r}: in "
+                                               "lockstep between processes nodes watch neither SYNC nor heartbeats")
 
 
 def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses) -> None:

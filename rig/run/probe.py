@@ -8,7 +8,7 @@ the rows of the sequence are those of a run without probes. After clean-up the c
 """
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from rig.sequences.protocol import Mask, Rows
 
 BEFORE, AFTER = 3, 4  # phase numbers, beside those of set-up, main and clean-up; the log has their frames only
 PROBES = 2  # before set-up
+ATTEMPTS = 5  # at each of them, in real time
 DISTANCE = 1e-3  # m: from the position to the demand while the control word is not ACTIVE
 _STEP = 0.5e-3  # m: while it is; far below the current limit
 _MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
@@ -40,6 +41,8 @@ FIRST_STEPS = (
     Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
     Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, _STEP, 3), Step(0, DISTANCE, 8),
 )
+FIRST_CYCLES = sum(step.cycles for step in FIRST_STEPS)
+WARM_UP = (Step(0, DISTANCE, 30), Step(Control.RESET, DISTANCE, 1))  # real time: the first cycles may be late
 LAST_STEPS = (Step(0, DISTANCE, 8),)
 
 
@@ -64,6 +67,19 @@ def has_no_answers(probe: History) -> bool:
     """Whether the last cycles were all without a drive frame."""
     last = probe.column("cor")[-_MISSED_LIMIT:]
     return len(last) == _MISSED_LIMIT and bool(np.isnan(last).all())
+
+
+def find_gap(probe: History) -> str:
+    """Who left a cycle of a probe without a frame, not counting the warm-up: "bench", "controller", "" for nobody."""
+    if np.isnan(probe.column("xj")[-FIRST_CYCLES:]).any():
+        return "bench"
+    return "controller" if np.isnan(probe.column("cor")[-FIRST_CYCLES:]).any() else ""
+
+
+def select_last(rows: Rows) -> Rows:
+    """The rows of a probe without its warm-up."""
+    columns: Any = (column[-FIRST_CYCLES:] for column in rows)
+    return Rows(*columns)
 
 
 def read_rows(history: History, on_time: Mask) -> Rows:

@@ -89,7 +89,7 @@ def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
-                              sequence.fault_starts())
+                              sequence.fault_starts(), session.read_drives())
     return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from itertools import filterfalse
 from typing import NamedTuple
 
+import numpy as np
 from canopen.emcy import EmcyError
 
 from fdi.progress import Progress
@@ -19,8 +20,10 @@ from plant.errors import InputError
 from plant.profile import Profile, build_profile
 from plant.segments import RATE, Hold
 from rig.device.nmt import NmtState
+from rig.network import codec
 from rig.network.clock import WallClock
 from rig.network.codec import Control
+from rig.network.frame import Frame
 from rig.network.identity import Identity
 from rig.network.master import CONTROLLER, HEARTBEAT, HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, PLANT, Master
 from rig.network.wire import EmbeddedWire
@@ -37,24 +40,32 @@ from rig.run.overruns import OverrunWatch
 from rig.run.participants import Participants
 from rig.run.probe import (
     AFTER,
+    ATTEMPTS,
     BEFORE,
     FIRST_STEPS,
     LAST_STEPS,
     PROBES,
+    WARM_UP,
+    Step,
+    find_gap,
     find_on_time,
     has_firmware_effects,
     has_no_answers,
     list_inputs,
     make_probe_scenario,
     read_rows,
+    select_last,
 )
 from rig.run.processes import describe_exit
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import GuardWatch
 from rig.sequences.protocol import Emergency, ProtocolRecord, Rows
+from rig.sequences.run_data import DriveFrames
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
+_SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of their errors
+_MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
 _ENABLING_STEPS = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
 
 
@@ -89,6 +100,7 @@ class Session:
         self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9)
         self._probes: list[History] = []  # played before set-up
+        self._probe = History()  # the one being played
         self._after = History()  # the probe after clean-up
         self._is_probing = False  # before set-up: nothing that happens there ends the run
         self._emergencies: list[Emergency] = []
@@ -100,10 +112,14 @@ class Session:
         self.interrupted = False
         self.safe = False  # no current from here on, until clean-up
         self._powered = True  # clean-up may use current
+        self._may_power = True  # it may still use it when errors have gone meanwhile
+        self._reset_at = 0  # the cycle of clean-up whose control word resets the faults
         self._playing = False  # from the start of the nodes until the nodes are stopped by us
         self._demand = 0.0  # m, of the last cycle
         self._operational: set[int] = set()
         self._edges = sorted(self._faults.edges)
+        self._resets = self._faults.resets
+        self._injected = 0  # cycles whose frames of other nodes are sent
         self._agenda: list[tuple[int, str, str, str]] = []  # events of cycles that are queued: cycle, level, kind, text
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
         self._clock = wire.clock
@@ -111,7 +127,8 @@ class Session:
         self._next_look = 0  # when to look again whether the processes of the nodes are alive
         wire.is_node_gone = self._is_node_gone
         self._master = Master(wire, self.now, job.realtime)
-        self._master.on_frame = recorder.frame
+        self._drives: list[Frame] = []  # drive frames, if faults act on the bus
+        self._master.on_frame = self._keep_drive if job.sequence.disturbs_bus else recorder.frame
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
         self._master.on_heartbeat = lambda node, t_ns: self._heartbeats[node].append(t_ns)
@@ -140,10 +157,26 @@ class Session:
         else:
             self._agenda.append((self.loop.queued, level, kind, text))
 
+    def _keep_drive(self, frame: Frame) -> None:
+        """Record a frame; keep the drive frames for the checks of reactions."""
+        self.recorder.frame(frame)
+        if frame.cob_id == codec.DRIVE and len(frame.data) == 8 and len(self._drives) < _MOST_DRIVES:
+            self._drives.append(frame)
+
+    def read_drives(self) -> DriveFrames:
+        """The drive frames of a run with faults on the bus; times count cycles, as those of events do."""
+        drives = [codec.unpack_drive(frame.data) for frame in self._drives]
+        came, due = np.array([frame.t_ns for frame in self._drives], np.int64), np.array(self.due_ns, np.int64)
+        cycle = np.searchsorted(due, came, "right") - 1
+        since = np.clip(came - due[np.maximum(cycle, 0)], 0, self.job.period_ns - 1) if len(due) else came
+        t = np.where(cycle < 0, -np.inf, (cycle - self._plan.start) / RATE + since * 1e-9)
+        return DriveFrames(t, np.array([drive.current for drive in drives]),
+                           np.array([drive.status for drive in drives], np.int64))
+
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """Record a complete cycle (called by the loop)."""
         if signals.phase in (BEFORE, AFTER):
-            (self._probes[-1] if signals.phase == BEFORE else self._after).add(signals, timing)
+            (self._probe if signals.phase == BEFORE else self._after).add(signals, timing)
             return
         while self._agenda and self._agenda[0][0] <= signals.cycle:
             cycle, *words = self._agenda.pop(0)
@@ -188,7 +221,7 @@ class Session:
             self._gains = gains or self._master.read_gains()
         patient = not job.realtime and isinstance(self._clock, WallClock)
         self._master.configure(scenario.to_bytes(), gains,
-                               job.sequence.timing.choose_sync_period() if job.realtime else 0,
+                               job.sequence.timing.choose_sync_period() if job.realtime or self._is_embedded else 0,
                                PATIENT if patient else HEARTBEAT_LIMIT)
         self._master.start()
         self._wait_for_operational(job.sequence.timing.operational)
@@ -197,26 +230,54 @@ class Session:
         return open_loop(self._master, faults, self, self.job.bus, self.job.period_ns, self.job.realtime)
 
     def _play_probes(self) -> None:
-        """Play the probes before set-up, each after a reset of the nodes. Raises BusError."""
-        scenario = make_probe_scenario(self.scenario)
+        """Play the probes before set-up, each after a reset of the nodes.
+
+        In real time a probe with a gap is repeated. If the bench itself cannot deliver one, none is judged.
+
+        Raises:
+            BusError: a node does not answer or refuses.
+        """
+        steps = (*WARM_UP, *FIRST_STEPS) if self.job.realtime else FIRST_STEPS
         self._is_probing = True
         for _ in range(PROBES):
-            self._start_nodes(scenario)
+            probe = self._play_probe(steps)
+            attempts = ATTEMPTS if self.job.realtime else 1
+            while (gap := find_gap(probe)) and (attempts := attempts - 1) and not self.aborted:
+                probe = self._play_probe(steps)
             if self.aborted:
                 break
-            self._probes.append(History())
-            self.loop = self._make_loop(Schedule(scenario.plan, scenario.model.values))
-            try:
-                for step in list_inputs(FIRST_STEPS, BEFORE, 0.0):
-                    self.loop.cycle(step)
-                    if has_no_answers(self._probes[-1]):
-                        self.loop.hold(BEFORE)
-                        break
-                self.loop.finish()
-            finally:
-                self.loop.close()
-                self.loop = None
+            if gap == "bench" and self.job.realtime:
+                self.log_event("WARN", "probe", f"no probe without a gap in {ATTEMPTS} attempts: the plant was late")
+                self._probes.clear()
+                break
+            self._probes.append(probe)
         self._is_probing = False
+
+    def _play_probe(self, steps: tuple[Step, ...]) -> History:
+        """Play one probe after a reset of the nodes. Raises BusError."""
+        scenario = make_probe_scenario(self.scenario)
+        self._start_nodes(scenario)
+        self._probe = History()
+        if self.aborted:  # a node did not become OPERATIONAL
+            return self._probe
+        self.loop = self._make_loop(Schedule(scenario.plan, scenario.model.values))
+        try:
+            for step in list_inputs(steps, BEFORE, 0.0):
+                self.loop.cycle(step)
+                if self.job.realtime and self._stop():
+                    self.interrupted = True
+                    self._abort("operator", "stopped by the operator")
+                if self.aborted or has_no_answers(self._probe):
+                    self.loop.hold(BEFORE)
+                    break
+            self.loop.finish()
+        except BaseException:
+            self._master.stop()
+            raise
+        finally:
+            self.loop.close()
+            self.loop = None
+        return self._probe
 
     def _play_last_probe(self) -> None:
         """Play the probe after clean-up, if the controller is still in control."""
@@ -237,7 +298,7 @@ class Session:
 
         run = read_rows(self.history, judged & find_on_time(self.history, self._faults, job.realtime, seconds))
         return ProtocolRecord(
-            run=run, probes=[read(probe) for probe in self._probes if len(probe)],
+            run=run, probes=[select_last(read(probe)) for probe in self._probes if len(probe)],
             after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
             heartbeats={NAMES[node]: [t_ns * 1e-9 for t_ns in times] for node, times in self._heartbeats.items()},
             heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9), heartbeat_period=HEARTBEAT * 1e-3,
@@ -305,7 +366,7 @@ class Session:
         """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
         self._next_look = 0
         if self._is_node_gone() or any(trouble.kind == "bring_up" for trouble in self.troubles):
-            self._powered = False
+            self._powered = self._may_power = False
             return build_profile((Hold(time=0.1),), self._demand)
         return self.job.sequence.cleanup_profile(self._demand)
 
@@ -322,11 +383,18 @@ class Session:
             self._master.start()
         return not self.safe or not self._master.errors()
 
+    def _try_again(self) -> None:
+        """Some cycles into clean-up: a node that had to be started again may have no errors any more by now."""
+        assert self.loop is not None
+        self.loop.wait_until_played(lambda: False)
+        self._powered = self._may_power and not self.gone and not self._master.errors()
+        self._reset_at = _SETTLING
+
     def _choose_control_word(self, phase: int, i: int) -> int:
         """Control word of the phase's cycle `i`."""
         if self.safe if phase != CLEANUP else not self._powered:
             return 0
-        if phase == CLEANUP and self.safe and i == 0:
+        if phase == CLEANUP and self.safe and i == self._reset_at:
             return int(Control.RESET)
         started = self.loop.queued if self.loop else 0  # without set-up main is where it is enabled
         return int(_ENABLING_STEPS[started]) if started < len(_ENABLING_STEPS) else int(Control.ACTIVE)
@@ -340,6 +408,8 @@ class Session:
             shown = section.name if phase == MAIN else PHASES[phase]
             for i in range(section.start, section.stop):
                 self._announce_faults()
+                if phase == CLEANUP and i == _SETTLING and not self._powered:
+                    self._try_again()
                 self._demand = float(profile.command[i])
                 load = self._find_load(self.loop.queued) if phase == MAIN else 0.0
                 self.loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
@@ -353,7 +423,18 @@ class Session:
         """Force on the ram from the scenario in a cycle, N."""
         return float(self.scenario.force[cycle] * FORCE_RESOLUTION) if cycle < len(self.scenario.force) else 0.0
 
+    def _inject(self) -> None:
+        """Send the resets and the frames of other nodes that are due before the next cycle."""
+        assert self.loop is not None
+        while self._resets and self._resets[0][0] <= self.loop.k:
+            self._master.reset_controller(self._resets.pop(0)[1])
+        for k in range(self._injected, self.loop.k + 1):
+            for cob_id, data in self._faults.foreign_frames(k):
+                self._master.send(cob_id, data)
+        self._injected = self.loop.k + 1
+
     def _must_end(self) -> bool:
+        self._inject()
         self._is_node_gone()
         if self._overruns.problem and not self.aborted:
             self._abort("overrun", self._overruns.problem)

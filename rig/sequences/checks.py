@@ -15,13 +15,15 @@ from typing import Annotated, Literal
 import numpy as np
 
 from plant.segments import RATE, Hertz, Second, require_frequency
+from rig.network.codec import Status
 from rig.sequences import measures
 from rig.sequences.check import LATEST_TIME, Check, CheckResult, InUnit, require_check
 from rig.sequences.measures import NotMeasurable
-from rig.sequences.run_data import EventLike, RunData, TraceLike
+from rig.sequences.run_data import NO_DRIVES, DriveFrames, EventLike, RunData, TraceLike
 
-__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "evaluate_checks"]
+__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "ShutOff", "evaluate_checks"]
 
+LEFT_OPERATIONAL = "node 2 left OPERATIONAL:"  # words of the event
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InSI = Annotated[float, "SI units"]
 Percent = Annotated[float, "%"]
@@ -162,6 +164,12 @@ class PhaseLag(AmplitudeRatio):
         return -degrees(phase(response))
 
 
+def _require_time(after: str | float) -> None:
+    if isinstance(after, float):
+        require_check(0 <= after <= LATEST_TIME, "after",
+                      f"0 to {LATEST_TIME:g} s of main, or a fault's name, not {after:g}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResponseWithin(Check):
     """Time from `after` (a fault's name or s of main) to an event, or to a signal passing a level for 3 samples, s."""
@@ -179,14 +187,10 @@ class ResponseWithin(Check):
         levelled = self.above is not None or self.below is not None
         require_check(levelled == (self.signal is not None), "signal",
                       "a signal with a level above or below which it counts")
-        if isinstance(self.after, float):
-            require_check(0 <= self.after <= LATEST_TIME, "after",
-                          f"0 to {LATEST_TIME:g} s of main, or a fault's name, not {self.after:g}")
+        _require_time(self.after)
 
     def measure(self, run: RunData, span: slice) -> float:
-        after = self.after if isinstance(self.after, float) else run.starts.get(self.after)
-        if after is None:
-            raise NotMeasurable(f"there was no fault {self.after!r}")
+        after = run.find_start(self.after)
         if self.signal:
             rest = run.span((after, span.stop / RATE))
             return measures.find_crossing(run.signal(self.signal, rest), self.above, self.below)
@@ -194,6 +198,56 @@ class ResponseWithin(Check):
         if not events:
             raise NotMeasurable(f"no event {self.event!r} after {after:g} s")
         return events[0].t - after
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShutOff(Check):
+    """Time from `after` to the drive frame from which on the controller says zero current and no closed loop, s.
+
+    Any drive frame counts, also one of another cycle. A controller that leaves OPERATIONAL sends none any more, which
+    counts as well. `status`: the four lower bits of the status word that it must say then; by default any without MODE.
+    """
+
+    kind, si = "shut_off", "s"
+    after: str | Second
+    status: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_time(self.after)
+        require_check(self.status is None or 0 <= self.status <= 0xF, "status",
+                      f"the four lower bits of a status word, 0 to 15, not {self.status}")
+
+    def measure(self, run: RunData, span: slice) -> float:
+        after = run.find_start(self.after)
+        drives = run.drives.between(after, span.stop / RATE)
+        is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
+        if self.status is not None:
+            is_off &= drives.status & 0xF == self.status
+        on = np.flatnonzero(~is_off)
+        off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
+        left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / RATE)
+                if not len(on) or event.t >= drives.t[on[-1]]]
+        times = [*off[:1].tolist(), *left[:1]]
+        if not times:
+            raise NotMeasurable("the controller did not say zero current, nor did it leave OPERATIONAL")
+        return float(min(times)) - after
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recovers(Check):
+    """Time from the start of clean-up until the status word says ACTIVE, and does so to the end, s."""
+
+    kind, si = "recovers", "s"
+
+    def measure(self, run: RunData, span: slice) -> float:
+        start = len(run.trace.t) / RATE
+        drives = run.drives.between(start, np.inf)
+        idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
+        first = int(idle[-1]) + 1 if len(idle) else 0
+        if first >= len(drives.t):
+            raise NotMeasurable("the controller was not ACTIVE at the end of clean-up")
+        return float(drives.t[first]) - start
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,11 +277,12 @@ class EventNever(EventOccurs):
 
 KINDS: dict[str, type[Check]] = {kind.kind: kind for kind in (
     Overshoot, SettlingTime, RiseTime, SteadyError, RampError, BreakAway, MaxError, RmsError, NeverExceeds,
-    AmplitudeRatio, PhaseLag, ResponseWithin, EventOccurs, EventNever)}
+    AmplitudeRatio, PhaseLag, ResponseWithin, ShutOff, Recovers, EventOccurs, EventNever)}
 
 
 def evaluate_checks(checks: Iterable[Check], trace: TraceLike, sections: Mapping[str, slice],
-             events: Sequence[EventLike] = (), starts: Mapping[str, float] | None = None) -> list[CheckResult]:
+             events: Sequence[EventLike] = (), starts: Mapping[str, float] | None = None,
+             drives: DriveFrames = NO_DRIVES) -> list[CheckResult]:
     """Judge a run.
 
     Args:
@@ -236,6 +291,7 @@ def evaluate_checks(checks: Iterable[Check], trace: TraceLike, sections: Mapping
         sections: rows of each section of the command.
         events: what happened, times in s of main.
         starts: when each fault began, s of main, by its label.
+        drives: all drive frames, for the checks of a reaction.
     """
-    run = RunData(trace, sections, events, starts or {})
+    run = RunData(trace, sections, events, starts or {}, drives)
     return [check.judge(run) for check in checks]

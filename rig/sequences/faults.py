@@ -24,12 +24,14 @@ from rig.sequences import tables
 from rig.sequences.injection import AddedSignal, StuckSignal, choose_frames
 
 Sensor = Literal["xj", "p12", "xs"]
-FrameName = Literal["feedback", "valve_state", "drive", "command"]
-HeartbeatNode = Literal["rig", "plant"]
+FrameName = Literal["feedback", "valve_state", "drive", "command", "sync"]
+PdoName = Literal["feedback", "valve_state", "drive", "command"]
+BenchNode = Literal["rig", "plant"]
 InSI = Annotated[float, "SI units"]
 LATEST_START = 1e6  # s, later than any run ends
 LARGEST_VALUE = 1e12  # SI; a sensor cannot be further off, and sums of two stay numbers
 LARGEST_COUNT = 1_000_000_000  # cycles or frames to count to
+MOST_FOREIGN = 1000  # frames a cycle; a bus of 1 Mbit/s carries 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +52,9 @@ class Fault(ABC):
     @property
     def label(self) -> str:
         """Its name, or what it does to what: `lost drive`, `parameter filter.clogging`."""
-        what = next((getattr(self, key) for key in ("parameter", "signal", "frame", "node") if hasattr(self, key)), "")
-        return self.name or f"{self.kind} {what}"
+        keys = ("parameter", "signal", "frame", "node", "reset")
+        what = next((getattr(self, key) for key in keys if hasattr(self, key)), "")
+        return self.name or f"{self.kind} {what}".rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +133,7 @@ class Stuck(Fault):
 class _Frames(Fault):
     """Affects every `every`-th frame, each with a probability, until `count` frames were affected."""
 
-    frame: FrameName
+    frame: FrameName | PdoName
     every: int = 1
     count: int | None = None
     probability: float = 1.0
@@ -147,6 +150,7 @@ class Lost(_Frames):
     """Frames that never arrive."""
 
     kind = "lost"
+    frame: FrameName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +158,7 @@ class Late(_Frames):
     """Frames that arrive `delay` seconds late."""
 
     kind = "late"
+    frame: PdoName
     delay: Second
 
     def __post_init__(self) -> None:
@@ -162,14 +167,106 @@ class Late(_Frames):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Duplicated(_Frames):
+    """Frames that arrive twice, one right after the other."""
+
+    kind = "duplicated"
+    frame: FrameName
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corrupted(_Frames):
+    """Frames with `bits` bits of their data inverted, chosen at random; on a real bus the CRC lets one in 2^15 pass."""
+
+    kind = "corrupted"
+    frame: PdoName
+    bits: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(1 <= self.bits <= 64, "bits", f"1 to 64 bits, not {self.bits}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Short(_Frames):
+    """Frames cut to their first `length` bytes."""
+
+    kind = "short"
+    frame: PdoName
+    length: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(0 <= self.length <= 7, "length", f"0 to 7 bytes, not {self.length}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jitter(Fault):
+    """SYNC comes late by a random time, uniform between 0 and `size` seconds; due times stay where they are."""
+
+    kind = "jitter"
+    size: Second
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(0 < self.size < 1 / RATE, "size", f"above 0 s and below the cycle of {1 / RATE:g} s, "
+                                                   f"not {self.size:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Foreign(Fault):
+    """A node that is not of the bench: in every `every`-th cycle the rig sends `frames` frames that nobody expects.
+
+    A few with an unknown COB-ID are foreign traffic; many with a low one are a babbling node.
+    """
+
+    kind = "foreign"
+    cob_id: int = 0x7E5
+    length: int = 8
+    frames: int = 1  # in each of these cycles
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(1 <= self.cob_id <= 0x7FF and not is_of_bench(self.cob_id), "cob_id",
+                 f"an identifier from 1 to 0x7FF that no node of the bench uses, not 0x{self.cob_id:X}")
+        _require(0 <= self.length <= 8, "length", f"0 to 8 bytes, not {self.length}")
+        _require(1 <= self.frames <= MOST_FOREIGN, "frames", f"1 to {MOST_FOREIGN} frames a cycle, not {self.frames}")
+        _require(1 <= self.every <= LARGEST_COUNT, "every", f"1 or more cycles, not {self.every}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BusOff(Fault):
+    """A node of the bench is bus-off: it neither sends nor receives, and recovers at the end."""
+
+    kind = "bus_off"
+    node: BenchNode
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reset(Fault):
+    """The rig resets the controller by NMT: its communication, or the whole node (CiA 301, 7.2.8.2.1)."""
+
+    kind = "reset"
+    reset: Literal["node", "communication"] = "node"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Silent(Fault):
     """A node whose heartbeat stops."""
 
     kind = "heartbeat"
-    node: HeartbeatNode
+    node: BenchNode
 
 
-KINDS: dict[str, type[Fault]] = {kind.kind: kind for kind in (Parameter, Offset, Noise, Stuck, Lost, Late, Silent)}
+KINDS: dict[str, type[Fault]] = {kind.kind: kind for kind in (
+    Parameter, Offset, Noise, Stuck, Lost, Late, Duplicated, Corrupted, Short, Jitter, Foreign, BusOff, Reset, Silent)}
+BUS_FAULTS = (_Frames, Jitter, Foreign, BusOff, Reset, Silent)  # those on the bus
+
+
+def is_of_bench(cob_id: int) -> bool:
+    """Whether a node of the bench, 1 to 3, uses a COB-ID: its function code and node number (CiA 301, 7.3.5), SYNC."""
+    return cob_id == 0x080 or cob_id & 0x7F in (1, 2, 3)
 
 
 class Drop(NamedTuple):
@@ -180,6 +277,41 @@ class Delay(NamedTuple):
     """This frame arrives later."""
 
     ns: int
+
+
+class Double(NamedTuple):
+    """This frame arrives twice."""
+
+
+class Corrupt(NamedTuple):
+    """The data of this frame is inverted where `mask` has a one; first byte lowest."""
+
+    mask: int
+
+
+class Cut(NamedTuple):
+    """Only the first `length` bytes of this frame arrive."""
+
+    length: int
+
+
+Action = Drop | Delay | Double | Corrupt | Cut
+ACTION_CODES: Mapping[type, int] = {Drop: 1, Delay: 2, Double: 3, Corrupt: 4, Cut: 5}  # 0: sent normally
+
+
+def apply_action(action: Action | None, data: bytes) -> tuple[bytes, ...]:
+    """What arrives of a frame, at once; a delayed frame is the caller's business and arrives unchanged."""
+    match action:
+        case Drop():
+            return ()
+        case Double():
+            return data, data
+        case Corrupt(mask):
+            word = int.from_bytes(data, "little") ^ mask
+            return (word.to_bytes(8, "little")[:len(data)],)
+        case Cut(length):
+            return (data[:length],)
+    return (data,)
 
 
 class Edge(NamedTuple):
@@ -224,11 +356,14 @@ class Schedule:
     """
 
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
-        self._base = base or {}
+        self._base, self._stop = base or {}, plan.stop
         self._parameters: dict[str, list[tuple[int, int, float, Parameter]]] = {}
         self._signals: dict[str, list[Callable[[int, float], float]]] = {}
-        self._frames: dict[str, list[tuple[int, bytes, Drop | Delay]]] = {}
+        self._frames: dict[str, list[tuple[int, list[Action | None]]]] = {}
         self._silent: dict[str, list[range]] = {}
+        self._bus_off: dict[str, list[range]] = {}
+        self._foreign: list[tuple[range, Foreign]] = []
+        self._resets: list[tuple[int, str]] = []
         self.edges: tuple[Edge, ...] = ()
         for index, fault in enumerate(plan.faults):
             first, last = plan.cycles(fault)
@@ -250,10 +385,22 @@ class Schedule:
             case Stuck():
                 self._signals.setdefault(fault.signal, []).append(StuckSignal(range(first, last), fault.value))
             case _Frames():
-                action = Delay(round(fault.delay * 1e9)) if isinstance(fault, Late) else Drop()
                 hit = choose_frames(last - first, fault.every, fault.count, fault.probability, rng)
-                self._frames.setdefault(fault.frame, []).append((first, hit, action))
+                self._put(fault.frame, first, _choose_actions(fault, hit, rng))
                 return first + len(hit)
+            case Jitter():
+                delays = np.rint(rng.uniform(0.0, fault.size, last - first) * 1e9).astype(int).tolist()
+                self._put("sync", first, [Delay(ns) for ns in delays])
+            case Foreign():
+                self._foreign.append((range(first, last), fault))
+            case BusOff():
+                self._bus_off.setdefault(fault.node, []).append(range(first, last))
+                self._silent.setdefault(fault.node, []).append(range(first, last))
+                for frame in _SENT_BY[fault.node] + _RECEIVED_BY[fault.node]:
+                    self._put(frame, first, [Drop()] * (last - first))
+            case Reset():
+                self._resets.append((first, fault.reset))
+                return first + 1
             case Silent():
                 self._silent.setdefault(fault.node, []).append(range(first, last))
         return last
@@ -283,26 +430,122 @@ class Schedule:
             value = change(cycle, value)
         return value
 
-    def frame(self, name: str, cycle: int) -> Drop | Delay | None:
-        """What happens to the frame `name` of this cycle; None: it is sent normally."""
-        for first, hit, action in self._frames.get(name, ()):
-            if 0 <= cycle - first < len(hit) and hit[cycle - first]:
+    def _put(self, name: str, first: int, actions: list[Action | None] | list[Delay] | list[Drop]) -> None:
+        self._frames.setdefault(name, []).append((first, list(actions)))
+
+    def frame(self, name: str, cycle: int) -> Action | None:
+        """What happens to the frame `name` of this cycle; None: it is sent normally. Of several faults the first acts.
+
+        The name is that of a PDO or `sync`.
+        """
+        for first, actions in self._frames.get(name, ()):
+            if 0 <= cycle - first < len(actions) and (action := actions[cycle - first]) is not None:
                 return action
         return None
 
+    def list_actions(self, name: str) -> set[type]:
+        """The kinds of action that happen to the frame `name` at some time."""
+        return {type(action) for _, actions in self._frames.get(name, ()) for action in actions if action is not None}
+
+    def frame_actions(self, name: str, cycles: int) -> NDArray[np.int64]:
+        """`frame` of the first `cycles` as a table for compiled loops, (cycles, 2): code (ACTION_CODES) and argument.
+
+        The argument of a delay is in ns, that of a corrupted frame the mask as a signed 64-bit word, that of a short
+        one its length in bytes; else 0.
+        """
+        table = np.zeros((cycles, 2), np.int64)
+        for first, actions in reversed(self._frames.get(name, [])):  # the first fault acts, so it is written last
+            for k, action in enumerate(actions[:max(0, cycles - first)], first):
+                if action is not None:
+                    table[k] = ACTION_CODES[type(action)], _find_argument(action)
+        return table
+
+    def foreign_frames(self, cycle: int) -> list[tuple[int, bytes]]:
+        """COB-ID and data of the frames of no node of the bench that are sent in this cycle."""
+        if not self._foreign:
+            return []
+        return [(fault.cob_id, (cycle & 0xFFFF).to_bytes(8, "little")[:fault.length])
+                for cycles, fault in self._foreign if cycle in cycles and (cycle - cycles.start) % fault.every == 0
+                for _ in range(fault.frames)]
+
+    def foreign_actions(self, cycles: int) -> NDArray[np.int64]:
+        """`foreign_frames` of the first `cycles` as a table, (n, 4): cycle, COB-ID, length, number of frames."""
+        rows = [(k, fault.cob_id, fault.length, fault.frames) for when, fault in self._foreign
+                for k in range(when.start, min(when.stop, cycles), fault.every)]
+        return np.array(sorted(rows), np.int64).reshape(-1, 4)
+
+    @property
+    def resets(self) -> list[tuple[int, str]]:
+        """The cycles before which the rig resets the controller, and what: "node" or "communication"."""
+        return sorted(self._resets)
+
+    def is_bus_off(self, node: str, cycle: int) -> bool:
+        """Whether the node (rig or plant) is bus-off."""
+        return any(cycle in cycles for cycles in self._bus_off.get(node, ()))
+
+    def count_lost_syncs(self, cycle: int) -> int:
+        """How many SYNCs in a row are lost from this cycle on."""
+        count = 0
+        while isinstance(self.frame("sync", cycle + count), Drop):
+            count += 1
+        return count
+
     def find_disturbed(self, cycles: int) -> NDArray[np.bool_]:
-        """Of the first `cycles` those in which a fault acts on a cyclic frame, and the one after each."""
+        """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the one after each.
+
+        After a reset of the controller, all cycles of main.
+        """
         disturbed = np.zeros(cycles + 1, bool)
-        for first, hit, _ in (layer for layers in self._frames.values() for layer in layers):
-            at = first + np.flatnonzero(np.frombuffer(hit, np.uint8))
-            at = at[at < cycles]
-            disturbed[at] = disturbed[at + 1] = True
+        for k, _ in self._resets:  # the rig starts the controller again after main
+            disturbed[k:self._stop] = True
+        for name in self._frames:
+            codes = self.frame_actions(name, cycles)[:, 0]
+            hit = np.flatnonzero(codes == ACTION_CODES[Drop] if name == "sync" else codes)
+            disturbed[hit] = disturbed[hit + 1] = True
         found: NDArray[np.bool_] = disturbed[:cycles]
         return found
 
     def is_heartbeat_alive(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) sends its heartbeat."""
         return not any(cycle in cycles for cycles in self._silent.get(node, ()))
+
+
+_SENT_BY: Mapping[str, tuple[str, ...]] = {"rig": ("command", "sync"), "plant": ("feedback", "valve_state")}
+_RECEIVED_BY: Mapping[str, tuple[str, ...]] = {"rig": (), "plant": ("drive",)}
+
+
+def _choose_actions(fault: _Frames, hit: bytes, rng: np.random.Generator) -> list[Action | None]:
+    """What happens to the frames that a fault hits, cycle by cycle; drawn from `rng` where it is random."""
+    def choose() -> Action:
+        match fault:
+            case Late():
+                return Delay(round(fault.delay * 1e9))
+            case Duplicated():
+                return Double()
+            case Corrupted():
+                return Corrupt(sum(1 << int(bit) for bit in rng.choice(64, fault.bits, replace=False)))
+            case Short():
+                return Cut(fault.length)
+        return Drop()
+
+    return [choose() if is_hit else None for is_hit in hit]
+
+
+def _find_argument(action: Action) -> int:
+    """The argument of an action as a signed 64-bit word."""
+    match action:
+        case Delay(ns):
+            return ns
+        case Corrupt(mask):
+            return mask - (1 << 64) if mask >= 1 << 63 else mask
+        case Cut(length):
+            return length
+    return 0
+
+
+def is_noticed_by_time(fault: Fault) -> bool:
+    """Whether nodes notice a fault only because something has not come for some time: SYNC or a heartbeat."""
+    return isinstance(fault, Silent | BusOff) or (isinstance(fault, Lost) and fault.frame == "sync")
 
 
 def _require_size(value: float) -> None:

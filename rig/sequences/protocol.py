@@ -230,11 +230,13 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
     allowed = (0.001 if record.realtime else 0.0) if limits.missing is None else limits.missing
     wrong = missing = cycles = 0
     for rows in record.stretches:
+        judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
         flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
-        is_wrong = rows.on_time & (flags & int(Flags.DRIVE_LATE) != 0)
-        is_missing = rows.on_time & ~is_wrong & (np.isnan(rows.cor) | (flags & int(Flags.DRIVE_MISSING) != 0))
-        wrong, missing, cycles = wrong + int(is_wrong.sum()), missing + int(is_missing.sum()), cycles + int(
-            rows.on_time.sum())
+        is_wrong = judged & (flags & int(Flags.DRIVE_LATE) != 0)
+        is_missing = judged & ~is_wrong & (np.isnan(rows.cor) | (flags & int(Flags.DRIVE_MISSING) != 0))
+        wrong += int(is_wrong.sum())
+        missing += int(is_missing.sum())
+        cycles += int(judged.sum())
     for name, count in (("drive frames of another cycle", wrong), ("drive frames missing or late", missing)):
         value = 100 * count / cycles if cycles else 0.0
         yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")

@@ -3,9 +3,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plant.segments import RATE, Array
 from rig.sequences import measures
@@ -37,6 +38,22 @@ class EventLike(Protocol):
     def text(self) -> str: ...
 
 
+class DriveFrames(NamedTuple):
+    """All drive frames of a run, whatever their cycle number, as columns; only recorded if faults act on the bus."""
+
+    t: Array  # s of main
+    current: Array  # A
+    status: NDArray[np.int64]  # status word
+
+    def between(self, t0: float, t1: float) -> DriveFrames:
+        """Those with t0 <= t < t1."""
+        chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
+        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen])
+
+
+NO_DRIVES = DriveFrames(np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
+
+
 @dataclass(frozen=True)
 class RunData:
     """The data of a run that checks use: trace, sections, events, and when each fault started (s of main, by label)."""
@@ -45,6 +62,18 @@ class RunData:
     sections: Mapping[str, slice] = field(default_factory=dict)
     events: Sequence[EventLike] = ()
     starts: Mapping[str, float] = field(default_factory=dict)
+    drives: DriveFrames = NO_DRIVES
+
+    def find_start(self, after: str | float) -> float:
+        """A time, s of main, given as such or as the label of the fault that begins then.
+
+        Raises:
+            NotMeasurable: there is no such fault.
+        """
+        t = after if isinstance(after, float) else self.starts.get(after)
+        if t is None:
+            raise NotMeasurable(f"there was no fault {after!r}")
+        return t
 
     def span(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
         """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""

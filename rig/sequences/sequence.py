@@ -20,7 +20,7 @@ from plant.model import Model, find_quantity
 from plant.profile import Profile, build_profile, name_sections, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
-from rig.sequences.checks import Check, ResponseWithin
+from rig.sequences.checks import Check, ResponseWithin, ShutOff
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
 from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
@@ -105,7 +105,13 @@ class Sequence:
     @property
     def loses_frames(self) -> bool:
         """Whether a fault keeps frames from arriving."""
-        return any(isinstance(fault, faults.Lost | faults.Late) for fault in self.faults)
+        lossy = (faults.Lost, faults.Late, faults.Corrupted, faults.Short, faults.BusOff, faults.Reset)
+        return any(isinstance(fault, lossy) for fault in self.faults)
+
+    @property
+    def disturbs_bus(self) -> bool:
+        """Whether a fault acts on the bus."""
+        return any(isinstance(fault, faults.BUS_FAULTS) for fault in self.faults)
 
     def fault_starts(self) -> dict[str, float]:
         """When each fault begins, s of main, by its label."""
@@ -276,5 +282,5 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
             raise place.at(i, "window").refuse(f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / RATE:
             raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
-        if isinstance(check, ResponseWithin) and isinstance(check.after, str) and labels[check.after] != 1:
+        if isinstance(check, ResponseWithin | ShutOff) and isinstance(check.after, str) and labels[check.after] != 1:
             raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(check.after, labels)}")

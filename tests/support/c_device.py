@@ -66,7 +66,7 @@ class _Output(ctypes.Structure):
 
 class _Hooks(ctypes.Structure):
     _fields_ = [("context", ctypes.c_void_p), ("on_sync", _Plain), ("on_rpdo", _Numbered), ("on_write", _Write),
-                ("on_nmt", _Change), ("on_heartbeat_lost", _Node)]  # fmt: skip
+                ("on_nmt", _Change), ("on_sync_lost", _Plain), ("on_heartbeat_lost", _Node)]  # fmt: skip
 
 
 def skip_without_compiler() -> None:
@@ -220,6 +220,7 @@ class CDevice(_View):
         self.on_rpdo: Callable[[int], None] = lambda n: None
         self.on_write: Callable[[int, int, bytes], None] = lambda index, sub, data: None
         self.on_nmt: Callable[[NmtState, NmtState], None] = lambda old, new: None
+        self.on_sync_lost: Callable[[], None] = lambda: None
         self.on_heartbeat_lost: Callable[[int], None] = lambda node: None
         library, calls, od = load_library(), _Calls(), Dictionary(eds_path, node_id)
         self._memory = ctypes.create_string_buffer(library.host_device_size())
@@ -234,6 +235,7 @@ class CDevice(_View):
             _Numbered(lambda _, n: calls.guard(lambda: self.on_rpdo(n))),
             _Write(self._write_object),
             _Change(lambda _, old, new: calls.guard(lambda: self.on_nmt(NmtState(old), NmtState(new)))),
+            _Plain(lambda _: calls.guard(lambda: self.on_sync_lost())),
             _Node(lambda _, node: calls.guard(lambda: self.on_heartbeat_lost(node))))  # fmt: skip
         table = _Dictionary(self._objects, len(objects), self._values)
         if not library.device_init(self._memory, node_id, table, self._output, self._hooks, self._buffer, DOMAIN_BYTES):

@@ -237,17 +237,19 @@ def test_sync_with_data_is_refused_and_said_once() -> None:
     assert rack.sync() == [(0x083, NO_ERROR), (0x183, bytes(8)), (0x283, bytes(8))]
 
 
-def test_sync_lost_after_a_hundred_periods_and_back() -> None:
+def test_sync_lost_after_twelve_periods_and_back() -> None:
     rack = running()
+    lost: list[int] = []
+    rack.device.on_sync_lost = lambda: lost.append(1)
 
     def wait(ms: int) -> list[tuple[int, bytes]]:
         return [frame for frame in rack.wait(ms) if frame[0] != 0x703]  # heartbeats go on
 
     assert wait(500) == []  # none came yet: none is missed
     rack.sync()
-    assert wait(100) == []
-    assert wait(1) == [(0x083, bytes.fromhex("0081110000000000"))]
-    assert wait(200) == []
+    assert wait(12) == [] and lost == []
+    assert wait(1) == [(0x083, bytes.fromhex("0081110000000000"))] and lost == [1]
+    assert wait(200) == [] and lost == [1]
     assert rack.sync()[0] == (0x083, NO_ERROR)
     download(rack, 0x1006, 0, 0, 4)
     rack.sync()

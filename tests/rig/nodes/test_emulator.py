@@ -15,7 +15,21 @@ from rig.network import codec
 from rig.network.codec import Flags
 from rig.nodes.emulator import COUNTERS, MISSED_LIMIT, Emulator
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Fault, Late, Lost, Noise, Offset, Parameter, Plan, Silent, Stuck
+from rig.sequences.faults import (
+    BusOff,
+    Corrupted,
+    Duplicated,
+    Fault,
+    Late,
+    Lost,
+    Noise,
+    Offset,
+    Parameter,
+    Plan,
+    Short,
+    Silent,
+    Stuck,
+)
 
 QUIET_MODEL = Model().replace({f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spool")})
 STOP = 200
@@ -264,3 +278,67 @@ def test_strange_frames_do_no_harm() -> None:
     assert desk.node.device.state is NmtState.OPERATIONAL
     desk.cycle(1e-3)
     assert desk.last()[1].cycle == 0
+
+
+def test_a_lost_sync_does_not_stop_the_plant() -> None:
+    """Two SYNCs are lost, and what was to be latched then comes too late: three in a row, and the cycles go on."""
+    desk = PlantDesk(scenario(Lost(frame="sync", start=0.004, end=0.006)))
+    other = PlantDesk(scenario())
+    for k in range(10):
+        if k in (4, 5):
+            desk.k += 1
+            desk.wait(MS)
+            other.cycle(None)
+        else:
+            said, expected = desk.cycle(5e-3), other.cycle(5e-3)
+            assert (said[1].cycle, said[1].flags) == (k, Flags.DRIVE_LATE | Flags.CURRENT_ZEROED if k == 6 else 0)
+            assert k > 6 or said[0] == expected[0]  # the current in force was the same up to there
+    assert counters(desk) == (2, 1)
+
+
+def test_a_duplicated_sync_is_answered_twice_and_moves_the_plant_once() -> None:
+    desk = PlantDesk(scenario(Duplicated(frame="sync", start=0.003, end=0.004)))
+    other = PlantDesk(scenario())
+    for k in range(8):
+        if k == 3:
+            desk.send(codec.SYNC)
+        assert desk.cycle(5e-3) == other.cycle(5e-3)
+    assert len(desk.frames(codec.FEEDBACK)) == len(desk.frames(codec.VALVE_STATE)) == 9 and counters(desk) == (0, 0)
+
+
+def test_a_plant_that_is_bus_off_moves_without_current_and_comes_back() -> None:
+    desk = PlantDesk(scenario(BusOff(node="plant", start=0.010, end=0.030)))
+    for _ in range(40):
+        desk.send(codec.SYNC)
+        if len(desk.frames(codec.FEEDBACK)) > desk.k - 20 * (desk.k >= 30):
+            desk.drive(5e-3, desk.k)
+        desk.k += 1
+        desk.wait(MS)
+    cycles = [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)]
+    assert cycles == [*range(10), *range(30, 40)]
+    assert desk.node._current == 5e-3 and desk.node._counts["missing"] >= 20
+    assert not [t_ns for t_ns, _, _ in desk.heard if 10 * MS <= t_ns < 30 * MS]
+
+
+def test_duplicated_short_and_corrupted_frames() -> None:
+    desk = PlantDesk(scenario(Duplicated(frame="feedback", start=0.002, end=0.003),
+                              Short(frame="valve_state", length=3, start=0.004, end=0.005),
+                              Corrupted(frame="feedback", bits=1, start=0.006, end=0.007),
+                              Short(frame="drive", length=7, start=0.008, end=0.009)))
+    other = PlantDesk(scenario())
+    for k in range(12):
+        if k == 4:
+            desk.send(codec.SYNC)
+            assert len(desk.frames(codec.VALVE_STATE)[-1]) == 3
+            desk.drive(5e-3, 4)
+            desk.k += 1
+            desk.wait(MS)
+            other.cycle(5e-3)
+        else:
+            desk.cycle(5e-3)
+            other.cycle(5e-3)
+    sound, found = other.frames(codec.FEEDBACK), desk.frames(codec.FEEDBACK)
+    assert found[2] == found[3] == sound[2] and len(found) == 13
+    wrong = int.from_bytes(found[7], "little") ^ int.from_bytes(sound[6], "little")
+    assert wrong.bit_count() == 1 and found[:2] + found[3:7] + found[8:9] == sound[:6] + sound[7:8]
+    assert desk.emergencies()[:1] == [0x8210] and counters(desk) == (1, 0)

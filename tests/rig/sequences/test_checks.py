@@ -13,6 +13,7 @@ from plant.profile import build_profile
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.run_data import NO_DRIVES, DriveFrames
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower
@@ -68,8 +69,9 @@ def check(kind: str, **keys: Any) -> checks.Check:
     return checks.KINDS[kind](**keys)
 
 
-def judged(run: Run, sections: dict[str, slice], kind: str, events: tuple[Event, ...] = (), **keys: Any) -> CheckResult:
-    (result,) = evaluate_checks([check(kind, **keys)], run, sections, events, {"fault": 0.5})
+def judged(run: Run, sections: dict[str, slice], kind: str, events: tuple[Event, ...] = (),
+           drives: DriveFrames = NO_DRIVES, **keys: Any) -> CheckResult:
+    (result,) = evaluate_checks([check(kind, **keys)], run, sections, events, {"fault": 0.5}, drives)
     return result
 
 
@@ -211,7 +213,7 @@ NEEDED: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("kind", sorted(set(checks.KINDS) - {"event_occurs", "event_never"}))
+@pytest.mark.parametrize("kind", sorted(set(checks.KINDS) - {"event_occurs", "event_never", "shut_off", "recovers"}))
 @pytest.mark.parametrize("fault", ["no position", "holes", "broken off", "empty"])
 def test_what_cannot_be_measured_has_failed_and_says_why(kind: str, fault: str) -> None:
     run, reason = broken_runs()[fault]
@@ -290,3 +292,48 @@ def test_a_measure_without_end_has_failed(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(measures, "measure_overshoot", lambda *_: float("inf"))
     result = judged(run, sections, "overshoot", window="step", low=0.0, high=None)
     assert not result.passed and isnan(result.value) and result.detail == "the measure came to inf"
+
+
+def drives(*frames: tuple[float, float, int]) -> DriveFrames:
+    """Time, current and status word of drive frames."""
+    t, current, status = (np.array(column) for column in zip(*frames, strict=True))
+    return DriveFrames(t, current, status)
+
+
+ON, OFF = 2e-3, 0.0  # A
+
+
+@pytest.mark.parametrize(("frames", "expected"), [
+    (((0.49, ON, 15), (0.5, ON, 15), (0.503, OFF, 0), (0.504, OFF, 0)), 0.003),
+    (((0.5, ON, 15), (0.503, OFF, 0), (0.504, ON, 15), (0.505, OFF, 0)), 0.005),  # once is not for good
+    (((0.5, ON, 0), (0.501, OFF, 15), (0.502, OFF, 8)), 0.002),  # zero current and the loop open, both
+])
+def test_time_until_the_controller_is_off(frames: tuple[tuple[float, float, int], ...], expected: float) -> None:
+    run, sections = follower(Hold(time=1.0))
+    result = judged(run, sections, "shut_off", after="fault", drives=drives(*frames))
+    assert result.value == pytest.approx(expected)
+
+
+def test_a_status_word_that_is_asked_for() -> None:
+    run, sections = follower(Hold(time=1.0))
+    frames = drives((0.5, ON, 15), (0.501, OFF, 8), (0.502, OFF, 0))
+    assert judged(run, sections, "shut_off", after=0.5, status=0, drives=frames).value == pytest.approx(0.002)
+    result = judged(run, sections, "shut_off", after=0.5, status=1, drives=frames)
+    assert isnan(result.value) and "did not say zero current" in result.detail
+
+
+def test_a_controller_that_left_operational_is_off() -> None:
+    run, sections = follower(Hold(time=1.0))
+    left = (Event(0.51, "nmt", "node 2 controller left OPERATIONAL: boot-up"),)
+    frames = drives((0.5, ON, 15), (0.505, ON, 15))
+    assert judged(run, sections, "shut_off", left, after=0.5, drives=frames).value == pytest.approx(0.01)
+    later = drives((0.5, ON, 15), (0.52, ON, 15))
+    assert isnan(judged(run, sections, "shut_off", left, after=0.5, drives=later).value)
+
+
+def test_time_until_the_controller_is_active_again() -> None:
+    run, sections = follower(Hold(time=1.0))
+    frames = drives((0.9, ON, 15), (1.0, OFF, 0), (1.001, OFF, 8), (1.002, ON, 15), (1.003, ON, 15))
+    assert judged(run, sections, "recovers", drives=frames).value == pytest.approx(0.002)
+    for gone in (drives((1.0, ON, 15), (1.2, OFF, 0)), drives((0.9, ON, 15))):
+        assert isnan(judged(run, sections, "recovers", drives=gone).value)

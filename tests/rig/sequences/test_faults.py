@@ -11,7 +11,31 @@ from plant import load_model
 from plant.errors import InputError
 from rig.nodes.scenario import Scenario
 from rig.sequences import faults
-from rig.sequences.faults import Delay, Drop, Fault, Late, Lost, Noise, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.faults import (
+    BusOff,
+    Corrupt,
+    Corrupted,
+    Cut,
+    Delay,
+    Double,
+    Drop,
+    Duplicated,
+    Fault,
+    Foreign,
+    Jitter,
+    Late,
+    Lost,
+    Noise,
+    Offset,
+    Parameter,
+    Plan,
+    Reset,
+    Schedule,
+    Short,
+    Silent,
+    Stuck,
+    apply_action,
+)
 from rig.sequences.sequence import Sequence, parse_sequence
 
 MAIN = 'title = "T"\nmain = [{ kind = "hold", time = 1.0 }]\n'
@@ -104,7 +128,10 @@ ONE_OF_EACH: tuple[Fault, ...] = (
     Parameter(parameter="filter.clogging", value=0.3, start=1.0, ramp=0.5), Offset(signal="p12", value=1e5, start=0.1),
     Noise(signal="xs", value=1e-6, start=0.2, end=0.4), Stuck(signal="xj", start=0.3),
     Lost(frame="drive", start=1.0, count=3), Late(frame="feedback", start=1.0, delay=1e-3),
-    Silent(node="rig", start=2.0, name="rig dies"),
+    Silent(node="rig", start=2.0, name="rig dies"), Duplicated(frame="sync", start=0.1, every=7),
+    Corrupted(frame="feedback", start=0.1, bits=3), Short(frame="command", start=0.1, length=4, count=2),
+    Jitter(size=2e-4, start=0.5), Foreign(start=0.1, cob_id=0x10, frames=20), BusOff(node="plant", start=0.1, end=0.2),
+    Reset(start=0.7),
 )
 
 
@@ -168,3 +195,63 @@ def test_it_is_cheap_enough_to_ask_in_every_cycle() -> None:
             s.frame(frame, k)
         s.is_heartbeat_alive("plant", k)
     assert (time.perf_counter() - begin) / 2000 < 100e-6  # some 5 us on an idle machine; a cycle is 1000 us
+
+
+def test_what_arrives_of_a_frame() -> None:
+    data = bytes(range(8))
+    assert apply_action(None, data) == (data,) and apply_action(Drop(), data) == ()
+    assert apply_action(Double(), data) == (data, data) and apply_action(Cut(3), data) == (data[:3],)
+    assert apply_action(Corrupt(0x01 | 0x80 << 56), data) == (bytes((1, 1, 2, 3, 4, 5, 6, 0x87)),)
+    assert apply_action(Corrupt(1 << 63), b"\x01\x02") == (b"\x01\x02",)
+
+
+def test_corrupted_frames_have_as_many_bits_inverted_as_asked_for() -> None:
+    s = schedule(Corrupted(frame="drive", start=0.0, end=0.1, bits=3), seed=5)
+    masks = [action.mask for k in range(100) if isinstance(action := s.frame("drive", k), Corrupt)]
+    assert len(masks) == 100 and {mask.bit_count() for mask in masks} == {3} and len(set(masks)) > 90
+
+
+def test_jitter_delays_sync_within_its_size() -> None:
+    s = schedule(Jitter(size=2e-4, start=0.01, end=0.5), seed=2)
+    delays = [action.ns for k in range(10, 500) if isinstance(action := s.frame("sync", k), Delay)]
+    assert len(delays) == 490 and 0 <= min(delays) < 10_000 and 190_000 < max(delays) <= 200_000
+    assert s.frame("sync", 9) is None and s.frame("sync", 500) is None
+
+
+def test_the_table_of_a_frame_says_what_frame_says() -> None:
+    """Compiled loops read tables."""
+    plan = Plan(faults=(*ONE_OF_EACH, Lost(frame="feedback", start=0.15, count=1)), stop=2000, seed=3)
+    s = Schedule(plan, {"filter.clogging": 0.0})
+    kinds: dict[int, type] = {code: kind for kind, code in faults.ACTION_CODES.items()}
+    for name in ("command", "sync", "feedback", "valve_state", "drive"):
+        for k, (code, argument) in enumerate(s.frame_actions(name, 1900).tolist()):
+            action = s.frame(name, k)
+            assert type(action) is kinds.get(code, type(None)), (name, k)
+            assert argument & (1 << 64) - 1 == (action[0] if action else 0)
+    assert {kind for name in ("command", "sync", "feedback", "valve_state", "drive") for kind in s.list_actions(name)} \
+        == set(kinds.values())
+
+
+def test_frames_of_other_nodes() -> None:
+    s = schedule(Foreign(start=0.01, end=0.02, cob_id=0x10, frames=3, every=4), Foreign(start=0.013, length=0))
+    sent = [len(s.foreign_frames(k)) for k in range(10, 22)]
+    assert sent == [3, 0, 0, 1, 4, 1, 1, 1, 4, 1, 1, 1]
+    assert s.foreign_frames(10) == [(0x10, (10).to_bytes(8, "little"))] * 3 and s.foreign_frames(13) == [(0x7E5, b"")]
+    table = s.foreign_actions(22)
+    assert [sum(n for k, _, _, n in table.tolist() if k == cycle) for cycle in range(10, 22)] == sent
+
+
+def test_a_node_that_is_bus_off_sends_and_receives_nothing() -> None:
+    s = schedule(BusOff(node="plant", start=0.1, end=0.2), BusOff(node="rig", start=0.3, end=0.4))
+    for name in ("feedback", "valve_state", "drive"):
+        assert [s.frame(name, k) for k in (99, 100, 199, 200)] == [None, Drop(), Drop(), None]
+    assert s.frame("command", 300) == s.frame("sync", 399) == Drop() and s.frame("sync", 150) is None
+    assert s.is_bus_off("plant", 150) and not s.is_bus_off("rig", 150) and not s.is_heartbeat_alive("rig", 350)
+    assert s.count_lost_syncs(300) == 100 and s.count_lost_syncs(299) == 0
+
+
+def test_disturbed_cycles() -> None:
+    s = schedule(Lost(frame="drive", start=0.01, count=1), Jitter(size=1e-4, start=0.02),
+                 Reset(start=0.03), stop=40)
+    assert np.flatnonzero(s.find_disturbed(60)).tolist() == [10, 11, *range(30, 40)]
+    assert s.resets == [(30, "node")]

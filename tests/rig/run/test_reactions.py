@@ -1,0 +1,91 @@
+"""The shipped sequences of a reaction: the reference firmware passes, and a controller that does not react fails."""
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import firmware_variants as variants
+import pytest
+from firmware_variants import Variant
+from short_sequences import job, play
+
+from rig.network.frame import Frame
+from rig.nodes import firmware
+from rig.run import participants
+from rig.run.outcome import Outcome
+from rig.sequences import load_sequence
+
+LOSSES = ("lost_command", "lost_feedback", "lost_sync", "lost_heartbeat")
+
+
+class NoSyncWatch(Variant):
+    """Does not notice that SYNC has stopped."""
+
+    def tick(self, t_ns: int) -> None:
+        self.firmware.device.sync.configure(0)
+        super().tick(t_ns)
+
+
+class NoHeartbeatWatch(Variant):
+    """Does not hear the rig's heartbeat, and so does not watch it."""
+
+    def hear(self, frame: Frame) -> Frame:
+        return frame if frame.cob_id != 0x701 else frame._replace(cob_id=0x7FF)
+
+
+def play_sequence(name: str, folder: Path, **settings: object) -> Outcome:
+    return play(replace(job(**settings), sequence=load_sequence(name)), folder)  # type: ignore[arg-type]
+
+
+def find_failures(outcome: Outcome) -> set[str]:
+    return {check.name for check in outcome.checks if not check.passed}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
+def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str, seed: int) -> None:
+    outcome = play_sequence(name, tmp_path, seed=seed)
+    assert (outcome.verdict, outcome.why) == ("PASS", "") and outcome.safe
+
+
+@pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
+def test_it_does_so_in_real_time(tmp_path: Path, name: str) -> None:
+    """However late the machine is: the reaction is counted in cycles."""
+    outcome = play_sequence(name, tmp_path, pace="realtime", max_overruns=1.0)
+    assert {"reaction", "emergency"} & find_failures(outcome) == set() and outcome.safe, outcome.why
+
+
+@pytest.mark.parametrize("name", ["lost_command", "lost_feedback"])
+def test_a_controller_that_does_not_miss_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                    name: str) -> None:
+    monkeypatch.setattr(firmware, "LOST_AFTER", 10**9)
+    outcome = play_sequence(name, tmp_path)
+    assert outcome.verdict == "FAIL" and {"reaction", "emergency"} <= find_failures(outcome)
+
+
+@pytest.mark.parametrize(("name", "make", "failed"), [
+    ("lost_sync", NoSyncWatch, {"reaction", "emergency"}), ("lost_heartbeat", NoHeartbeatWatch, {"emergency"}),
+])
+def test_a_controller_that_does_not_watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+                                          make: type[Variant], failed: set[str]) -> None:
+    monkeypatch.setattr(participants, "Firmware", make)
+    outcome = play_sequence(name, tmp_path)
+    assert outcome.verdict == "FAIL" and failed <= find_failures(outcome)
+
+
+class StaysOn(Variant):
+    """Sends the current on, whatever has happened, and says so in the status word."""
+
+    _current = 0.0
+
+    def answer(self, drive: variants.Drive) -> variants.Drive:
+        if drive.status & 7 == 7:
+            self._current = drive.current
+            return drive
+        return drive._replace(current=self._current)
+
+
+@pytest.mark.parametrize("name", ["lost_command", "lost_feedback"])
+def test_a_status_word_alone_is_no_reaction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(participants, "Firmware", StaysOn)
+    assert "reaction" in find_failures(play_sequence(name, tmp_path))
