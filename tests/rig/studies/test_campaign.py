@@ -113,7 +113,7 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(environment: Pat
     assert 0 < len(done) < 6
     with (there / folder.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
-    said = rig("campaign", there, *few, "--json")
+    said = rig("campaign", there, *few, *MATRIX[-2:], "--json")
     assert (said.status, said.json["cases"]) == (0, 6)
     assert rows(there) == rows(local)[:6] and rows(there / folder.RESULTS) == rows(there)
     again = Counter(source for _, source in calls(environment))
@@ -201,7 +201,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
-    (("--fault", "spool_frction=3"), "effect: spool_frction: expected one of"),
+    (("--fault", "spool_frction=3"), "effect: spool_frction: expected an effect of the catalogue; did you mean spool_friction?"),
     (("--fault", "filter_clogging=1.5"), "filter_clogging: expected a number"),
     (("--fault", "filter_clogging"), "--fault: filter_clogging: expected healthy"),
     (("--fault", "healthy", "--tolerance", "0.5"), "tolerance: expected a number from 0 to 0.2"),
