@@ -201,7 +201,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
-    (("--fault", "spool_frction=3"), "effect: spool_frction: expected an effect of the catalogue; did you mean spool_friction?"),
+    (("--fault", "spool_frction=3"), "an effect of the catalogue; did you mean spool_friction?"),
     (("--fault", "filter_clogging=1.5"), "filter_clogging: expected a number"),
     (("--fault", "filter_clogging"), "--fault: filter_clogging: expected healthy"),
     (("--fault", "healthy", "--tolerance", "0.5"), "tolerance: expected a number from 0 to 0.2"),
