@@ -1,7 +1,7 @@
 """A controller for the bench, written with python-can and canopen alone: python docs/foreign_controller.py [GROUP]
 
 It joins the UDP bus of `rig run --controller external --bus udp_multicast:GROUP` as node 2 and closes the position
-loop. It shows how a program joins a run. Unlike a firmware, it watches neither the rig's heartbeat nor the feedback.
+loop. It shows how a program joins a run. Unlike a firmware, it does not watch command, feedback, SYNC and heartbeat.
 """
 from __future__ import annotations
 

@@ -73,7 +73,8 @@ print(json.dumps({
 def test_machine_code_of_another_cpu_is_not_taken_from_the_cache(tmp_path: Path) -> None:
     """One folder serves all: a setting that is new compiles, one that was there loads."""
     def compiled_functions(changes: dict[str, str]) -> int:
-        environment = {**os.environ, "EHA_RIG_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT), **changes}
+        environment = {**other_cpus.list_environment(), "EHA_RIG_CACHE": str(tmp_path / "cache"),
+                       "PYTHONPATH": str(ROOT), **changes}
         subprocess.run([sys.executable, tmp_path / "program.py"], env=environment, check=True)
         return len(list((tmp_path / "cache").rglob("*.nbc")))
 

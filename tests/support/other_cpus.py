@@ -31,7 +31,9 @@ def compiles_for(feature: str) -> bool:
 def list_disabled_features(*kept: str) -> str:
     """Switches off the vector code of NumPy that this CPU has, but for that of the `kept` instruction sets."""
     core = np._core._multiarray_umath  # type: ignore[attr-defined]
-    return " ".join(name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] and name not in kept)
+    already = os.environ.get("NPY_DISABLE_CPU_FEATURES", "").split()  # this process may run under such a setting itself
+    found = [name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] or name in already]
+    return " ".join(name for name in found if name not in kept)
 
 
 THIS, AVX2, OLDEST = "this CPU", "AVX2 and FMA (2013)", "no vector code beyond SSE2, no FMA"
@@ -49,15 +51,20 @@ def list_cpu_settings() -> dict[str, Mapping[str, str]]:
     return found
 
 
+def list_environment() -> dict[str, str]:
+    """The environment without settings of another CPU, under which the tests themselves may run."""
+    settings = ("NUMBA_CPU", "OPENBLAS", "NPY_DISABLE", "GLIBC_TUNABLES")
+    return {key: value for key, value in os.environ.items() if not key.startswith(settings)}
+
+
 def run_on_each_cpu(program: str, *words: object, folder: Path, timeout_s: float = 600,
-                cpus: Sequence[str] = (THIS, AVX2, OLDEST)) -> dict[str, Any]:
+                    cpus: Sequence[str] = (THIS, AVX2, OLDEST)) -> dict[str, Any]:
     """What the program of this folder prints as JSON, by CPU; all processes at the same time, outputs in `folder`."""
     began = {}
     for name, changes in list_cpu_settings().items():
         if name not in cpus:
             continue
-        environment = {key: value for key, value in os.environ.items() if not key.startswith(("NUMBA_CPU", "OPENBLAS"))}
-        environment |= {**changes, "PYTHONPATH": f"{ROOT}{os.pathsep}{SUPPORT}"}
+        environment = {**list_environment(), **changes, "PYTHONPATH": f"{ROOT}{os.pathsep}{SUPPORT}"}
         command = [sys.executable, str(SUPPORT / program), *map(str, words)]
         place = folder / str(len(began))
         place.mkdir()
