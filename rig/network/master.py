@@ -14,7 +14,7 @@ from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from dbc import EDS
-from plant.errors import RigError
+from plant.errors import InputError, RigError
 from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from rig.device.nmt import NmtCommand, NmtState
 from rig.network import codec
@@ -23,6 +23,7 @@ from rig.network.identity import Identity, read_identity
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import Wire
 from rig.nodes import firmware
+from rig.nodes.cycle_record import CycleRecord, decode_cycle_record
 from rig.nodes.emulator import SCENARIO
 from rig.nodes.firmware import GAINS, Gains
 
@@ -30,6 +31,7 @@ NODE, CONTROLLER, PLANT = 1, 2, 3
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 QUICK_HEARTBEAT = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
+RECORD = 0x2212  # object of the plant
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
 _OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
@@ -182,6 +184,15 @@ class Master:
     def read_identity(self, node: int) -> Identity:
         """What a node says about itself; objects that it does not have are None."""
         return read_identity(lambda index, sub: self._upload(node, index, sub))
+
+    def read_plant_record(self) -> CycleRecord | None:
+        """The plant's own record of its cycles (object 0x2212); None if it has none."""
+        data = self._upload(PLANT, RECORD, 0)
+        try:
+            record = decode_cycle_record(data or b"")
+        except InputError:  # of a foreign plant
+            return None
+        return record if len(record.cycle) else None
 
     def configure(self, scenario: bytes, gains: Gains | None, sync_period_us: int,
                   limit_ms: int = HEARTBEAT_LIMIT) -> None:

@@ -48,7 +48,7 @@ class CycleRecords(NamedTuple):
     response: Array  # the controller's drive frame
     flags: NDArray[np.int64]  # of the valve state
     injected: Injected
-    plant_delay: Array | None = None  # the plant's own record: SYNC taken up after it came
+    plant_delay: Array | None = None  # the plant's own record: feedback sent after SYNC came
 
     @property
     def cycles(self) -> int:
@@ -85,6 +85,7 @@ class Cause(NamedTuple):
     cycle: int
     text: str
     evidence: tuple[str, ...] = ()
+    is_gone: bool = False  # the node does not answer any more: no lateness explains that
 
     @property
     def is_lateness(self) -> bool:
@@ -132,7 +133,7 @@ class LateCycles(NamedTuple):
 
     sync: Mask  # SYNC sent too late
     feedback: Mask  # the plant's frames came too late, or not
-    stalled: Mask  # by its own record, the plant took SYNC up too late
+    stalled: Mask  # by its own record, the plant sent feedback too late
 
     @property
     def any(self) -> Mask:
@@ -205,7 +206,7 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
 def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
     delay = records.plant_delay
     if delay is not None and late.stalled[span].any():
-        return f"by its own record the plant took SYNC up {1e3 * float(np.nanmax(delay[span])):.1f} ms late"
+        return f"by its own record the plant sent feedback {1e3 * float(np.nanmax(delay[span])):.1f} ms after SYNC"
     missing = int(np.isnan(records.feedback[span]).sum() or np.isnan(records.valve[span]).sum())
     if missing:
         return f"the plant sent no feedback for {missing} {'cycle' if missing == 1 else 'cycles'}"
@@ -360,7 +361,8 @@ def _describe_stop(node: int, records: CycleRecords, first: int, cycle: int, how
         text = f"node {node} {NAMES[node]} did not answer in time: no {frames} frame for {count} cycles from {first}"
     else:
         text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}"
-    return Cause(node, "stopped", first, text, _show_punctuality(records, first, cycle) if node == CONTROLLER else ())
+    evidence = _show_punctuality(records, first, cycle) if node == CONTROLLER else ()
+    return Cause(node, "stopped", first, text, evidence, is_gone=bool(how))
 
 
 def _show_punctuality(records: CycleRecords, first: int, cycle: int) -> tuple[str, ...]:

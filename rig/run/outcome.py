@@ -70,6 +70,8 @@ class Outcome:
         cause = self.attribution.cause
         if cause is not None and cause.is_lateness:
             return self.describe_cause()
+        if cause is not None and cause.is_gone and self.aborted:
+            return ""  # a dead node is no matter of timing
         if self.job.realtime and (problem := self._find_excess()):
             return problem
         if self.aborted or not self.failures:

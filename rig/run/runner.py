@@ -11,9 +11,11 @@ import numpy as np
 
 from fdi.progress import Progress
 from plant import Actuator, Columns, InputError
+from plant.segments import Array
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
 from rig.network.raw_bus import can_open
+from rig.nodes.cycle_record import CycleRecord
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
@@ -108,7 +110,17 @@ def collect_records(job: Job, session: Session) -> CycleRecords:
     injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
     return CycleRecords(np.array(session.due_ns, dtype=np.int64), columns["lateness"], columns["feedback_response"],
                         columns["valve_response"], columns["response"], history.column("flags").astype(np.int64),
-                        injected)
+                        injected, select_plant_delays(session.plant_record, len(history)))
+
+
+def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array | None:
+    """From SYNC to feedback by the plant's own record, s, (cycles,); 0 where it has no entry, None without a record."""
+    if record is None:
+        return None
+    delays = np.zeros(cycles)
+    known = (record.cycle >= 0) & (record.cycle < cycles)
+    delays[record.cycle[known]] = (record.sent - record.sync)[known] * 1e-9
+    return delays
 
 
 @contextlib.contextmanager

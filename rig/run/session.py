@@ -28,6 +28,7 @@ from rig.network.identity import Identity
 from rig.network.master import CONTROLLER, HEARTBEAT, HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, PLANT, Master
 from rig.network.wire import EmbeddedWire
 from rig.nodes import firmware
+from rig.nodes.cycle_record import CycleRecord
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
@@ -96,6 +97,7 @@ class Session:
         self.due_ns = array("q")  # log time of each cycle
         self.troubles: list[Trouble] = []
         self.gone: dict[int, str] = {}  # nodes that do not answer any more, and how that is known
+        self.plant_record: CycleRecord | None = None  # the plant's own, read after a real-time run with trouble
         self.identities: dict[int, Identity] = {}
         self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9)
@@ -358,6 +360,8 @@ class Session:
                 self.loop.close()
                 self._find_silent_nodes()
                 self._master.stop()
+                if self.job.realtime and self.troubles and PLANT not in self.gone:  # it takes some seconds on a CAN bus
+                    self.plant_record = self._master.read_plant_record()
                 for failure in self._master.restore(self.gone):
                     self.log_event("WARN", "restore", failure)
                 self.log_event("INFO", "phase", "end")

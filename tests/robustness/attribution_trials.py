@@ -60,9 +60,10 @@ class Trial(NamedTuple):
 
     case: Case
     verdict: str
-    blamed: str  # "bench", "node 2", "node 3", or "" for nobody
+    blamed: str  # "node 1", "node 2", "node 3", or "" for nobody
     text: str
-    seconds: float  # from the stall or kill to the end of the run
+    seconds: float  # from the stall or kill to the verdict of the run
+    exit_seconds: float  # until its process has ended: the page of the run is drawn in between
 
     @property
     def is_wrong(self) -> bool:
@@ -108,7 +109,7 @@ def read_blame(answer: dict[str, Any]) -> tuple[str, str]:
     """Whom a run blames, and in which words; runs before `cause` existed are read by their sentence."""
     cause = answer.get("cause")
     if cause:
-        return str(cause["source"]), str(cause["text"])
+        return str(cause["source"])[:6], f"{answer['why']} {cause['evidence']}"
     text = str(answer.get("why", "")) if answer["verdict"] == "ABORTED" else ""
     blamed = "node 2" if text.startswith("node 2") else "node 3" if text.startswith("node 3") else ""
     return "bench" if answer["verdict"] == "INVALID_TIMING" else blamed, str(answer.get("why", ""))
@@ -124,7 +125,7 @@ def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str)
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     is_reached = wait_for_cycle(link, chance.randrange(250, 1500), run)
     link.close()
-    begin = time.monotonic()
+    begin, begin_time = time.monotonic(), time.time()
     if is_reached:
         victim = run.pid if case.process == "rig" else find_children(run.pid)[case.process]
         if case.stall:
@@ -134,12 +135,13 @@ def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str)
         else:
             os.kill(victim, signal.SIGKILL)
     output, errors = run.communicate(timeout=RUN_LIMIT)
-    seconds = time.monotonic() - begin
+    exit_seconds = time.monotonic() - begin
     try:
         answer = json.loads(output)
     except ValueError:
-        return Trial(case, f"status {run.returncode}", "", errors.strip()[-200:], seconds)
-    return Trial(case, answer["verdict"], *read_blame(answer), seconds)
+        return Trial(case, f"status {run.returncode}", "", errors.strip()[-200:], exit_seconds, exit_seconds)
+    seconds = (out / "verdict.json").stat().st_mtime - begin_time
+    return Trial(case, answer["verdict"], *read_blame(answer), seconds, exit_seconds)
 
 
 def format_case(case: Case, trials: list[Trial]) -> str:
@@ -148,8 +150,9 @@ def format_case(case: Case, trials: list[Trial]) -> str:
                                                           strict=True))
     wrong = sum(trial.is_wrong for trial in trials)
     words = [", ".join(f"{name} {count}" for name, count in counter.most_common()) for counter in (verdicts, blamed)]
-    longest = max(trial.seconds for trial in trials)
-    return f"{case!s:44} {words[0]:40} {words[1]:28} wrong {wrong:3} of {len(trials)}   {longest:6.2f} s"
+    longest, last = max(trial.seconds for trial in trials), max(trial.exit_seconds for trial in trials)
+    return (f"{case!s:40} {words[0]:34} {words[1]:28} wrong {wrong} of {len(trials)}; verdict after at most "
+            f"{longest:.2f} s, exit {last:.2f} s")
 
 
 def run_cases(cases: list[Case], trials: int, folder: Path, group: str) -> Iterator[Trial]:

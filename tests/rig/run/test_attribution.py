@@ -9,6 +9,7 @@ import pytest
 
 from rig.network.codec import Flags
 from rig.network.master import CONTROLLER, NODE, PLANT
+from rig.nodes.cycle_record import CycleRecord
 from rig.run.attribution import (
     Attribution,
     CycleRecords,
@@ -19,6 +20,7 @@ from rig.run.attribution import (
     find_injected,
     find_last_stop,
 )
+from rig.run.runner import select_plant_delays
 from rig.sequences.faults import Fault, Late, Lost, Offset, Plan, Schedule, Silent
 from rig.sequences.timing import TimingPolicy
 
@@ -126,7 +128,15 @@ def test_the_plants_own_record_shows_a_stall() -> None:
     script.report(503.0, PLANT, 0x8250)
     found = script.attribute()
     assert source_and_kind(found) == (PLANT, "late") and found.cause is not None
-    assert "by its own record the plant took SYNC up 3.0 ms late" in found.cause.text
+    assert "by its own record the plant sent feedback 3.0 ms after SYNC" in found.cause.text
+
+
+def test_the_plants_record_is_matched_by_cycle() -> None:
+    cycle, sync = np.array([2, 3, 900]), np.array([1000, 2000, 3000])
+    record = CycleRecord(cycle, sync, sync + 10, sync + 500, sync + 900, np.zeros(3, dtype=np.int64))
+    delays = select_plant_delays(record, 5)
+    assert delays is not None and delays == pytest.approx([0, 0, 5e-7, 5e-7, 0])
+    assert select_plant_delays(None, 5) is None
 
 
 def test_a_dead_controller_is_named_and_not_the_plant_that_misses_it() -> None:
@@ -139,7 +149,7 @@ def test_a_dead_controller_is_named_and_not_the_plant_that_misses_it() -> None:
     assert found.cause.text.endswith("no drive frame since cycle 600; its process was ended by SIGKILL")
     assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
     assert [trouble.node for trouble in found.consequences] == [PLANT] and found.by_bench == 0
-    assert found.judged[:N - 1].all()
+    assert found.judged[:N - 1].all() and found.cause.is_gone
 
 
 def test_a_dead_controller_is_named_although_a_sync_was_late_just_before() -> None:

@@ -177,6 +177,24 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     assert {"model.toml", "sequence/long.toml"} <= trace.attachments.keys()
 
 
+@pytest.mark.parametrize(("name", "source"), [("controller", "node 2 controller"), ("plant", "node 3 plant")])
+def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, source: str) -> None:
+    """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state."""
+    where = spec("udp_multicast")
+    (tmp_path / "long.toml").write_text(LONG)
+    process = started("run", tmp_path / "long.toml", "--bus", where, "--out", tmp_path, "--json")
+    grown(tmp_path / "trace.mcap", 60_000, timeout=120.0)
+    victims = [node for node in nodes_on(where)
+               if name.encode() in Path(f"/proc/{node}/cmdline").read_bytes().split(b"\0") and node != process.pid]
+    for victim in victims:
+        os.kill(victim, signal.SIGKILL)
+    said = finished(process)
+    cause = said.json["cause"]
+    assert len(victims) == 1 and (said.status, said.json["verdict"]) == (1, "ABORTED")
+    assert (cause["source"], cause["kind"]) == (source, "stopped") and "SIGKILL" in cause["text"]
+    assert gone(where) and said.json["timing"]["cycles"] < 60_000
+
+
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path, pace: str) -> None:
     """A terminal interrupts all its processes; clean-up needs the plant."""
