@@ -314,25 +314,29 @@ def check_rpdo_values(t: Target) -> str:
 @case("4.16", "values of a transmitted PDO", "7.2.2, 7.5.2.38",
       "the mapped objects in their order, least significant byte first")
 def check_tpdo_values(t: Target) -> str:
-    """Compared with what SDO reads before and after; values that move meanwhile are left out."""
-    found, compared = [], 0
+    """Five SYNCs; after each frame SDO reads the objects twice, and values that move meanwhile are left out.
+
+    Three of five must agree: an application may change a value between its PDO and the reading.
+    """
+    found, rounds = [], 5
     for pdo in _list_valid(t, is_sent=True):
         if not _set_type(t, pdo, 1):
             continue
+        mapping, cob_id = read_mapping(t, pdo), _cob_id(t, pdo)
+        differences = []
         with operational(t):
-            frames = _count_answers(t, pdo, 1)
-            require(len(frames) == 1, f"{pdo.name}: {len(frames)} frames at a SYNC")
-            first, second = read_mapped(t, pdo), read_mapped(t, pdo)
-        at = 0
-        for (index, sub, _), a, b in zip(read_mapping(t, pdo), first, second, strict=True):
-            sent = frames[0][at:at + len(a)]
-            at += len(a)
-            if a == b:
-                compared += 1
-                require(sent == a, f"{pdo.name}: 0x{index:04X}:{sub:X} was sent as {sent.hex()}, SDO reads {a.hex()}")
-        found.append(pdo.name)
+            for _ in range(rounds):
+                t.sync()
+                frame = t.wait_for(cob_id, t.options.timeout)
+                require(frame is not None, f"{pdo.name}: no frame at a SYNC")
+                assert frame is not None
+                first, second = read_mapped(t, pdo), read_mapped(t, pdo)
+                differences.append(_compare_values(mapping, frame.data, first, second))
+        wrong = [each for each in differences if each]
+        require(len(wrong) <= rounds // 2, f"{pdo.name}: {wrong[-1] if wrong else ''}")
+        found.append(f"{pdo.name} {rounds - len(wrong)} of {rounds}")
     require_applicable(found, "no TPDO accepts transmission type 1")
-    return f"{compared} objects of {', '.join(found)}"
+    return ", ".join(found)
 
 
 @case("4.17", "changes of the mapping", "7.5.2.36, 7.5.2.38",
@@ -498,6 +502,17 @@ def _move(t: Target, pdo: Pdo, word: int, can_id: int) -> None:
     t.write(pdo.parameter, 1, word | INVALID)
     t.write(pdo.parameter, 1, word & ~0x7FF | INVALID | can_id)
     t.write(pdo.parameter, 1, word & ~0x7FF & ~INVALID | can_id)
+
+
+def _compare_values(mapping: list[tuple[int, int, int]], data: bytes, first: list[bytes], second: list[bytes]) -> str:
+    """The first object that a PDO carries otherwise than two equal readings have it; empty if there is none."""
+    at = 0
+    for (index, sub, _), before, after in zip(mapping, first, second, strict=True):
+        sent = data[at:at + len(before)]
+        at += len(before)
+        if before == after != sent:
+            return f"0x{index:04X}:{sub:X} was sent as {sent.hex()}, SDO reads {before.hex()}"
+    return ""
 
 
 def _send_values(t: Target, pdo: Pdo, values: list[bytes], cob_id: int | None = None) -> None:
