@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rig.cli.options import parse_whole_number
@@ -13,10 +14,12 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
-    parser.add_argument("what", nargs="?", choices=("plant", "realtime", "explain", "robustness"), default="plant",
+    parser.add_argument("what", nargs="?", default="plant",
+                        choices=("plant", "realtime", "explain", "robustness", "faults"),
                         help="plant: speed of the plant (default); realtime: lateness and response of the cycle beside "
                              "cyclictest and C; explain: how often rig explain is right; "
-                             "robustness: invented frames, killed processes, full disks, long work")
+                             "robustness: invented frames, killed processes, full disks, long work; "
+                             "faults: every fault on the bus in every phase of a motion, a matrix")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
     add = parser.add_argument_group("rig bench realtime").add_argument
@@ -47,6 +50,8 @@ def run_command(args: argparse.Namespace) -> int:
         return _study_robustness(args)
     if args.what == "realtime":
         return _run_realtime(args)
+    if args.what == "faults":
+        return _study_bus_faults(args)
     from fdi.output import write_text
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
@@ -133,6 +138,22 @@ def _run_trial(args: argparse.Namespace) -> int:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_trial_report(figures), args)
     return 0 if all(rate["met"] or not rate["of"] for rate in figures["rates"]) else 1
+
+
+def _study_bus_faults(args: argparse.Namespace) -> int:
+    """The matrix of faults on the bus and phases of a motion; exit status 1 if a cell failed."""
+    from rig.cli.answer import choose_places, show_answer, write_answer
+    from rig.cli.progress_bar import show_progress
+    from rig.studies.bus_faults import study_bus_faults
+    from rig.studies.bus_faults_report import build_bus_faults_report
+
+    places = choose_places(args, "", "")
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        cells = study_bus_faults(args.seed, progress=progress)
+    report = replace(build_bus_faults_report(cells, args.seed), files=places.files)
+    write_answer(report, places)
+    show_answer(report, args)
+    return 0 if all(cell.passed for cell in cells) else 1
 
 
 def _study_robustness(args: argparse.Namespace) -> int:
