@@ -106,6 +106,13 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     else:
         text = f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time"
     lines = [Line("timing", text)]
+    judged = outcome.attribution.judged
+    if not judged.all():
+        reasons = ", ".join(f"{name.replace('_', ' ')} {count}"
+                            for name, count in outcome.attribution.invalid.items() if count)
+        lines.append(Line("judged", f"{int(judged.sum())} of {len(judged)} cycles; the bench was late: {reasons}"))
+    if outcome.attribution.cause is not None:
+        lines.append(Line("first cause", outcome.describe_cause()))
     missing = [f"{name.replace('_', ' ')} {count}" for name, count in outcome.counters.items() if count]
     if missing:
         lines.append(Line("missing", ", ".join(missing)))
