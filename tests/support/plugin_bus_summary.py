@@ -6,16 +6,29 @@ vcan/test_vcan_guest.py; it notes their number in `GUEST_TESTS`.
 """
 from __future__ import annotations
 
+import os
 from collections import Counter
 
 import pytest
 from vcan_host import APT_LINE, guest_missing, kernel_has_vcan0
+
+from rig.network.bus import explain_socketcan_problem
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
 GUEST_TESTS = pytest.StashKey[int]()  # socketcan tests that passed in the guest
 NOTES = pytest.StashKey[list[str]]()  # sentences for the summary, such as what the dissector found
 LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
 RUNNER = "tests/vcan/test_vcan_guest.py"
+
+
+def require_bus_kind(kind: str) -> str:
+    """That back end; skips or fails the test that needs one which is not here."""
+    problem = explain_socketcan_problem("vcan0") if kind == "socketcan" else ""
+    if problem and os.environ.get("EHA_RIG_REQUIRE_VCAN") == "1":
+        pytest.fail(problem)
+    if problem:
+        pytest.skip(problem)
+    return kind
 
 
 def bus_of(nodeid: str) -> str | None:

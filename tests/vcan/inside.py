@@ -1,8 +1,10 @@
-"""What runs where a vcan0 is: the bus tests, and one whole preflight run by three processes with candump listening.
+"""What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and a
+minute at 1 kHz with the C firmware.
 
-    python tests/vcan/inside.py OUT bus|preflight ...
+    python tests/vcan/inside.py OUT bus|preflight|minute ...
 
-Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`.
+Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`;
+minute/ and minute.json from `minute`.
 """
 from __future__ import annotations
 
@@ -19,6 +21,13 @@ from pathlib import Path
 TESTS = Path(__file__).parent.parent
 BUS = "socketcan:vcan0"
 RUN_LIMIT_S = 500
+MINUTE = """
+title = "A minute at 1 kHz"
+setup = [{ kind = "hold", time = 0.2 }]
+main = [{ name = "sine", kind = "sine", amplitude = 2e-3, frequency = 1.0, time = 60.0 }]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.2 }]
+checks = [{ name = "no emergency", kind = "event_never", event = "EMCY" }]
+"""
 RIG = Path(sys.executable).with_name("rig")
 
 
@@ -74,12 +83,20 @@ def preflight(out: Path) -> int:
     return status
 
 
+def minute(out: Path) -> int:
+    """60,000 cycles in lockstep with the C firmware; the run's exit status."""
+    (out / "minute.toml").write_text(MINUTE)
+    words = ["run", str(out / "minute.toml"), "--bus", BUS, "--controller", "c", "--json", "--out", str(out / "minute")]
+    with (out / "minute.json").open("wb") as answer:
+        return subprocess.run([RIG, *words], stdout=answer, stdin=subprocess.DEVNULL).returncode
+
+
 def main() -> int:
     """Run the parts asked for, all of them even if one fails; the first status that is not 0."""
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
     os.chdir(TESTS.parent)
-    parts = {"bus": bus_tests, "preflight": preflight}
+    parts = {"bus": bus_tests, "preflight": preflight, "minute": minute}
     statuses = [parts[name](out) for name in sys.argv[2:]]
     return next((status for status in statuses if status), 0)
 

@@ -3,15 +3,17 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from bus_stations import spec
-from c_device import skip_without_compiler
-from c_program import build_faulty, run_program
+from c_device import STRICT, skip_without_compiler
+from c_program import SANITIZERS, build_faulty, run_program
+from plugin_bus_summary import require_bus_kind
 from short_sequences import SHORT, job, play
 
-from rig.firmware.build import build_controller
+from rig.firmware.build import FOLDER, build_controller, build_program
 from rig.network.bus import open_can
 from rig.network.link import Link
 from rig.run import participants
@@ -40,26 +42,29 @@ LOSES_FRAMES = ("late_frame", "stale_cycle", "missed_cycles")
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 3.0')
 
 
-@pytest.fixture(autouse=True)
-def compiler() -> None:
-    """These tests compile the firmware."""
+@pytest.fixture(scope="module", params=["udp_multicast"])
+def bus_with_plant(request: pytest.FixtureRequest) -> Iterator[str]:
+    """A bus between programs with a plant that stays on it, as on a real bench."""
     skip_without_compiler()
+    where = spec(require_bus_kind(request.param))
+    with run_program(sys.executable, "-m", "rig.cli.main", "node", "plant", "--bus", where, "--quiet"):
+        wait_for_node(where, 3)
+        yield where
 
 
-def play_against(folder: Path, fault: str) -> Outcome:
-    """A short run in lockstep against the firmware with that fault."""
-    where = spec("udp_multicast")
-    with run_program(build_faulty(), fault, where):
-        return play(job(LONG if fault == "no_heartbeat" else SHORT, seed=1, controller="external", bus=where), folder)
-
-
-def wait_for_nodes(where: str, seconds: float = 60.0) -> None:
-    """Until both nodes have sent a heartbeat: the plant may compile its model before."""
+def wait_for_node(where: str, node: int, seconds: float = 60.0) -> None:
+    """Until a node has sent a heartbeat: the plant may compile its model before."""
     link, heard, end = Link(open_can(where), time.monotonic_ns), set[int](), time.monotonic() + seconds
-    while not {0x702, 0x703} <= heard and time.monotonic() < end:
+    while 0x700 + node not in heard and time.monotonic() < end:
         heard |= {frame.cob_id for frame in link.poll(0.1)}
     link.close()
-    assert {0x702, 0x703} <= heard
+    assert 0x700 + node in heard
+
+
+def play_short(folder: Path, where: str, fault: str, seed: int = 1) -> Outcome:
+    """A short run in lockstep against the firmware that is on the bus."""
+    text = LONG if fault == "no_heartbeat" else SHORT
+    return play(job(text, seed=seed, controller="external", plant="external", bus=where), folder)
 
 
 def list_failed(outcome: Outcome) -> list[str]:
@@ -68,27 +73,44 @@ def list_failed(outcome: Outcome) -> list[str]:
 
 
 @pytest.mark.parametrize("fault", CAUGHT_BY)
-def test_each_fault_is_caught_by_its_check(tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_fault_is_caught_by_its_check(
+    tmp_path: Path, fault: str, bus_with_plant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if fault in LOSES_FRAMES:
         monkeypatch.setattr(participants, "FRAME_TIMEOUT", 0.2)  # s: it is spent in each cycle without an answer
-    outcome = play_against(tmp_path, fault)
+    with run_program(build_faulty(), fault, bus_with_plant):
+        outcome = play_short(tmp_path, bus_with_plant, fault)
     assert outcome.status == 1
     assert CAUGHT_BY[fault] in list_failed(outcome)
 
 
-def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path) -> None:
+def test_a_firmware_that_is_slow_to_start_is_caught(tmp_path: Path, bus_with_plant: str) -> None:
+    """It needs 1.5 s from NMT start to OPERATIONAL."""
+    with run_program(build_faulty(), "slow_start", bus_with_plant):
+        outcome = play_short(tmp_path, bus_with_plant, "slow_start")
+    assert (outcome.verdict, outcome.status) == ("ABORTED", 1)
+    assert "node 2 controller must be OPERATIONAL within 1 s of NMT start" in outcome.aborted
+
+
+def test_a_sound_firmware_with_an_integral_part_passes(tmp_path: Path, bus_with_plant: str) -> None:
     """It is the firmware of "leaks_state" without the leak."""
-    outcome = play_against(tmp_path, "integral")
+    with run_program(build_faulty(), "integral", bus_with_plant):
+        outcome = play_short(tmp_path, bus_with_plant, "integral")
     assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])
 
 
-def test_twenty_runs_against_one_sound_firmware_pass(tmp_path: Path) -> None:
-    """Without one false alarm. Firmware and plant stay on the bus between the runs, as on a real bench."""
-    where = spec("udp_multicast")
-    plant = (sys.executable, "-m", "rig.cli.main", "node", "plant", "--bus", where, "--quiet")
-    with run_program(build_controller(), where), run_program(*plant):
-        wait_for_nodes(where)
+def test_twenty_runs_against_one_sound_firmware_pass(tmp_path: Path, bus_with_plant: str) -> None:
+    """Without one false alarm, and without a restart of the firmware in between."""
+    with run_program(build_controller(), bus_with_plant):
         for seed in range(20):
-            outcome = play(job(seed=seed, controller="external", plant="external", bus=where), tmp_path)
+            outcome = play_short(tmp_path, bus_with_plant, "none", seed)
             assert (seed, outcome.verdict, list_failed(outcome)) == (seed, "PASS", [])
             assert set(outcome.counters.values()) == {0}
+
+
+def test_a_run_under_the_sanitizers_passes(tmp_path: Path, bus_with_plant: str) -> None:
+    """The whole program with its ports; the first wrong access to memory would end it."""
+    program = build_program("controller", sorted(FOLDER.glob("*.c")), (*STRICT, *SANITIZERS))
+    with run_program(program, bus_with_plant):
+        outcome = play_short(tmp_path, bus_with_plant, "none")
+    assert (outcome.verdict, list_failed(outcome)) == ("PASS", [])

@@ -87,9 +87,9 @@ static void receive(void *context, const struct frame *frame)
     (void)context;
     if (has("ignores_control") && frame->cob_id == COMMAND && frame->length == 8)
         write_bytes(seen.data + 4, ACTIVE, 2);
-    if (has("slow_start") && frame->cob_id == 0 && frame->data[0] == NMT_START && start_ns == 0) {
+    if (has("slow_start") && nmt_read_command(frame, CONTROLLER_NODE) == NMT_START && frame->cob_id == 0) {
         start = *frame;
-        start_ns = now_ns + INT64_C(3000000000);
+        start_ns = now_ns + INT64_C(1500000000);
         return;
     }
     const struct control_law before = controller.law;
