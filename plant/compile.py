@@ -21,13 +21,14 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from plant import functions
 
 Function = Any  # a plain function, or numba's dispatcher of one
+AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
 
 
 class LibraryFunction:
@@ -64,6 +65,50 @@ class LibraryFunction:
         return f"LibraryFunction({self.name!r}, {self.signature!r})"
 
 
+class PointerCall:
+    """A call of machine code by its address, `call(address, arguments..)`: what is called is chosen at run time.
+
+    A loop that calls the plant by its address is compiled once for all plants.
+    """
+
+    def __init__(self, signature: str) -> None:
+        """`signature`: as for `LibraryFunction`; d is a double."""
+        self.signature = signature
+
+    def __call__(self, address: int, *arguments: float) -> int:
+        """Call it from interpreted code."""
+        kinds: dict[str, Any] = {"i": ctypes.c_int32, "q": ctypes.c_int64, "d": ctypes.c_double}
+        return int(ctypes.CFUNCTYPE(*(kinds[letter] for letter in self.signature))(address)(*arguments))
+
+    def declare(self) -> Any:
+        """The function that numba compiles into a call."""
+        import llvmlite.ir
+        import numba
+        import numba.extending
+
+        kinds: dict[str, Any] = {"i": numba.types.int32, "q": numba.types.int64, "d": numba.types.float64}
+        result, *arguments = (kinds[letter] for letter in self.signature)
+
+        def type_call(given: tuple[Any, ...]) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                types = [context.get_value_type(kind) for kind in (result, *arguments)]
+                pointer = llvmlite.ir.FunctionType(types[0], types[1:]).as_pointer()
+                return builder.call(builder.inttoptr(values[0], pointer), values[1:])
+
+            return result(numba.types.int64, *arguments), code
+
+        names = ", ".join(f"a{i}" for i in range(len(arguments)))
+        made: dict[str, Any] = {"type_call": type_call}
+        exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))", made)
+        return numba.extending.intrinsic(made[f"call_{self.signature}"])
+
+    def __repr__(self) -> str:
+        return f"PointerCall({self.signature!r})"
+
+
+Foreign = LibraryFunction | PointerCall
+
+
 def find_cache_folder() -> Path:
     """The folder of compiled code: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
     named = os.environ.get("EHA_RIG_CACHE")
@@ -97,7 +142,9 @@ def rebind_names(function: Function, **names: Any) -> Function:
     """A copy of `function` that sees `names` in place of its module's globals."""
     # said to be at home here: numba imports that home again when it reads its cache, and a user's file is no module
     there = function.__globals__ | names | {"__name__": __name__}
-    return FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
+    copy = FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
+    vars(copy).update(vars(function))
+    return copy
 
 
 def interpret_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
@@ -111,7 +158,7 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     import numba.core.compiler_lock
 
     root = _link_calls(function, ports or {}, lambda f: f)
-    linked = _link_calls(function, ports or {}, lambda f: numba.njit(f, **INLINE_OPTIONS), LibraryFunction.declare)
+    linked = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
     plain = rebind_names(linked.py_func)
     settings: Any = numba.config
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
@@ -147,8 +194,24 @@ INLINE_OPTIONS: Any = {
 }
 
 
+def keep_apart(function: AnyFunction) -> AnyFunction:
+    """Mark a function that compiled code calls instead of including it wherever it is called.
+
+    For what does not compute: to include the whole of a bus at each of its calls takes a minute to compile.
+    """
+    vars(function)["is_apart"] = True
+    return function
+
+
+def _declare_part(f: Function) -> Function:
+    """A function below the one to be compiled, as numba gets it."""
+    import numba
+
+    return numba.njit(f, **INLINE_OPTIONS | {"forceinline": not vars(f).get("is_apart", False)})
+
+
 def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
-                declare: Callable[[LibraryFunction], Any] = lambda f: f) -> Function:
+                declare: Callable[[Foreign], Any] = lambda call: call) -> Function:
     """Copy the call graph below `function`, names in `ports` replaced by theirs.
 
     Each copy goes through `make`, each function of the C library through `declare`.
@@ -161,7 +224,7 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
             return f
         if f not in made:
             calls = {name: link(ports.get(name, g)) for name, g in _find_calls(f).items()}
-            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, LibraryFunction)}
+            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, Foreign)}
             made[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
         return made[f]
 
@@ -276,7 +339,8 @@ _THIS_FILE = "".join(Path(str(file)).read_text(encoding="utf-8") for file in (__
 def _describe_code(f: Function) -> str:
     f = getattr(f, "py_func", f)
     held = [cell.cell_contents for cell in f.__closure__ or ()]
-    return " ".join([_describe_constant(f.__code__), *map(_describe_constant, (*(f.__defaults__ or ()), *held))])
+    parts = f.__code__, *(f.__defaults__ or ()), *held, *vars(f).items()
+    return " ".join(map(_describe_constant, parts))
 
 
 def _describe_constant(value: Any) -> str:

@@ -21,6 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+# numba's calling convention: address of the result, of the failure, then the arguments, an array as 7 of them
+ADVANCE_CALL = "i" + "qq" + "qqqqqqq" + "dddd" + "qqqqqqq" + "q"
+READ_CALL = "i" + "qq" + "qqqqqqq" + "qqqqqqq" + "d" + "qqqqqqq"
 Advance = Callable[[float, float, float, float], object]  # current A, load N, noise, t s: moves the state one cycle
 
 _SYMBOL = "advance"
@@ -61,6 +64,12 @@ class StoredCode:
                 if code is not None and _gives_same_bits(code, run, flat, record):
                     _write_object(self._path, code)
 
+    def find_address(self) -> int:
+        """Address of the machine code, for a `plant.compile.PointerCall` of ADVANCE_CALL; call `warm` before."""
+        if self._entry is not None:
+            return int(self._engine.get_function_address(_SYMBOL))
+        return find_function_address(self._compile())
+
     def bind(self, flat: Array, record: Array, steps: int) -> Advance:
         """The function that advances the state `flat` of a plant with the parameters `record` by one cycle."""
         if self._entry is None:
@@ -76,6 +85,12 @@ class StoredCode:
                 self._compile()(flat, current, load, noise, t, record, steps)
 
         return advance
+
+
+def find_function_address(run: Any) -> int:
+    """Address of what numba has compiled for a dispatcher with one signature."""
+    (overload,) = run.overloads.values()
+    return int(overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name))
 
 
 def _gives_same_bits(code: bytes, run: Any, flat: Array, record: Array) -> bool:

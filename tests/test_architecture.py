@@ -47,7 +47,7 @@ FOLDER_MAY_IMPORT = {
 # Modules of others that only some files may import (prefixes of paths).
 ONLY_IN = {
     "numba": ("plant/compile.py",),
-    "llvmlite": ("plant/machine_code.py",),
+    "llvmlite": ("plant/machine_code.py", "plant/compile.py"),
     "can": ("rig/",),
     "canopen": ("rig/",),
     "cantools": ("rig/",),

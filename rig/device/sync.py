@@ -35,13 +35,17 @@ class SyncConsumer:
             self._malformed = True
             self._emcy.raise_error(EmcyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION)
             return
+        self.notice(frame.t_ns)
+        self._cycle()
+
+    def notice(self, t_ns: int) -> None:
+        """A SYNC came at `t_ns`: it is not lost. For a cycle that runs elsewhere, this is all there is to do."""
         if self._limit_ns:
-            self._deadline = frame.t_ns + self._limit_ns
+            self._deadline = t_ns + self._limit_ns
         if self._lost or self._malformed:
             self._lost = self._malformed = False
             self._emcy.clear(EmcyCode.COMMUNICATION)
             self._emcy.clear(EmcyCode.SYNC_LENGTH)
-        self._cycle()
 
     def tick(self, t_ns: int) -> None:
         if self._deadline and t_ns > self._deadline:

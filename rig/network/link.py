@@ -13,7 +13,6 @@ from can.interfaces.socketcan import SocketcanBus
 
 from plant.errors import RigError
 from rig.network.frame import Frame
-from rig.network.raw_bus import attach_filter
 from rig.network.udp import LoopbackBus
 
 _CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
@@ -95,7 +94,7 @@ class Link:
 
     def _set_filters(self) -> None:
         if isinstance(self._bus, LoopbackBus):
-            attach_filter(self._bus.receiver, self._bus.own_port, sorted(self._left_out), refuses=True)
+            self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
             exact = _IDENTIFIER | _EXTENDED | _REMOTE
             filters = [_FILTER.pack(cob_id | _INVERTED, exact) for cob_id in sorted(self._left_out)]

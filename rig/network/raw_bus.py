@@ -30,8 +30,8 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Sequence
-from ctypes import addressof, c_char
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import can
@@ -39,7 +39,7 @@ import numpy as np
 from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
-from plant.compile import LibraryFunction
+from plant.compile import LibraryFunction, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
 from rig.network.bus import parse_spec, require_interface
@@ -59,16 +59,17 @@ KINDS = {"socketcan": SOCKETCAN, "udp_multicast": UDP}
 # The port's memory, as words of 8 bytes. First single numbers ..
 _KIND, _RX, _TX, _TURN, _ERROR = range(5)
 _IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
+_OWN, _COUNTS_LOSSES = 15, 16  # UDP: own port, network order; whether the kernel's count is of losses alone
 _LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
 _ID_AT, _LENGTH_AT, _DATA_AT, _TAIL = range(11, 15)  # byte offsets in the datagram to be sent; length of its end
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
 _MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
-_TAKE, _GIVE, _EVENT = 400, 416, 424
-_CONTROL, _ALLOWED, _IN, _OUT = 448, 1024, 2048, 4096
-_CONTROL_SIZE, _IN_SIZE, _OUT_SIZE = 256, 2048, 512
+_TAKE, _GIVE, _EVENT, _SENDER = 400, 416, 424, 432
+_CONTROL, _ALLOWED, _IN, _OUT = 512, 1024, 2048, 4096
+_CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE = 256, 2048, 512, 16
 _CAN_SIZE = 16  # struct can_frame
 
-_SOL_SOCKET, _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE, _SO_ATTACH_FILTER = 1, 35, 40, 33, 26
+_SOL_SOCKET, _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 1, 35, 40, 33
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER = 101, 1, 2
 _DONTWAIT, _POLLIN = 0x40, 1
 _EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
@@ -159,6 +160,7 @@ def _read_wall_clock(port: Port) -> int:
 # ---------------------------------------------------------------------------------------- receive
 
 
+@keep_apart
 def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int]:
     """The next frame; if none is waiting, wait for one until `deadline_ns` (absolute; 0: do not wait, NEVER).
 
@@ -168,6 +170,8 @@ def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int
     while True:
         size = _take_datagram(port)
         if size >= 0:
+            if words[_OWN] and words[_OWN] == _integer(port.halves[_SENDER // 4]) >> 16 & 0xFFFF:
+                continue
             kind, cob_id, length, data = _decode(port, size)
             if kind == _DATA:
                 if not port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1:
@@ -192,6 +196,7 @@ def _take_datagram(port: Port) -> int:
     """Its length; -1 with the reason in the port. Notes how many the kernel had to drop before it."""
     base = port.octets.ctypes.data
     port.words[(_MESSAGE + 40) // 8] = _CONTROL_SIZE
+    port.words[(_MESSAGE + 8) // 8] = _SENDER_SIZE
     size = _recvmsg(port.words[_RX], base + _MESSAGE, _DONTWAIT)
     if size < 0:
         _note_errno(port)
@@ -241,7 +246,7 @@ def _find_time(port: Port) -> int:
         if port.halves[place // 4 + 2] == _SOL_SOCKET:
             if port.halves[place // 4 + 3] == _SO_TIMESTAMPNS:
                 wall = words[place // 8 + 2] * 1_000_000_000 + words[place // 8 + 3]
-            elif port.halves[place // 4 + 3] == _SO_RXQ_OVFL:
+            elif port.halves[place // 4 + 3] == _SO_RXQ_OVFL and words[_COUNTS_LOSSES]:
                 words[_IN_KERNEL] = _integer(port.halves[place // 4 + 4]) & 0xFFFFFFFF
         if size < 16:
             break
@@ -279,6 +284,7 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
 # ---------------------------------------------------------------------------------------- send
 
 
+@keep_apart
 def send_frame(port: Port, cob_id: int, length: int, data: int) -> int:
     """Put a frame on the bus: SENT; QUEUE_FULL, the frame is lost and counted; FAILED or NO_TURN."""
     if port.words[_KIND] == UDP:
@@ -338,6 +344,7 @@ def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
     return _integer(place + length + words[_TAIL] - _OUT)
 
 
+@keep_apart
 def decode_datagram(octets: NDArray[np.uint8], start: int, size: int) -> tuple[int, int, int, int]:
     """(kind, COB-ID, length, payload) of a msgpack map as python-can's udp_multicast packs it, keys in any order.
 
@@ -461,7 +468,8 @@ class RawBus:
     """A bus for compiled loops; `port` is what they get. Use it as a context, or close it.
 
     Counted, to be read at any time: `error_frames`; `overflows`, frames lost on the way in; `dropped`, frames that are
-    not classical 11-bit data frames; `unsent`, frames the full transmit queue refused.
+    not classical 11-bit data frames; `unsent`, frames the full transmit queue refused. On UDP with a filter `overflows`
+    stays as it is: the kernel counts a frame that the filter drops as one that was lost.
     """
 
     def __init__(self, spec: str, cob_ids: Sequence[int] | None = None) -> None:
@@ -478,6 +486,7 @@ class RawBus:
         self.port = _make_port()
         self._sockets: list[socket.socket] = []
         self._turn: Turn | None = None
+        self._set_kernel_filter: Callable[[Sequence[int]], None]
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         try:
             (self._open_socketcan if kind == "socketcan" else self._open_udp)(channel, cob_ids)
@@ -543,10 +552,9 @@ class RawBus:
         require_interface(channel)
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         self._sockets.append(raw)
+        self._set_kernel_filter = partial(_filter_socketcan, raw)
         if cob_ids is not None:
-            exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
-            filters = b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids)
-            raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, filters)
+            self._set_kernel_filter(cob_ids)
         else:
             raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", 0x1FFFFFFF))
         set_receive_options(raw)
@@ -558,8 +566,12 @@ class RawBus:
         self._sockets.append(tx)
         rx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sockets.append(rx)
-        attach_filter(rx, tx.getsockname()[1], cob_ids)
+        own = tx.getsockname()[1]
+        self._set_kernel_filter = partial(udp.attach_filter, rx, own)
+        if cob_ids is not None:
+            self._set_kernel_filter(cob_ids)
         set_receive_options(rx)
+        self.port.words[_OWN] = socket.htons(own)
         udp.join_group(rx, group, udp.PORT)
         tx.connect((group, udp.PORT))
         self._turn = Turn(group, udp.PORT)
@@ -569,12 +581,36 @@ class RawBus:
 
     def _prepare(self, kind: int, cob_ids: Sequence[int] | None) -> None:
         """Fill in what is the same for both kinds of bus."""
-        words, halves, octets = self.port
+        words, halves = self.port.words, self.port.halves
         words[_KIND], words[_LATEST] = kind, time.monotonic_ns()
+        words[_COUNTS_LOSSES] = kind == SOCKETCAN or cob_ids is None
         halves[_POLL // 4: _POLL // 4 + 4] = words[_RX], _POLLIN, self._wake, _POLLIN
+        self._allow(cob_ids)
+
+    def set_filter(self, cob_ids: Sequence[int]) -> None:
+        """Receive these COB-IDs from now on. Another thread may be receiving.
+
+        Raises:
+            RigError: the kernel refuses.
+        """
+        try:
+            self._set_kernel_filter(cob_ids)
+        except OSError as error:
+            raise RigError(f"{self.spec}: {error.strerror}") from error
+        self.port.words[_COUNTS_LOSSES] = self.port.words[_KIND] == SOCKETCAN
+        self._allow(cob_ids)
+
+    def _allow(self, cob_ids: Sequence[int] | None) -> None:
+        """One bit a COB-ID, for the frames that the kernel lets through."""
         allowed = np.zeros(0x800, np.uint8)
         allowed[slice(None) if cob_ids is None else list(cob_ids)] = 1
-        octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
+        self.port.octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
+
+
+def _filter_socketcan(raw: socket.socket, cob_ids: Sequence[int]) -> None:
+    """Let only these data frames through."""
+    exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
+    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids))
 
 
 def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None) -> RawBus:
@@ -597,41 +633,13 @@ def set_receive_options(raw: socket.socket) -> None:
     raw.setsockopt(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
 
-def attach_filter(raw: socket.socket, own_port: int, cob_ids: Sequence[int] | None, refuses: bool = False) -> None:
-    """A socket filter (classic BPF): no datagram from `own_port`, and of python-can's layout only these COB-IDs, or, if
-    it `refuses`, all but these.
-
-    A datagram of another layout passes; it is decoded by whoever reads it.
-    """
-    load_half, load_byte, load_word = 0x28, 0x30, 0x20  # at an absolute place, counted from the UDP header
-    equal, at_least, always, give = 0x15, 0x35, 0x05, 0x06
-    accept, drop = 0xFFFFFFFF, 0
-    program = [(load_half, 0, 0, 0), (equal, 0, 1, own_port), (give, 0, 0, drop)]
-    if cob_ids is not None and len(cob_ids) <= 64:
-        text = [(8, 0x8BA97469), (8 + 20, 0xAE617262), (8 + 31, 0x6E5F6964)]  # map of 11, "ti.."; "arb..", "n_id"
-        for place, word in text:
-            program += [(load_word, 0, 0, place), (equal, 1, 0, word), (give, 0, 0, accept)]
-        program += [(load_byte, 0, 0, 8 + 35),  # the identifier itself, or 0xCC and a byte, or 0xCD and two
-                    (at_least, 0, 6, 0x80),
-                    (equal, 0, 2, 0xCC), (load_byte, 0, 0, 8 + 36), (always, 0, 0, 3),
-                    (equal, 1, 0, 0xCD), (give, 0, 0, accept), (load_half, 0, 0, 8 + 36)]
-        named, others = (drop, accept) if refuses else (accept, drop)
-        program += [step for cob_id in cob_ids for step in ((equal, 0, 1, cob_id), (give, 0, 0, named))]
-        program.append((give, 0, 0, others))
-    else:
-        program.append((give, 0, 0, accept))
-    steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))
-    code = (c_char * len(steps)).from_buffer(steps)
-    raw.setsockopt(_SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(program), addressof(code)))
-
-
 def _make_port() -> Port:
     """The memory, with the addresses that the kernel's structures hold."""
     words = np.zeros((_OUT + _OUT_SIZE) // 8, np.int64)
     port = Port(words, words.view(np.int32), words.view(np.uint8))
     base = words.ctypes.data
     # struct msghdr: name, its length, vectors, their number, control data, its length, flags
-    words[_MESSAGE // 8: _MESSAGE // 8 + 7] = 0, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
+    words[_MESSAGE // 8: _MESSAGE // 8 + 7] = base + _SENDER, 0, base + _VECTOR, 1, base + _CONTROL, _CONTROL_SIZE, 0
     words[_VECTOR // 8: _VECTOR // 8 + 2] = base + _IN, _IN_SIZE
     words[_LIMIT // 8: _LIMIT // 8 + 2] = TURN_LIMIT_NS // 1_000_000_000, TURN_LIMIT_NS % 1_000_000_000
     for place, operations in ((_TAKE, TAKE), (_GIVE, GIVE)):

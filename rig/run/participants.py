@@ -28,7 +28,7 @@ RIVAL_TIMEOUT = 0.25  # s: a rig at work is heard within this
 FRAME_TIMEOUT = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
 LOST_FRAME_TIMEOUT = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
 BOOT_TIMEOUT = 0.7  # s: a node that is there boots within this
-START_TIMEOUT = 60.0  # s: a node of our own may have to compile the plant first
+START_TIMEOUT = 180.0  # s: a node of our own may have to compile its loop and the plant first
 
 
 class Participants(NamedTuple):

@@ -7,7 +7,7 @@ the main phase; a fault ends when main ends, so that clean-up runs on a healthy 
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -348,6 +348,17 @@ class Plan:
         return tables.build_dataclass(cls, plain, tables.Place("scenario"), {Fault: KINDS})
 
 
+class ParameterChange(NamedTuple):
+    """A fault of a parameter in numbers: `value` is reached within `ramp` s in the cycles first <= k < last."""
+
+    name: str
+    first: int
+    last: int
+    base: float
+    value: float
+    ramp: Second
+
+
 class Schedule:
     """The faults in cycle k. `base` gives the model's own value of every parameter that a fault changes.
 
@@ -358,7 +369,7 @@ class Schedule:
     def __init__(self, plan: Plan, base: Mapping[str, float] | None = None) -> None:
         self._base, self._stop = base or {}, plan.stop
         self._parameters: dict[str, list[tuple[int, int, float, Parameter]]] = {}
-        self._signals: dict[str, list[Callable[[int, float], float]]] = {}
+        self._signals: dict[str, list[AddedSignal | StuckSignal]] = {}
         self._frames: dict[str, list[tuple[int, list[Action | None]]]] = {}
         self._silent: dict[str, list[range]] = {}
         self._bus_off: dict[str, list[range]] = {}
@@ -508,6 +519,27 @@ class Schedule:
     def is_heartbeat_alive(self, node: str, cycle: int) -> bool:
         """Whether the node (rig or plant) sends its heartbeat."""
         return not any(cycle in cycles for cycles in self._silent.get(node, ()))
+
+    def list_parameter_changes(self) -> list[list[ParameterChange]]:
+        """The faults of each parameter that one acts on; of several in a cycle the first counts."""
+        return [[ParameterChange(name, first, last, self._base[name], value, fault.ramp)
+                 for first, last, value, fault in changes] for name, changes in self._parameters.items()]
+
+    def list_signal_changes(self, name: str) -> list[AddedSignal | StuckSignal]:
+        """The faults of a sensor, in the order in which they act."""
+        return self._signals.get(name, [])
+
+    def list_frame_faults(self, name: str) -> list[tuple[int, bytes, Action]]:
+        """The faults of a frame: first cycle, one byte a cycle (1: hit), what happens; the first that hits counts."""
+        faults = []
+        for first, actions in self._frames.get(name, []):
+            for what in dict.fromkeys(action for action in actions if action is not None):
+                faults.append((first, bytes(action == what for action in actions), what))
+        return faults
+
+    def has_bus_off(self, node: str) -> bool:
+        """Whether the node (rig or plant) is bus-off at some time."""
+        return node in self._bus_off
 
 
 _SENT_BY: Mapping[str, tuple[str, ...]] = {"rig": ("command", "sync"), "plant": ("feedback", "valve_state")}

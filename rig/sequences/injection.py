@@ -8,22 +8,23 @@ class AddedSignal:
     """An additive sensor fault: `values`, one per cycle, are added from cycle `first` on."""
 
     def __init__(self, first: int, values: list[float]) -> None:
-        self._first, self._values = first, values
+        self.first, self.values = first, values
 
     def __call__(self, cycle: int, value: float) -> float:
-        k = cycle - self._first
-        return value + self._values[k] if 0 <= k < len(self._values) else value
+        k = cycle - self.first
+        return value + self.values[k] if 0 <= k < len(self.values) else value
 
 
 class StuckSignal:
     """A sensor that is stuck during `cycles`, at `value` or, without one, at its last reading."""
 
     def __init__(self, cycles: range, value: float | None) -> None:
-        self._cycles, self._last_read, self._value = cycles, 0.0, value
+        self.cycles, self.value = cycles, value
+        self._last_read = 0.0
 
     def __call__(self, cycle: int, value: float) -> float:
-        if cycle in self._cycles:
-            return self._last_read if self._value is None else self._value
+        if cycle in self.cycles:
+            return self._last_read if self.value is None else self.value
         self._last_read = value
         return value
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ from rig.cli import options
 
 if TYPE_CHECKING:
     from rig.network.frame import Node, Send
+    from rig.network.link import Link
+    from rig.nodes.scenario import Scenario
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,42 +36,68 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.network.bus import choose_bus, open_can
     from rig.network.clock import WallClock
     from rig.network.link import Link
+    from rig.network.raw_bus import can_open
     from rig.network.wire import serve_node
     from rig.run.participants import EMBEDDED_NAMES
-    from rig.run.priority import raise_priority
+    from rig.run.priority import LOOP_PRIORITY, lock_memory, raise_priority
 
     bus, _ = choose_bus(args.bus)
     if bus.partition(":")[0] in EMBEDDED_NAMES:
         raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
-    make = choose_node(args)
+    is_compiled = args.node == "plant" and can_open(bus)
     clock = WallClock()
-    link = Link(open_can(bus), clock.now)
     ended: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda got, frame: ended.append(got))
-    node = make(link.send)
-    if not args.quiet:
-        print(f"{args.node} on {bus}; Ctrl-C ends it", flush=True)
-    try:
-        with raise_priority():
-            serve_node(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
-    finally:
-        link.close()
+    with contextlib.ExitStack() as stack:
+        link = Link(open_can(bus), clock.now)
+        stack.callback(link.close)
+        if is_compiled:
+            node = open_compiled_plant(args, bus, link, stack, stack.enter_context(lock_memory()))
+        else:
+            node = choose_node(args)(link.send)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda got, frame: ended.append(got))
+        if not args.quiet:
+            kind = "compiled loop" if is_compiled else "Python loop, soft real time"
+            print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
+        stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))
+        serve_node(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
     if not args.quiet:
         print(f"{args.node}: incoming frames lost {link.overflows}, not sent {link.unsent}, "
               f"error frames {link.error_frames}")
     return 0
 
 
+def open_compiled_plant(args: argparse.Namespace, bus: str, link: Link, stack: contextlib.ExitStack,
+                        is_locked: bool) -> Node:
+    """The plant emulator with its loop in compiled code; `link` is for its services. `stack` closes it."""
+    from rig.network.raw_bus import open_raw_bus
+    from rig.nodes.emulator_service import LEFT_OUT, EmulatorService
+
+    raw = stack.enter_context(open_raw_bus(bus))
+    link.leave_out(LEFT_OUT)
+    service = EmulatorService(link.send, raw, choose_scenario(args), is_locked, link.leave_out)
+    stack.callback(service.close)
+    return service
+
+
 def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
     """A function that builds the node which the options describe."""
     from rig.nodes.emulator import Emulator
     from rig.nodes.firmware import Firmware, read_gains
+    from rig.nodes.scenario import require_servovalve
+
+    if args.node == "plant":
+        return lambda send: Emulator(send, choose_scenario(args))
+    model = options.load_chosen_model(args)
+    require_servovalve(model)
+    return lambda send: Firmware(send, read_gains(model), model)
+
+
+def choose_scenario(args: argparse.Namespace) -> Scenario:
+    """The plant that the options describe, without faults."""
     from rig.nodes.scenario import Scenario, require_servovalve
     from rig.sequences.faults import Plan
 
     model = options.load_chosen_model(args)
     require_servovalve(model)
-    if args.node == "plant":
-        return lambda send: Emulator(send, Scenario(model, Plan(stop=0), (), args.seed))
-    return lambda send: Firmware(send, read_gains(model), model)
+    return Scenario(model, Plan(stop=0), (), args.seed)

@@ -1,0 +1,657 @@
+"""The emulator's cycle as one compiled loop: SYNC in, feedback and valve state out, the plant one cycle further.
+
+`run_emulator` is a plain function; `plant.compile` compiles it with the plant and the bus (raw_bus.py) as one. It does
+what `rig.nodes.emulator.Emulator` does, with the same numbers; only the CANopen services stay in Python
+(emulator_service.py), on another socket. Both work on the same arrays, which are made before the start: nothing is
+allocated in the loop.
+
+Time. In real time a late frame is late by the clock. In lockstep (0x1006 = 0) the cycles have no fixed length, so a
+delay counts in cycles, as on the embedded bus: a frame that is late by m cycles and a part is sent in cycle k + m,
+after the answer to that cycle has come.
+"""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant import Model
+from plant.compile import PointerCall, keep_apart
+from plant.flat import list_state_values
+from plant.machine_code import ADVANCE_CALL, READ_CALL
+from plant.model import STEPS
+from plant.run import PRESSURE, SENSED, SPOOL
+from plant.segments import RATE
+from plant.solve import NOISES
+from rig.network.raw_bus import (
+    FRAME,
+    NEVER,
+    SENT,
+    Port,
+    join_halves,
+    join_words,
+    read_clock,
+    receive_frame,
+    send_frame,
+    sleep_until,
+    split_words,
+)
+from rig.nodes.cycle_record import RING
+from rig.sequences.faults import Delay, Drop, Schedule
+from rig.sequences.injection import AddedSignal
+
+MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
+NOISE_RING = 1 << 16  # cycles of noise drawn ahead
+EVENT_RING = 256
+_HELD = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
+_ANSWER_LIMIT = 80_000_000  # ns: in lockstep the answer to a late feedback frame is waited for this long
+
+# NMT states (CiA 301), as in the heartbeat
+INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
+
+# The words that loop and services share. Written by the services:
+(STOP, DEMOTED, PERIOD, SYNC_ID, DRIVE_ID, DRIVE_TYPE, FEEDBACK_ID, FEEDBACK_TYPE, VALVE_ID, VALVE_TYPE, EMCY_ID,
+ OTHER_REGISTER, NOISE_FILLED) = range(13)
+# .. by the loop:
+(STATE, BEGUN, FIRST, CYCLE, CHANGED, MISSED, WAITING, WAITING_DATA, CURRENT, STATUS_WORD, ANSWERED, MISSING, LATE,
+ ZEROED, FEEDBACK_COUNT, VALVE_COUNT, NOISE_USED, PLANT_CYCLE, HELD, ORDER, NOW, EVENTS, RECORDED, LAST_SYNC,
+ LONGEST_WAKE, LONGEST_RESPONSE, LONGEST_CYCLE, XJ, P12, XS, FLAGS, FRAME_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID,
+ PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE, RESET_COMMAND) = range(16, 57)
+# .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
+(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, PARAMETER_VALUES_AT, SIGNALS, SIGNALS_AT, STUCK_AT, ADDED_AT, FRAMES, FRAMES_AT,
+ HITS_AT, LOAD, LOAD_AT, FLAT, FLAT_AT, LIVE_AT, RECORD_SIZE, ADVANCE, READ) = range(64, 83)
+LEVELS_AT, SENSORS_AT = 84, 87  # of the three transducers: where their noise is in the record, their value in the state
+_WORDS = 96
+EVENTS_AT, _HELD_AT = _WORDS, _WORDS + EVENT_RING
+TIMES_AT = _HELD_AT + 6 * _HELD
+_TABLES_AT = TIMES_AT + 6 * RING
+_CURRENT, _PERIOD, _READINGS, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
+_REAL_TABLES_AT = NOISE_AT + NOISES * NOISE_RING
+
+# what the loop returns
+ENDED, RESET, BROKEN = 0, 1, 2
+# events for the services
+TIMEOUT_RAISED, TIMEOUT_CLEARED, DRIVE_SHORT, DRIVE_WHOLE, DIVERGED, SYNC_MALFORMED = range(1, 7)
+COMMANDED = 256  # + the NMT command
+
+_FEEDBACK, _VALVE, _DRIVE = range(3)  # frames that faults act on
+_FRAMES = ("feedback", "valve_state", "drive")
+_SIGNALS = ("xj", "p12", "xs")
+_ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
+_DROP = -1
+
+_DRIVE_MISSING, _DRIVE_LATE, _CURRENT_ZEROED = 1, 2, 4  # codec.Flags
+_LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
+_TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
+_MAXIMUM, _MINIMUM = 2.0**31 - 1.0, -(2.0**31)
+
+_call_advance, _call_read = PointerCall(ADVANCE_CALL), PointerCall(READ_CALL)
+
+Words = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
+
+class Memory(NamedTuple):
+    """All that loop and services share. Two arrays: with one for each table the loop takes a minute to compile.
+
+    words: the numbers named above; a ring of events; late frames in rows of (due, order, COB-ID, length, data, which
+    frame); a ring of cycles in rows of (cycle, SYNC received, begun, sent, done, flags), times in ns; then the faults.
+
+    The faults: parameters are rows of (place in the record, first cycle, end, number of the parameter), and of (base,
+    value, ramp in s); signals are rows of (signal, kind, first cycle, end, place among the added values), and of
+    (value, last reading) where stuck; frames are rows of (frame, first cycle, cycles, first bit, delay in ns, -1:
+    dropped), and a bit a cycle.
+
+    reals: current in force, A; period, s; readings of the transducers; a ring of noise, NOISES a cycle;
+    real numbers of the faults; load, N a cycle; state and parameters of the plant.
+    """
+
+    words: Words
+    reals: Reals
+
+
+def run_emulator(port: Port, m: Memory) -> int:
+    """Serve the bus until the services stop it (ENDED), an NMT reset comes (RESET) or the bus fails (BROKEN)."""
+    words = m.words
+    while True:
+        if words[STOP]:
+            return ENDED
+        if words[DEMOTED]:
+            if words[STATE] == OPERATIONAL:
+                _leave_operational(m, words[DEMOTED])
+            words[DEMOTED] = 0
+        if words[PUSHED]:
+            words[PUSHED] = 0
+            status, t_ns, cob_id = FRAME, words[PUSHED_TIME], words[PUSHED_ID]
+            length, data = words[PUSHED_LENGTH], words[PUSHED_DATA]
+        else:
+            status, t_ns, cob_id, length, data = receive_frame(port, _find_next_due(m))
+        if status == FRAME:
+            if cob_id == words[SYNC_ID]:
+                _take_sync(port, m, t_ns, length)
+            elif cob_id == words[DRIVE_ID]:
+                _take_drive(m, t_ns, length, data)
+            elif cob_id == 0 and length == 2 and _take_command(m, data):
+                return RESET
+        elif status < 0:
+            words[FAILURE] = status
+        if words[HELD] and words[PERIOD]:
+            _release_until(port, m, read_clock(port), True)
+        if words[FAILURE]:
+            return BROKEN
+
+
+def _integer(value: Any) -> int:
+    """A word as the integer that compiled code and Python calculate alike with."""
+    return int(np.int64(value))
+
+
+# ------------------------------------------------------------------------------------ NMT
+
+
+def _take_command(m: Memory, data: int) -> bool:
+    """An NMT command to this node; True for a reset, which the services carry out. They hear of all from here."""
+    words = m.words
+    command, node = data & 0xFF, data >> 8 & 0xFF  # before its boot-up the node hears nothing
+    if words[STATE] == INITIALISING or (node != 0 and node != 3):
+        return False
+    if command == 129 or command == 130:
+        words[RESET_COMMAND] = command
+        return True
+    if command == 1 or command == 2 or command == 128:
+        _post_event(m, COMMANDED + command)
+    if command == 1 and words[STATE] != OPERATIONAL:
+        words[STATE] = OPERATIONAL
+        words[BEGUN] = words[FIRST] = 1
+    elif command == 2 and words[STATE] != STOPPED:
+        _leave_operational(m, STOPPED)
+    elif command == 128 and words[STATE] != PRE_OPERATIONAL:
+        _leave_operational(m, PRE_OPERATIONAL)
+    return False
+
+
+def _leave_operational(m: Memory, state: int) -> None:
+    """What waits for a SYNC is dropped, and SYNCs are counted anew."""
+    words = m.words
+    words[STATE] = state
+    words[WAITING] = 0
+    words[FEEDBACK_COUNT], words[VALVE_COUNT] = words[FEEDBACK_TYPE], words[VALVE_TYPE]
+
+
+def _post_event(m: Memory, event: int) -> None:
+    m.words[EVENTS_AT + m.words[EVENTS] % EVENT_RING] = event
+    m.words[EVENTS] += 1
+
+
+# ------------------------------------------------------------------------------------ drive
+
+
+def _take_drive(m: Memory, t_ns: int, length: int, data: int) -> None:
+    """A drive frame came; a fault may drop or delay it."""
+    words = m.words
+    action = _find_action(m, _DRIVE, words[CYCLE] - 1)
+    if action == 0:
+        _keep_drive(m, length, data)
+    elif action > 0:
+        now = t_ns if words[PERIOD] else words[NOW]
+        _hold_frame(m, now + action, words[DRIVE_ID], length, data, _DRIVE)
+
+
+def _keep_drive(m: Memory, length: int, data: int) -> None:
+    """The drive frame waits for the next SYNC (a synchronous RPDO)."""
+    words = m.words
+    if words[STATE] != OPERATIONAL:
+        return
+    if length < 8:
+        if not words[SHORT]:
+            _post_event(m, DRIVE_SHORT)
+        words[SHORT] = 1
+        return
+    if words[SHORT]:
+        _post_event(m, DRIVE_WHOLE)
+        words[SHORT] = 0
+    if words[DRIVE_TYPE] <= _LAST_SYNCHRONOUS:
+        words[WAITING], words[WAITING_DATA] = 1, data
+    else:
+        words[CURRENT], words[STATUS_WORD], words[ANSWERED] = split_words(data)
+
+
+# ------------------------------------------------------------------------------------ cycle
+
+
+def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
+    """One cycle of the plant; while the node is not OPERATIONAL, time goes on and the plant pauses."""
+    words = m.words
+    begun_ns = read_clock(port)
+    while words[NOISE_USED] >= words[NOISE_FILLED]:  # the services draw a minute ahead; never repeat a number
+        if words[STOP]:
+            return
+        sleep_until(port, read_clock(port) + 100_000)
+    if not words[PERIOD]:  # lockstep: what was late is late for the cycle that ends now
+        _release_until(port, m, words[CYCLE] * words[CYCLE_TIME] - 1, True)
+        words[NOW] = words[CYCLE] * words[CYCLE_TIME]
+    if words[STATE] != OPERATIONAL:
+        words[CYCLE] += words[BEGUN]
+        return
+    if length:
+        _post_event(m, SYNC_MALFORMED)
+        return
+    words[LAST_SYNC] = t_ns
+    fresh = words[WAITING]
+    if fresh:
+        words[WAITING] = 0
+        words[CURRENT], words[STATUS_WORD], words[ANSWERED] = split_words(words[WAITING_DATA])
+    k = words[CYCLE]
+    flags = 0
+    if not words[FIRST]:
+        flags = _judge_drive(port, m, k, fresh)
+    words[FIRST] = 0
+    if not _read_plant(m, k):
+        _post_event(m, DIVERGED)
+        _leave_operational(m, PRE_OPERATIONAL)
+        return
+    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
+    end = (k + 1) * words[CYCLE_TIME] - 1  # in lockstep, the last instant of this cycle
+    is_crowded = not words[PERIOD] and _is_feedback_due(m, end)
+    is_fed = _send_feedback(port, m, k, t_ns)
+    if not is_crowded:
+        _send_valve_state(port, m, k, t_ns)
+    sent_ns = read_clock(port)
+    _advance_plant(m, k)
+    words[CYCLE] = k + 1
+    done_ns = read_clock(port)
+    _record_cycle(m, k, t_ns, begun_ns, sent_ns, done_ns, flags)
+    if not words[PERIOD]:
+        if is_crowded:
+            _send_late_feedback(port, m, k, is_fed)
+            _send_valve_state(port, m, k, t_ns)
+        # Drives wait for the next SYNC, for that of this cycle comes before them; but not if it answers late feedback.
+        is_fed = _is_feedback_due(m, end)
+        if _find_next_held(m, end, is_fed) >= 0:
+            words[NOW] = end if is_fed else words[NOW]
+            _release_until(port, m, end, is_fed)
+
+
+def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
+    """Flags of this cycle and the current to use until the next SYNC: see `Emulator._judge`."""
+    words = m.words
+    if fresh and words[ANSWERED] == (k - 1) & 0xFFFF:
+        m.reals[_CURRENT] = words[CURRENT] / 1e8
+        if words[MISSED] >= MISSED_LIMIT:
+            _announce_timeout(port, m, 0)
+        words[MISSED] = 0
+        return 0
+    words[MISSED] += 1
+    if fresh:
+        words[LATE] += 1
+        flags = _DRIVE_LATE
+    else:
+        words[MISSING] += 1
+        flags = _DRIVE_MISSING
+    if words[MISSED] >= MISSED_LIMIT:
+        m.reals[_CURRENT] = 0.0
+        flags |= _CURRENT_ZEROED
+        _announce_timeout(port, m, 1)
+    return flags
+
+
+def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
+    """EMCY 0x8250 or its end. It stands on the bus before the feedback of this cycle, so the loop itself sends it."""
+    words = m.words
+    if words[ZEROED] == raised:
+        return
+    words[ZEROED] = raised
+    _post_event(m, TIMEOUT_RAISED if raised else TIMEOUT_CLEARED)
+    register = words[OTHER_REGISTER]
+    data = register << 16
+    if raised:
+        data = _TIMEOUT_CODE | (register | _TIMEOUT_REGISTER) << 16 | 1 << 24
+    if words[EMCY_ID] >= 0:
+        _send(port, m, words[EMCY_ID], 8, data)
+
+
+def _read_plant(m: Memory, k: int) -> bool:
+    """Change the parameters of this cycle and read the transducers; False if the simulation has diverged."""
+    words, reals = m.words, m.reals
+    _set_parameters(m, k, words[CHANGED])
+    words[CHANGED] = k
+    noise, flat = NOISE_AT + NOISES * (words[NOISE_USED] % NOISE_RING), words[FLAT_AT]
+    if words[READ]:
+        base = reals.ctypes.data
+        _call_read(words[READ], base + 8 * _READINGS, base + 8 * _FAILURE,
+                   0, 0, words[FLAT], 8, base + 8 * flat, words[FLAT], 8,
+                   0, 0, NOISES, 8, base + 8 * noise, NOISES, 8,
+                   words[PLANT_CYCLE] * reals[_PERIOD],
+                   0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE])
+    else:  # as in `plant.Actuator.sample`
+        for i in range(3):
+            level = reals[words[LIVE_AT] + words[LEVELS_AT + i]]
+            reals[_READINGS + i] = reals[flat + words[SENSORS_AT + i]] + level * reals[noise + i]
+    xj, p12, xs = reals[_READINGS], reals[_READINGS + 1], reals[_READINGS + 2]
+    if not np.isfinite(xj + p12 + xs):
+        return False
+    words[XJ] = _count(_disturb(m, 0, xj, k) * 1e7)
+    words[P12] = _count(_disturb(m, 1, p12, k) / 10.0)
+    words[XS] = _count(_disturb(m, 2, xs, k) * 1e9)
+    return True
+
+
+def _advance_plant(m: Memory, k: int) -> None:
+    """One cycle under the current in force and the load of this cycle."""
+    words, reals = m.words, m.reals
+    load = 0.0
+    if k < words[LOAD]:
+        load = reals[words[LOAD_AT] + k]
+    noise = reals[NOISE_AT + NOISES * (words[NOISE_USED] % NOISE_RING) + NOISES - 1]
+    base = reals.ctypes.data
+    _call_advance(words[ADVANCE], base + 8 * _READINGS, base + 8 * _FAILURE,
+                  0, 0, words[FLAT], 8, base + 8 * words[FLAT_AT], words[FLAT], 8,
+                  reals[_CURRENT], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
+                  0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], STEPS)
+    words[NOISE_USED] += 1
+    words[PLANT_CYCLE] += 1
+
+
+def _count(value: float) -> int:
+    """The nearest INT32, half counts to the even one: see `codec`."""
+    return int(np.rint(min(max(value, _MINIMUM), _MAXIMUM)))
+
+
+def _record_cycle(m: Memory, k: int, t_ns: int, begun_ns: int, sent_ns: int, done_ns: int, flags: int) -> None:
+    words = m.words
+    at = TIMES_AT + 6 * (words[RECORDED] % RING)
+    words[at], words[at + 1], words[at + 2] = k, t_ns, begun_ns
+    words[at + 3], words[at + 4], words[at + 5] = sent_ns, done_ns, flags
+    words[RECORDED] += 1
+    words[LONGEST_WAKE] = max(words[LONGEST_WAKE], begun_ns - t_ns)
+    words[LONGEST_RESPONSE] = max(words[LONGEST_RESPONSE], sent_ns - t_ns)
+    words[LONGEST_CYCLE] = max(words[LONGEST_CYCLE], done_ns - t_ns)
+
+
+# ------------------------------------------------------------------------------------ frames out
+
+
+def _send(port: Port, m: Memory, cob_id: int, length: int, data: int) -> None:
+    status = send_frame(port, cob_id, length, data)
+    if status < 0:
+        m.words[FAILURE] = status
+    elif status != SENT:
+        m.words[UNSENT] += 1
+
+
+def _send_feedback(port: Port, m: Memory, k: int, t_ns: int) -> bool:
+    """Feedback, where it is due at this SYNC; whether it went out."""
+    words = m.words
+    if not _count_down(words, FEEDBACK_TYPE, FEEDBACK_COUNT, FEEDBACK_ID):
+        return False
+    data = join_halves(words[XJ], words[P12])
+    return _send_unless_faulty(port, m, _FEEDBACK, words[FEEDBACK_ID], data, k, t_ns)
+
+
+def _send_valve_state(port: Port, m: Memory, k: int, t_ns: int) -> bool:
+    """Valve state, where it is due at this SYNC; whether it went out."""
+    words = m.words
+    if not _count_down(words, VALVE_TYPE, VALVE_COUNT, VALVE_ID):
+        return False
+    data = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
+    return _send_unless_faulty(port, m, _VALVE, words[VALVE_ID], data, k, t_ns)
+
+
+def _count_down(words: Words, kind: int, count: int, cob_id: int) -> bool:
+    """Whether a TPDO is due: type n of 1..240 at every n-th SYNC."""
+    if not 1 <= words[kind] <= _LAST_SYNCHRONOUS:
+        return False
+    words[count] -= 1
+    if words[count] > 0:
+        return False
+    words[count] = words[kind]
+    return bool(words[cob_id] >= 0)
+
+
+def _send_unless_faulty(port: Port, m: Memory, what: int, cob_id: int, data: int, k: int, t_ns: int) -> bool:
+    action = _find_action(m, what, k)
+    if action == 0:
+        _send(port, m, cob_id, 8, data)
+        return True
+    if action > 0:
+        now = t_ns if m.words[PERIOD] else m.words[NOW]
+        _hold_frame(m, now + action, cob_id, 8, data, what)
+    return False
+
+
+# ------------------------------------------------------------------------------------ late frames
+
+
+def _hold_frame(m: Memory, due: int, cob_id: int, length: int, data: int, what: int) -> None:
+    """Keep a frame until it is due; one too many is lost and counted."""
+    words = m.words
+    if words[HELD] >= _HELD:
+        words[UNSENT] += 1
+        return
+    at = _HELD_AT + 6 * words[HELD]
+    words[at], words[at + 1], words[at + 2] = due, words[ORDER], cob_id
+    words[at + 3], words[at + 4], words[at + 5] = length, data, what
+    words[HELD] += 1
+    words[ORDER] += 1
+
+
+def _find_next_due(m: Memory) -> int:
+    """When the next late frame is due, in real time."""
+    due = NEVER
+    if m.words[PERIOD]:
+        for i in range(m.words[HELD]):
+            due = min(due, _integer(m.words[_HELD_AT + 6 * i]))
+    return due
+
+
+def _find_next_held(m: Memory, t_ns: int, with_drives: bool) -> int:
+    """Where the late frame stands that is to be delivered next of those due at `t_ns`; -1 for none.
+
+    Drives first, which are for the emulator itself; valve states last, because in lockstep they end the rig's wait.
+    """
+    best = -1
+    for i in range(m.words[HELD]):
+        at = _HELD_AT + 6 * i
+        is_due = m.words[at] <= t_ns and (with_drives or m.words[at + 5] != _DRIVE)
+        if is_due and (best < 0 or _is_before(m.words, at, best)):
+            best = at
+    return best
+
+
+def _is_before(words: Words, a: int, b: int) -> bool:
+    rank_a, rank_b = (words[a + 5] + 1) % 3, (words[b + 5] + 1) % 3
+    if rank_a != rank_b:
+        return bool(rank_a < rank_b)
+    if words[a] != words[b]:
+        return bool(words[a] < words[b])
+    return bool(words[a + 1] < words[b + 1])
+
+
+def _is_feedback_due(m: Memory, t_ns: int) -> bool:
+    """Whether a feedback frame of an earlier cycle is to be sent until `t_ns`."""
+    is_due = False
+    for i in range(m.words[HELD]):
+        at = _HELD_AT + 6 * i
+        is_due |= m.words[at + 5] == _FEEDBACK and m.words[at] <= t_ns
+    return bool(is_due)
+
+
+@keep_apart
+def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
+    """Deliver the late frames that are due at `t_ns`; whether feedback was among them."""
+    words = m.words
+    is_fed = False
+    at = _find_next_held(m, t_ns, with_drives)
+    while at >= 0:
+        cob_id, length, data, what = words[at + 2], words[at + 3], words[at + 4], words[at + 5]
+        words[HELD] -= 1
+        last = _HELD_AT + 6 * words[HELD]
+        for i in range(6):
+            words[at + i] = words[last + i]
+        if what == _DRIVE:
+            _keep_drive(m, length, data)
+        else:
+            _send(port, m, cob_id, length, data)
+            is_fed |= what == _FEEDBACK
+        at = _find_next_held(m, t_ns, with_drives)
+    return bool(is_fed)
+
+
+@keep_apart
+def _send_late_feedback(port: Port, m: Memory, k: int, is_fed: bool) -> None:
+    """Lockstep: send the feedback of earlier cycles behind the answer to that of cycle k, and await the answer to it.
+
+    The rig goes on as soon as it has the valve state, which is sent after this.
+    """
+    words = m.words
+    start = k * words[CYCLE_TIME]
+    if is_fed:
+        _await_drive(port, m)
+    for t_ns in (start, start + words[CYCLE_TIME] - 1):  # an embedded bus has two instants in a cycle
+        words[NOW] = t_ns
+        if _release_until(port, m, t_ns, True):
+            _await_drive(port, m)
+
+
+@keep_apart
+def _await_drive(port: Port, m: Memory) -> None:
+    """Take the next drive frame; another frame ends the wait and comes up again in the loop."""
+    words = m.words
+    status, t_ns, cob_id, length, data = receive_frame(port, read_clock(port) + _ANSWER_LIMIT)
+    if status < 0:
+        words[FAILURE] = status
+    elif status == FRAME and cob_id == words[DRIVE_ID]:
+        _take_drive(m, t_ns, length, data)
+    elif status == FRAME:
+        words[PUSHED], words[PUSHED_TIME], words[PUSHED_ID] = 1, t_ns, cob_id
+        words[PUSHED_LENGTH], words[PUSHED_DATA] = length, data
+
+
+# ------------------------------------------------------------------------------------ faults
+
+
+def _find_action(m: Memory, what: int, k: int) -> int:
+    """What happens to a frame of cycle k: 0 nothing, -1 dropped, else the delay in ns."""
+    words = m.words
+    for i in range(words[FRAMES]):
+        at = words[FRAMES_AT] + 5 * i
+        place = k - words[at + 1]
+        if words[at] == what and 0 <= place < words[at + 2]:
+            bit = words[at + 3] + place
+            if words[words[HITS_AT] + (bit >> 5)] >> (bit & 31) & 1:
+                return _integer(words[at + 4])
+    return 0
+
+
+def _set_parameters(m: Memory, k: int, before: int) -> None:
+    """Set the parameters that differ from what they were in cycle `before`: see `Schedule.parameters_at`."""
+    words = m.words
+    number = -1
+    for i in range(words[PARAMETERS]):
+        at = words[PARAMETERS_AT] + 4 * i
+        if words[at + 3] != number:  # the first row of a parameter
+            number = words[at + 3]
+            value = _find_parameter(m, i, k)
+            if value != _find_parameter(m, i, before):
+                m.reals[words[LIVE_AT] + words[at]] = value
+
+
+def _find_parameter(m: Memory, first: int, k: int) -> float:
+    """The parameter whose rows begin at `first`, in cycle k."""
+    words, rows = m.words, m.words[PARAMETERS_AT]
+    base = m.reals[words[PARAMETER_VALUES_AT] + 3 * first]
+    i = first
+    while i < words[PARAMETERS] and words[rows + 4 * i + 3] == words[rows + 4 * first + 3]:
+        start = words[rows + 4 * i + 1]
+        if start <= k < words[rows + 4 * i + 2]:
+            at = words[PARAMETER_VALUES_AT] + 3 * i
+            value, ramp, t = m.reals[at + 1], m.reals[at + 2], (k - start) / RATE
+            growth = 1.0 if t >= ramp else t / ramp
+            return float(base + (value - base) * growth)
+        i += 1
+    return float(base)
+
+
+def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
+    """What a sensor says in place of `value`: see `Schedule.signal`."""
+    words, reals = m.words, m.reals
+    for i in range(words[SIGNALS]):
+        at, stuck = words[SIGNALS_AT] + 5 * i, words[STUCK_AT] + 2 * i
+        if words[at] != signal:
+            continue
+        is_acting = words[at + 2] <= k < words[at + 3]
+        if words[at + 1] == _ADDED:
+            if is_acting:
+                value += reals[words[ADDED_AT] + words[at + 4] + k - words[at + 2]]
+        elif not is_acting:
+            reals[stuck + 1] = value
+        elif words[at + 1] == _HOLDS_VALUE:
+            value = reals[stuck]
+        else:
+            value = reals[stuck + 1]
+    return value
+
+
+# ------------------------------------------------------------------------------------ made before the start
+
+
+def can_inject(schedule: Schedule) -> bool:
+    """Whether the loop knows all faults of the emulator's frames: lost and late ones."""
+    known = all(schedule.list_actions(name) <= {Drop, Delay} for name in _FRAMES)
+    return known and schedule.list_actions("sync") <= {Delay} and not schedule.has_bus_off("plant")
+
+
+def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0) -> Memory:
+    """Memory of the loop for a plant at rest, its load (N a cycle) and its faults; no noise is drawn yet.
+
+    `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model with effects on its
+    readings, `read_flat_sensors`.
+    """
+    names = {name: i for i, name in enumerate(model.names())}
+    parameters = [((names[change.name], change.first, change.last, number), (change.base, change.value, change.ramp))
+                  for number, changes in enumerate(schedule.list_parameter_changes()) for change in changes]
+    signals: list[tuple[int, ...]] = []
+    stuck: list[tuple[float, float]] = []
+    added: list[float] = []
+    for number, name in enumerate(_SIGNALS):
+        for change in schedule.list_signal_changes(name):
+            if isinstance(change, AddedSignal):
+                signals.append((number, _ADDED, change.first, change.first + len(change.values), len(added)))
+                added += change.values
+            else:
+                kind = _HOLDS_READING if change.value is None else _HOLDS_VALUE
+                signals.append((number, kind, change.cycles.start, change.cycles.stop, 0))
+            stuck.append((getattr(change, "value", None) or 0.0, 0.0))
+    frames: list[tuple[int, ...]] = []
+    hits = b""
+    for number, name in enumerate(_FRAMES):
+        for first, hit, action in schedule.list_frame_faults(name):
+            delay = action.ns if isinstance(action, Delay) else _DROP
+            frames.append((number, first, len(hit), len(hits), delay))
+            hits += hit
+    bits = np.packbits(np.frombuffer(hits + bytes(-len(hits) % 32), np.uint8), bitorder="little").view(np.uint32)
+    record = model.record()
+    state = list_state_values(model.state())
+    words, places = _join_tables(_TABLES_AT, np.int64, [row for row, _ in parameters], signals, frames, bits)
+    reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, [values for _, values in parameters], stuck, added,
+                                      load, state, record.view(np.float64))
+    words[CHANGED], words[STATE] = -1, INITIALISING
+    words[CYCLE_TIME] = round(model["controller.period"] * 1e9)
+    words[PARAMETERS], words[SIGNALS], words[FRAMES] = len(parameters), len(signals), len(frames)
+    words[LOAD], words[FLAT] = len(load), len(state)
+    words[PARAMETERS_AT], words[SIGNALS_AT], words[FRAMES_AT], words[HITS_AT], _ = places
+    (words[PARAMETER_VALUES_AT], words[STUCK_AT], words[ADDED_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT],
+     _) = real_places
+    words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read
+    words[LEVELS_AT: LEVELS_AT + 3] = [names[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
+    words[SENSORS_AT: SENSORS_AT + 3] = SENSED, PRESSURE, SPOOL
+    reals[_PERIOD] = model["controller.period"]
+    return Memory(words, reals)
+
+
+def _join_tables(start: int, kind: Any, *tables: Any) -> tuple[NDArray[Any], list[int]]:
+    """One array with the tables behind each other from `start` on, and where each begins and the last ends."""
+    flat = [np.asarray(table, kind).ravel() for table in tables]
+    places = [start + int(n) for n in np.cumsum([0, *map(len, flat)])]
+    return np.concatenate([np.zeros(start, kind), *flat]), places

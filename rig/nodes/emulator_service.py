@@ -1,0 +1,340 @@
+"""Node 3 on SocketCAN and UDP: the compiled cycle in a thread of its own, and beside it the CANopen services in Python.
+
+The loop hears the NMT commands and obeys them in the order of the bus, between two SYNCs; it passes them on to the
+services, which keep the state that heartbeat, SDO and EMCY need. All that they share are arrays (emulator_cycle.py).
+While the plant or the faults change (a scenario, an NMT reset) the loop is stopped; the frames that come meanwhile wait
+in its socket.
+"""
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from dbc import EDS
+from plant import Model
+from plant.compile import compile_function
+from plant.effects import CATALOGUE
+from plant.errors import InputError, RigError
+from plant.flat import list_state_values
+from plant.machine_code import find_function_address
+from plant.model import build_kernel
+from plant.run import load_stored_advance, report_law_errors
+from plant.solve import NOISES, read_flat_sensors
+from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
+from rig.network import codec
+from rig.network.frame import Frame, Send
+from rig.network.raw_bus import RawBus, make_closed_port
+from rig.nodes import emulator_cycle as ec
+from rig.nodes.cycle_record import RING, CycleRecord, encode_cycle_record
+from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, Emulator
+from rig.nodes.scenario import Scenario
+from rig.run.priority import enter_loop_thread, list_cpus
+from rig.sequences.faults import Plan, Schedule
+
+RECORD = 0x2212
+# what the services need not hear: the PDOs, and what the loop hears
+LEFT_OUT = (0x000, codec.SYNC, codec.DRIVE, codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE)
+_HEARTBEAT, _EMCY, _SDO, _REPLY = 0x700 + NODE, 0x080 + NODE, 0x600 + NODE, 0x580 + NODE
+_COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
+_STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
+
+
+class EmulatorService:
+    """The plant node on a bus of its own. Its interface is `receive` and `tick`, as that of `Emulator`, and `close`.
+
+    `send` is for the services; the loop uses `bus`. `is_locked`: the memory of the process is locked.
+    """
+
+    def __init__(self, send: Send, bus: RawBus, scenario: Scenario | None = None, is_locked: bool = False,
+                 leave_out: Callable[[Collection[int]], None] = lambda cob_ids: None) -> None:
+        """`leave_out(cob_ids)`: the services need not hear these frames."""
+        self._send, self._bus, self._is_locked, self._leave_out = send, bus, is_locked, leave_out
+        self._slow: Emulator | None = None  # takes over for faults that the loop does not know
+        self._thread: threading.Thread | None = None
+        self._kind = _COMPILED
+        self._obeying = False  # an NMT command, which the loop obeys by itself
+        self._run = compile_loop()
+        self._booking = False  # an error whose EMCY the loop has sent
+        self._scenario: Scenario | None = None
+        self._seen = self._last_sync = 0
+        self.device = Device(NODE, EDS[NODE], self._transmit)
+        self.device.on_write = self._on_write
+        self.device.on_nmt = self._on_nmt
+        self._od = self.device.od.values
+        self.load_scenario(scenario or Scenario(Model(), Plan(stop=0)))
+
+    def load_scenario(self, scenario: Scenario) -> None:
+        """Load a plant with its faults and loads; it is compiled now, not in the first cycle.
+
+        Raises:
+            InputError: a scenario that cannot be run; the previous one stays.
+        """
+        schedule = Schedule(scenario.plan, scenario.model.values)
+        if not ec.can_inject(schedule):
+            self._hand_over(scenario)
+            return
+        memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
+        with self._stop_loop():
+            state = self._memory.words[ec.STATE] if self._scenario else ec.INITIALISING
+            self._scenario = scenario
+            self._begin(memory, schedule, int(state))
+
+    def receive(self, frame: Frame) -> None:
+        """A frame for the services arrived."""
+        if self._slow is not None:
+            self._slow.receive(frame)
+            return
+        if frame.cob_id in LEFT_OUT:
+            return
+        self._book_events()
+        if frame.cob_id == _SDO:
+            self._show_values(frame.data)
+        self.device.receive(frame)
+
+    def tick(self, t_ns: int) -> None:
+        """Run the timers, take over what the loop reports, and draw noise ahead.
+
+        Raises:
+            RigError: the loop's bus is gone.
+        """
+        if self._slow is not None:
+            self._slow.tick(t_ns)
+            return
+        self._book_events()
+        last = int(self._memory.words[ec.LAST_SYNC])
+        if last != self._last_sync:
+            self._last_sync = last
+            self.device.sync.notice(t_ns)
+        self.device.tick(t_ns)
+        self._draw_noise()
+        self._share_settings()
+        self._watch_loop()
+
+    def close(self) -> None:
+        """Stop the loop."""
+        self._halt()
+
+    def _hand_over(self, scenario: Scenario) -> None:
+        """Let the emulator in Python take over, in soft real time, for as long as this program runs."""
+        slow = Emulator(self._send_later, scenario)
+        self._halt()
+        slow.tick(self.device.t_ns)  # its boot-up is not sent: the node has booted
+        self._slow = slow
+        self._leave_out(())
+
+    def _send_later(self, cob_id: int, data: bytes) -> None:
+        if self._slow is not None:
+            self._send(cob_id, data)
+
+    # -- the loop's thread
+
+    def _begin(self, memory: ec.Memory, schedule: Schedule, state: int) -> None:
+        """Take over new memory of the loop, which stands still; its next SYNC is the first."""
+        assert self._scenario is not None
+        self._memory, self._schedule = memory, schedule
+        self._rng = np.random.default_rng(self._scenario.seed)
+        self._seen = self._last_sync = 0
+        self._memory.words[ec.STATE] = state
+        self._memory.words[ec.BEGUN] = self._memory.words[ec.FIRST] = int(state == ec.OPERATIONAL)
+        self._draw_noise()
+        self._share_settings()
+
+    @contextmanager
+    def _stop_loop(self) -> Iterator[None]:
+        """Stop the loop, and start it again with what has been set meanwhile."""
+        self._halt()
+        try:
+            yield
+        finally:
+            self._memory.words[ec.STOP] = 0
+            self._thread = threading.Thread(target=self._serve, name="emulator", daemon=True)
+            self._thread.start()
+
+    def _serve(self) -> None:
+        with enter_loop_thread() as scheduler:
+            self._kind = _COMPILED | _FIFO * (scheduler == "SCHED_FIFO") | _LOCKED * self._is_locked
+            self._kind |= _PINNED * (len(list_cpus()) == 1)
+            self._run(self._bus.port, self._memory)
+
+    def _halt(self) -> None:
+        if self._thread is None:
+            return
+        self._memory.words[ec.STOP] = 1
+        self._bus.wake()
+        self._thread.join(_STOP_LIMIT)
+        if self._thread.is_alive():
+            raise RigError(f"{self._bus.spec}: the emulator's loop did not stop within {_STOP_LIMIT:g} s")
+        self._thread = None
+
+    def _watch_loop(self) -> None:
+        """Why the loop has ended, if it has: an NMT reset, or its bus is gone."""
+        if self._thread is None or self._thread.is_alive():
+            return
+        words = self._memory.words
+        if words[ec.FAILURE]:
+            raise self._bus.explain_failure(int(words[ec.FAILURE]))
+        self._book_events()
+        self._obey(int(words[ec.RESET_COMMAND]))
+
+    def _obey(self, command: int) -> None:
+        """Do what the loop has done at an NMT command, or left to the services."""
+        self._obeying = True
+        try:
+            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, NODE))))
+        finally:
+            self._obeying = False
+
+    # -- CANopen
+
+    def _transmit(self, cob_id: int, data: bytes) -> None:
+        """Send a frame of the services unless a fault or the loop has dealt with it."""
+        if cob_id == _EMCY and self._booking:
+            return
+        if cob_id == _REPLY:
+            self._share_settings()  # what SDO has written is in force when it is confirmed
+        if cob_id == _HEARTBEAT and data == bytes(1) and not self._memory.words[ec.STATE]:  # the first boot-up
+            self._memory.words[ec.STATE] = ec.PRE_OPERATIONAL
+        words = self._memory.words
+        is_begun = words[ec.BEGUN] and not words[ec.FIRST]  # before the first SYNC there is no cycle
+        if cob_id == _HEARTBEAT and is_begun and not self._schedule.is_heartbeat_alive("plant", int(words[ec.CYCLE])):
+            return
+        self._send(cob_id, data)
+
+    def _on_nmt(self, old: NmtState, new: NmtState) -> None:
+        if new is NmtState.INITIALISING:
+            assert self._scenario is not None
+            scenario = self._scenario
+            with self._stop_loop():
+                schedule = Schedule(scenario.plan, scenario.model.values)
+                memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
+                self._begin(memory, schedule, ec.PRE_OPERATIONAL)
+        elif not self._obeying and old is NmtState.OPERATIONAL:  # an error of the services: 0x1029
+            self._memory.words[ec.DEMOTED] = new
+            self._bus.wake()
+
+    def _on_write(self, index: int, sub: int, data: bytes) -> None:
+        if index != SCENARIO:
+            return
+        if self.device.state is NmtState.OPERATIONAL:
+            raise SdoAbort(Abort.STATE)
+        try:
+            self.load_scenario(Scenario.from_bytes(data))
+        except InputError as error:
+            raise SdoAbort(Abort.VALUE) from error
+
+    def _share_settings(self) -> None:
+        """What SDO may change, and the error register without the loop's own error."""
+        shared, od, pdo = self._memory.words, self.device.od, self.device.pdo
+        shared[ec.PERIOD] = od.number(0x1006, 0)
+        emcy = od.number(0x1014, 0, 1 << 31)
+        shared[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
+        others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
+        communication = any(code != EmcyCode.SOFTWARE for code in others)
+        shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
+        sent = (0x1800, ec.FEEDBACK_TYPE, ec.FEEDBACK_COUNT), (0x1801, ec.VALVE_TYPE, ec.VALVE_COUNT)
+        for index, kind, count in sent:
+            if shared[kind] != od.number(index, 2):
+                shared[kind] = shared[count] = od.number(index, 2)
+        shared[ec.DRIVE_TYPE] = od.number(0x1400, 2)
+        heard = shared[ec.SYNC_ID], shared[ec.DRIVE_ID]
+        shared[ec.SYNC_ID] = od.number(0x1005, 0, 0x80) & 0x7FF
+        shared[ec.DRIVE_ID], shared[ec.FEEDBACK_ID], shared[ec.VALVE_ID] = (
+            -1 if each.cob_id is None else each.cob_id for each in (pdo.rpdos[1], pdo.tpdos[1], pdo.tpdos[2]))
+        if heard != (shared[ec.SYNC_ID], shared[ec.DRIVE_ID]):
+            wanted = 0, int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
+            self._bus.set_filter([cob_id for cob_id in wanted if cob_id >= 0])
+
+    def _draw_noise(self, least: int = 1024) -> None:
+        """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
+        filled = int(self._memory.words[ec.NOISE_FILLED])
+        free = int(self._memory.words[ec.NOISE_USED]) + ec.NOISE_RING - filled
+        if free < least:
+            return
+        rows = self._rng.standard_normal((free, NOISES))
+        first = min(free, ec.NOISE_RING - filled % ec.NOISE_RING)  # up to the ring's end, then from its start
+        start = filled % ec.NOISE_RING
+        noise = self._memory.reals[ec.NOISE_AT: ec.NOISE_AT + NOISES * ec.NOISE_RING].reshape(-1, NOISES)
+        noise[start: start + first], noise[: free - first] = rows[:first], rows[first:]
+        self._memory.words[ec.NOISE_FILLED] = filled + free
+
+    def _book_events(self) -> None:
+        """Take over what the loop has done or noticed: errors, whose EMCY it sends itself or leaves to the services."""
+        emcy, t_ns = self.device.emcy, self.device.t_ns
+        while self._seen < self._memory.words[ec.EVENTS]:
+            event = self._memory.words[ec.EVENTS_AT + self._seen % ec.EVENT_RING]
+            self._seen += 1
+            if event >= ec.COMMANDED:
+                self._obey(int(event) - ec.COMMANDED)
+            elif event == ec.DRIVE_SHORT:
+                emcy.raise_error(EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION, b"\x01")
+            elif event == ec.DRIVE_WHOLE:
+                emcy.clear(EmcyCode.PDO_TOO_SHORT, b"\x01")
+            elif event == ec.SYNC_MALFORMED:
+                self.device.sync.receive(Frame(t_ns, codec.SYNC, b"\0"))
+            elif event == ec.DIVERGED:
+                emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+                self._obeying = True  # the loop has left OPERATIONAL
+                self.device.nmt.communication_error(0)
+                self._obeying = False
+            else:
+                self._booking = True
+                if event == ec.TIMEOUT_RAISED:
+                    emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
+                else:
+                    emcy.clear(EmcyCode.RPDO_TIMEOUT)
+                self._booking = False
+
+    def _show_values(self, request: bytes) -> None:
+        """Put the loop's values into the dictionary, which an SDO request is about to read."""
+        shared, od = self._memory.words, self._od
+        for index, word in ((0x2200, ec.XJ), (0x2201, ec.P12), (0x2202, ec.XS), (0x2203, ec.FLAGS),
+                            (0x2204, ec.FRAME_CYCLE), (0x2205, ec.CURRENT), (0x2206, ec.STATUS_WORD),
+                            (0x2207, ec.ANSWERED)):
+            od[index, 0] = int(shared[word])
+        longest = (shared[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
+        counts = (shared[ec.MISSING], shared[ec.LATE], shared[ec.RECORDED], shared[ec.UNSENT], self._bus.overflows,
+                  *longest, self._kind)
+        for sub, value in enumerate(counts, 1):
+            od[COUNTERS, sub] = min(int(value), 0xFFFFFFFF)
+        if len(request) == 8 and request[0] >> 5 == 2 and int.from_bytes(request[1:3], "little") == RECORD:
+            od[RECORD, 0] = encode_cycle_record(self.read_record())
+
+    def read_record(self) -> CycleRecord:
+        """The record of the cycles so far, at most the last RING."""
+        recorded = int(self._memory.words[ec.RECORDED])
+        times = self._memory.words[ec.TIMES_AT: ec.TIMES_AT + 6 * RING].reshape(-1, 6)
+        rows = times[np.arange(max(0, recorded - RING), recorded) % RING]
+        return CycleRecord(*rows.T)
+
+
+def compile_plant(model: Model) -> tuple[int, int]:
+    """Addresses of the compiled plant for `make_memory`; some seconds for effects that were never compiled before.
+
+    Raises:
+        InputError: an effect's law that cannot be compiled.
+    """
+    with report_law_errors(model):
+        flat, record = np.array(list_state_values(model.state())), model.record()
+        code = load_stored_advance(model.effects, model.plant)
+        code.warm(flat, record)
+        read = 0
+        if any(CATALOGUE[name].port == "reading" for name in model.effects):
+            run = build_kernel(read_flat_sensors, model.effects)
+            run(flat, np.zeros(NOISES), 0.0, record)
+            read = find_function_address(run)
+    return code.find_address(), read
+
+
+@cache
+def compile_loop() -> Any:
+    """The loop, for any plant: some seconds on a new machine, half a second afterwards."""
+    run = compile_function(ec.run_emulator)
+    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+    memory.words[ec.STOP] = 1
+    run(make_closed_port(), memory)  # compiles it; the loop ends at once
+    return run
