@@ -1,0 +1,67 @@
+"""The compiled emulator in a run between processes: the rows of the embedded bus, bit for bit, whatever the faults.
+
+A heartbeat that stops is not among them: in lockstep between processes nobody watches heartbeats.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bus_stations import spec
+from rig_command import rig
+
+from fdi.trace.mcap_log import open_log
+
+FIELDS = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
+
+HEAD = """
+title = "Faults of the emulator"
+setup = [{ kind = "hold", time = 0.1 }]
+main = [{ name = "sine", kind = "sine", amplitude = 2e-3, frequency = 4.0, time = 0.5 }]
+cleanup = [{ kind = "ramp", to = 0.0, time = 0.1 }]
+load = [{ kind = "ramp", to = 2e3, time = 0.2 }]
+faults = [
+"""
+PLANT = HEAD + """
+  { kind = "parameter", parameter = "filter.clogging", value = 0.3, start = 0.05, end = 0.4, ramp = 0.1 },
+  { kind = "parameter", parameter = "spool.static_friction", value = 30, start = 0.1, end = 0.3 },
+  { kind = "offset", signal = "xj", value = 1e-4, start = 0.05, end = 0.2, ramp = 0.05 },
+  { kind = "noise", signal = "xj", value = 1e-5, start = 0.1, end = 0.3 },
+  { kind = "noise", signal = "xs", value = 1e-6, start = 0.2, ramp = 0.1 },
+  { kind = "stuck", signal = "p12", start = 0.2, end = 0.25 },
+  { kind = "stuck", signal = "xs", start = 0.3, end = 0.32, value = 1e-4 },
+]
+"""
+FRAMES = HEAD + """
+  { kind = "lost", frame = "drive", start = 0.05, end = 0.1, every = 7 },
+  { kind = "lost", frame = "feedback", start = 0.1, end = 0.12, every = 9 },
+  { kind = "late", frame = "feedback", start = 0.12, end = 0.2, delay = 3e-4, probability = 0.2 },
+  { kind = "late", frame = "feedback", start = 0.2, end = 0.25, delay = 2.5e-3, every = 6 },
+  { kind = "late", frame = "feedback", start = 0.25, end = 0.3, delay = 1e-3, every = 6 },
+  { kind = "late", frame = "drive", start = 0.3, end = 0.35, delay = 3e-4, every = 3 },
+  { kind = "late", frame = "drive", start = 0.35, end = 0.4, delay = 1.5e-3, every = 9 },
+  { kind = "late", frame = "valve_state", start = 0.42, end = 0.45, delay = 3e-4, every = 3 },
+]
+"""
+
+
+def read_rows(folder: Path) -> list[tuple[str, ...]]:
+    """All cycles in the log as texts, in which NaN equals NaN."""
+    columns = open_log(folder / "trace.mcap").read_columns("/signals")
+    return [tuple(map(str, row)) for row in zip(*(columns[name].tolist() for name in FIELDS), strict=True)]
+
+
+@pytest.mark.parametrize("sequence", ["preflight", "clogging_in_flight", "lost_frames", PLANT, FRAMES],
+                         ids=["preflight", "clogging_in_flight", "lost_frames", "plant", "frames"])
+@pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
+def test_the_rows_are_those_of_the_embedded_bus(bus_kind: str, sequence: str, tmp_path: Path) -> None:
+    name = sequence
+    if "\n" in sequence:
+        name = str(tmp_path / "sequence.toml")
+        Path(name).write_text(sequence)
+    said = [rig("run", name, "--seed", 3, "--bus", bus, "--out", tmp_path / folder, "--quiet").status
+            for folder, bus in (("here", "embedded"), ("there", spec(bus_kind)))]
+    here, there = read_rows(tmp_path / "here"), read_rows(tmp_path / "there")
+    assert len(here) == len(there) >= 700
+    assert [(a, b) for a, b in zip(here, there, strict=True) if a != b] == []
+    assert said[0] == said[1]
