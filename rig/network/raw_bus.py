@@ -254,10 +254,24 @@ def _find_time(port: Port) -> int:
     now = read_clock(port)
     t_ns = now
     if wall >= 0:
-        t_ns = _integer(wall) - (_read_wall_clock(port) - now)
+        t_ns = _integer(wall) - _find_clock_distance(port)
     t_ns = max(min(t_ns, now), _integer(words[_LATEST]))
     words[_LATEST] = t_ns
     return t_ns
+
+
+def _find_clock_distance(port: Port) -> int:
+    """Wall clock minus monotonic clock, ns. A thread that is interrupted between the two readings reads them again."""
+    distance, shortest = 0, NEVER
+    for _ in range(5):
+        before = read_clock(port)
+        wall = _read_wall_clock(port)
+        taken = read_clock(port) - before
+        if taken < shortest:
+            distance, shortest = wall - before - taken // 2, taken
+        if taken < 5_000:
+            break
+    return distance
 
 
 def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
