@@ -119,6 +119,17 @@ class Log:
         table = table[np.argsort(table["time_ns"], kind="stable")]
         return {name: table[name].copy() for name in dtype.names or () if not name.startswith(".")}
 
+    def list_raw_messages(self) -> Iterator[tuple[int, int, bytes]]:
+        """(channel, log time in ns, data) of every message, in the order of the file.
+
+        Raises:
+            InputError: a chunk that is damaged.
+        """
+        with self.path.open("rb") as stream:
+            for index in self._chunks:
+                for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
+                    yield channel, time_ns, data
+
     def units(self, topic: str) -> dict[str, str]:
         """Field -> unit, from the channel's metadata."""
         return {key.removeprefix("unit."): value for channel in self.channels.values() if channel.topic == topic

@@ -45,8 +45,8 @@ def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin
     """
     rng, problems = np.random.default_rng(seed), []
     verdict, growth = "", {}
-    with tempfile.TemporaryDirectory(prefix="eha-rig-study-") as place, start_nodes(f"udp_multicast:{group}", group,
-                                                                                    controller) as nodes:
+    with (tempfile.TemporaryDirectory(prefix="eha-rig-study-") as place,
+          start_nodes(f"udp_multicast:{group}", controller) as nodes):
         own = {name: number for name, number in nodes.items() if name != "rig"}
         try:
             _play(group, Path(place))

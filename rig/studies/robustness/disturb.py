@@ -144,10 +144,11 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
             wait_until(lambda: bool(watcher.first_sync) or rig.poll() is not None, 120.0)
         threading.Event().wait(delay)
         moment = (clock.now() - watcher.first_sync) * 1e-9 if watcher.first_sync else float("nan")
-        _disturb(action, victim, rig, group, folder, pause)
+        is_done = _disturb(action, victim, rig, group, folder, pause)
         disturbed = clock.now()
-        if not wait_until(lambda: rig.poll() is not None, limit):
-            problems.append(f"the rig has not ended {limit:g} s later")
+        patience = limit if is_done else 4.0 * limit  # a process that was not there yet: the run goes on as usual
+        if not wait_until(lambda: rig.poll() is not None, patience):
+            problems.append(f"the rig has not ended {patience:g} s later")
         status = -1 if rig.poll() is None else rig.returncode
         if not wait_until(lambda: not find_processes(group), 10.0):
             problems.append(f"left: {', '.join(name for _, name in find_processes(group))}")
@@ -180,12 +181,12 @@ def _start_rig(place: Path, group: str, pace: str, controller: str, most: int | 
                                 preexec_fn=None if most is None else partial(limit_files, most))
 
 
-def _disturb(action: str, victim: str, rig: subprocess.Popen[bytes], group: str, folder: Path, pause: float) -> None:
-    """Do it. A process that is not there yet, or not any more, is left alone."""
+def _disturb(action: str, victim: str, rig: subprocess.Popen[bytes], group: str, folder: Path, pause: float) -> bool:
+    """Do it; False where the process is not there yet, or not any more."""
     if action == "remove folder":
         shutil.rmtree(folder, ignore_errors=True)
     if action not in ("kill", "stop"):
-        return
+        return action == "remove folder"
     found = [process for process, name in find_processes(group) if name == victim and process != rig.pid]
     processes = [rig.pid] if victim == "rig" else found[:1]
     for process in processes if rig.poll() is None else ():
@@ -194,6 +195,8 @@ def _disturb(action: str, victim: str, rig: subprocess.Popen[bytes], group: str,
             if action == "stop":
                 threading.Event().wait(pause)
                 os.kill(process, signal.SIGCONT)
+            return True
+    return False
 
 
 def _judge_output(file: Path, status: int, problems: list[str], *, is_killed: bool) -> str:

@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rig.firmware.build import build_controller
-from rig.studies.robustness.disturb import find_processes, wait_until
+from rig.network.bus import open_can
+from rig.network.clock import WallClock
+from rig.network.link import Link
+from rig.studies.robustness.disturb import wait_until
 from rig.studies.robustness.fuzz import PAGE
 
 
@@ -23,16 +26,23 @@ class Usage(NamedTuple):
 
 
 @contextlib.contextmanager
-def start_nodes(bus: str, group: str, controller: str) -> Iterator[dict[str, int]]:
+def start_nodes(bus: str, controller: str) -> Iterator[dict[str, int]]:
     """Plant and controller as processes; their numbers, and that of this process, by name."""
     commands = [[sys.executable, "-m", "rig.cli.main", "node", name, "--bus", bus, "--quiet"]
                 for name in (("plant", "controller") if controller == "builtin" else ("plant",))]
     if controller == "c":
         commands.append([str(build_controller()), bus])
+    booted: set[int] = set()
+    link = Link(open_can(bus), WallClock().now)
+
+    def is_ready() -> bool:
+        booted.update(frame.cob_id for frame in link.poll() if frame.data == b"\0")
+        return {0x702, 0x703} <= booted
+
     children = [subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL) for words in commands]
     try:
-        wait_until(lambda: len(find_processes(group)) == 2, 30.0)
-        wait_until(lambda: any(child.poll() is not None for child in children), 5.0)  # to load and boot
+        wait_until(is_ready, 120.0)
+        link.close()
         yield {"rig": os.getpid(), "plant": children[0].pid, "controller": children[1].pid}
     finally:
         for child in children:

@@ -30,6 +30,9 @@ def _tabulate_frames(figures: Mapping[str, Any]) -> list[Item]:
         rows.append(["UDP, datagrams", str(datagrams["datagrams"]), str(len(datagrams["problems"])),
                      Cell("yes", "good") if datagrams["verdict"] == "PASS" else Cell("NO", "bad"),
                      f"{max(datagrams['growth'].values(), default=0) / 1e6:.1f}"])
+    logs = figures["logs"]
+    if logs:
+        rows.append(["changed logs", str(logs["logs"]), str(len(logs["failures"])), "", ""])
     columns = [Column("into"), Column("frames", align="right"), Column("exceptions", align="right"),
                Column("works afterwards"), Column("more memory", "MB", "right")]
     return [Table(columns, rows, "Valid, mutated and random frames. Afterwards a node boots, answers SDO and takes "

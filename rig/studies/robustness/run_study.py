@@ -2,15 +2,22 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fdi.progress import Progress
+from fdi.progress import Progress, ignore_progress
+from plant.model import load_model
+from rig.run.job import Job
+from rig.run.runner import run_job
+from rig.sequences.sequence import parse_sequence
 from rig.studies.robustness.datagrams import fuzz_datagrams
-from rig.studies.robustness.disturb import ACTIONS, PROCESSES, Trial, disturb_run
+from rig.studies.robustness.disturb import ACTIONS, PROCESSES, SEQUENCE, Trial, disturb_run
 from rig.studies.robustness.fuzz import fuzz_node, fuzz_rig
+from rig.studies.robustness.logs import LogCount, fuzz_logs
 from rig.studies.robustness.soak import soak_bench
 
 MOST_GROWTH = 16 << 20  # bytes of memory that invented frames may cost
@@ -21,7 +28,7 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     """Run the study; its figures, with all that went wrong as "problems".
 
     Args:
-        frames: invented frames for each node; a tenth as many datagrams.
+        frames: invented frames for each node; a tenth as many datagrams, a thousandth as many changed logs.
         trials: disturbed runs of each kind.
         minutes: of long work; 0 for none.
         seed: of frames and moments.
@@ -41,6 +48,8 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     if datagrams and datagrams.verdict != "PASS":
         problems.append(f"invented datagrams: a run afterwards is {datagrams.verdict or 'impossible'}")
     problems += [f"invented datagrams: {problem}" for problem in (datagrams.problems if datagrams else ())]
+    logs = _study_logs(frames // 1000, seed, progress) if frames >= 1000 else None
+    problems += [f"changed logs: {failure}" for failure in (logs.failures if logs else ())]
     rows = []
     kinds = list(_list_kinds())
     for i, (action, victim) in enumerate(kinds):
@@ -56,7 +65,17 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     if soak:
         problems += [f"long work: {problem}" for problem in (*soak.problems, *soak.find_growth())]
     return {"frames": [count._asdict() for count in counts], "datagrams": datagrams._asdict() if datagrams else None,
-            "disturbed": rows, "soak": _describe_soak(soak._asdict()) if soak else None, "problems": problems}
+            "logs": logs._asdict() if logs else None, "disturbed": rows,
+            "soak": _describe_soak(soak._asdict()) if soak else None, "problems": problems}
+
+
+def _study_logs(count: int, seed: int, progress: Progress) -> LogCount:
+    """Changed logs of a short run on the embedded bus."""
+    job = Job(sequence=parse_sequence(SEQUENCE.replace("time = 3.0", "time = 0.3"), "s.toml", lambda name: b""),
+              model=load_model())
+    with tempfile.TemporaryDirectory(prefix="eha-rig-study-") as place:
+        run_job(job, Path(place) / "run", ignore_progress, lambda: False)
+        return fuzz_logs(Path(place) / "run" / "trace.mcap", Path(place), count, seed, progress)
 
 
 def _list_kinds() -> Iterator[tuple[str, str]]:

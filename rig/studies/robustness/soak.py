@@ -54,7 +54,7 @@ def soak_bench(minutes: float, group: str, pace: str = "lockstep", controller: s
     runs = cycles = 0
     start: dict[str, Usage] = {}
     problems = []
-    with tempfile.TemporaryDirectory(prefix="eha-rig-soak-") as place, start_nodes(bus, group, controller) as nodes:
+    with tempfile.TemporaryDirectory(prefix="eha-rig-soak-") as place, start_nodes(bus, controller) as nodes:
         while clock.now() < minutes * 60e9 or runs < 2:
             outcome = run_job(job, Path(place) / "run", ignore_progress, lambda: False)
             verdicts[outcome.verdict] = verdicts.get(outcome.verdict, 0) + 1

@@ -5,14 +5,16 @@ from pathlib import Path
 
 import pytest
 from c_device import CFirmware
+from short_sequences import job, play
 
 from rig.network.frame import Frame, Send
 from rig.nodes.firmware import Firmware
 from rig.studies.robustness import fuzz
 from rig.studies.robustness.datagrams import fuzz_datagrams
-from rig.studies.robustness.disturb import disturb_run, find_processes, has_semaphores
+from rig.studies.robustness.disturb import PROCESSES, disturb_run, find_processes, has_semaphores
 from rig.studies.robustness.frames import invent_frames
 from rig.studies.robustness.fuzz import fuzz_node, fuzz_rig
+from rig.studies.robustness.logs import fuzz_logs
 from rig.studies.robustness.nodes import Usage
 from rig.studies.robustness.report import build_robustness_report
 from rig.studies.robustness.run_study import run_study
@@ -68,7 +70,7 @@ def test_invented_datagrams_on_the_udp_bus() -> None:
     assert count.verdict == "PASS" and count.problems == () and max(count.growth.values()) < 16 << 20
 
 
-@pytest.mark.parametrize("victim", ["rig"])
+@pytest.mark.parametrize("victim", PROCESSES)
 def test_a_killed_process(victim: str) -> None:
     trial = disturb_run("kill", victim, 11)
     assert trial.problems == () and trial.cycles > 0 and trial.end < 30.0, trial
@@ -95,3 +97,11 @@ def test_the_study_as_a_whole(tmp_path: Path) -> None:
     assert report.verdict == "PASS" and len(report.sections) == 4
     assert not has_semaphores("239.1.1.1") and not find_processes("239.1.1.1")
     assert build_robustness_report({**figures, "problems": ["it hung"]}).verdict == "FAIL"
+
+
+def test_changed_logs(tmp_path: Path) -> None:
+    """Some are still good enough to be read; the others are refused, and nothing else happens."""
+    play(job(), tmp_path / "run")
+    count = fuzz_logs(tmp_path / "run" / "trace.mcap", tmp_path, 60, 10)
+    assert count.failures == () and count.accepted["recover"] > 50
+    assert 10 < count.accepted["report"] < 50 and count.accepted["report"] + count.refused["report"] == 60
