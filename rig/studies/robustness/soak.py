@@ -8,11 +8,14 @@ from typing import NamedTuple
 from fdi.progress import Progress, ignore_progress
 from plant.model import load_model
 from rig.network.clock import WallClock
+from rig.network.master import BusError
 from rig.run.job import Job
 from rig.run.runner import run_job
 from rig.sequences.sequence import parse_sequence
 from rig.studies.robustness.disturb import SEQUENCE, find_processes, has_semaphores
 from rig.studies.robustness.nodes import Usage, read_usage, start_nodes
+
+NO_ANSWER = "no answer"
 
 
 class Soak(NamedTuple):
@@ -56,13 +59,18 @@ def soak_bench(minutes: float, group: str, pace: str = "lockstep", controller: s
     problems = []
     with tempfile.TemporaryDirectory(prefix="eha-rig-soak-") as place, start_nodes(bus, controller) as nodes:
         while clock.now() < minutes * 60e9 or runs < 2:
-            outcome = run_job(job, Path(place) / "run", ignore_progress, lambda: False)
-            verdicts[outcome.verdict] = verdicts.get(outcome.verdict, 0) + 1
-            runs, cycles = runs + 1, cycles + outcome.timing["cycles"]
+            try:
+                outcome = run_job(job, Path(place) / "run", ignore_progress, lambda: False)
+                verdict, cycles = outcome.verdict, cycles + outcome.timing["cycles"]
+            except BusError:  # a busy machine: the nodes did not answer in time
+                verdict = NO_ANSWER
+            runs, verdicts[verdict] = runs + 1, verdicts.get(verdict, 0) + 1
             if not start and clock.now() > minutes * 6e9:
                 start = read_usage(nodes)
             progress("soak", min(1.0, clock.now() / (minutes * 60e9)))
         end = read_usage(nodes)
+    if verdicts.get(NO_ANSWER, 0) > 0.1 * runs:
+        problems.append(f"in {verdicts[NO_ANSWER]} of {runs} runs the nodes did not answer in time")
     if find_processes(group):
         problems.append("processes are left")
     if has_semaphores(group):
