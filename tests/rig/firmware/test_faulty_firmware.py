@@ -52,8 +52,8 @@ def bus_with_plant(request: pytest.FixtureRequest) -> Iterator[str]:
         yield where
 
 
-def wait_for_node(where: str, node: int, seconds: float = 60.0) -> None:
-    """Until a node has sent a heartbeat: the plant may compile its model before."""
+def wait_for_node(where: str, node: int, seconds: float = 300.0) -> None:
+    """Until a node has sent a heartbeat: the plant may compile its model and its cycle before."""
     link, heard, end = Link(open_can(where), time.monotonic_ns), set[int](), time.monotonic() + seconds
     while 0x700 + node not in heard and time.monotonic() < end:
         heard |= {frame.cob_id for frame in link.poll(0.1)}
@@ -64,7 +64,8 @@ def wait_for_node(where: str, node: int, seconds: float = 60.0) -> None:
 def play_short(folder: Path, where: str, fault: str, seed: int = 1) -> Outcome:
     """A short run in lockstep against the firmware that is on the bus."""
     text = LONG if fault == "no_heartbeat" else SHORT
-    return play(job(text, seed=seed, controller="external", plant="external", bus=where), folder)
+    patience = "" if fault == "slow_start" else "[timing]\noperational = 20\n"  # the machine may be busy
+    return play(job(text + patience, seed=seed, controller="external", plant="external", bus=where), folder)
 
 
 def list_failed(outcome: Outcome) -> list[str]:
