@@ -118,7 +118,7 @@ def test_bad_input_names_the_file(tmp_path: Path, runs: dict[str, Path]) -> None
         fdi.compare(tmp_path / "nowhere.csv")
     with pytest.raises(InputError, match="xq"):
         fdi.compare(runs["est"], signals=["xq"])
-    with pytest.raises(InputError, match="nosuch: expected one of"):
+    with pytest.raises(InputError, match="nosuch: expected an effect of the catalogue"):
         fdi.add_effect("nosuch", runs["est"])
     with pytest.raises(InputError, match="path"):
         fdi.compare(runs["est"]).write_html(tmp_path / "none" / "page.html")
