@@ -353,7 +353,7 @@ class Target:
 
 
 def read_error_code(frame: Frame) -> int:
-    """The error code of an emergency, -1 for a frame that is none."""
+    """The error code of an emergency; -1 for a frame of another kind."""
     return int.from_bytes(frame.data[:2], "little") if len(frame.data) == 8 else -1
 
 

@@ -287,15 +287,13 @@ class Master:
             self._command_node(node, command)
 
     def _command_node(self, node: int, command: NmtCommand) -> None:
-        self._send_nmt(node, int(command))
+        """Send it without the library, which fails after a heartbeat with a state that does not exist."""
+        self.send(0x000, bytes((command, node)))
 
     def reset_controller(self, reset: str) -> None:
         """Send the controller an NMT reset, "node" or "communication", and do not wait."""
-        self._send_nmt(CONTROLLER, {"node": 129, "communication": 130}[reset])
-
-    def _send_nmt(self, node: int, command: int) -> None:
-        """Send an NMT command; not by the library, which fails after a heartbeat with a state that does not exist."""
-        self.send(0x000, bytes((command, node)))
+        commands = {"node": NmtCommand.RESET_NODE, "communication": NmtCommand.RESET_COMMUNICATION}
+        self._command_node(CONTROLLER, commands[reset])
 
     def read_gains(self) -> Gains | None:
         """The gains of the controller (object 0x2110); None if it does not have them."""

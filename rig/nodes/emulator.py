@@ -7,6 +7,7 @@ bus time and begins exactly in the cycle that the sequence gives.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from math import isfinite
 from typing import cast
 
@@ -26,6 +27,20 @@ MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 _NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
 _HEARTBEAT = 0x700 + NODE
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
+
+
+def accept_scenario(device: Device, data: bytes, load: Callable[[Scenario], None]) -> None:
+    """Load a scenario that was downloaded to object 0x2210.
+
+    Raises:
+        SdoAbort: the node is OPERATIONAL, or the bytes are no scenario that can be run.
+    """
+    if device.state is NmtState.OPERATIONAL:
+        raise SdoAbort(Abort.STATE)
+    try:
+        load(Scenario.from_bytes(data))
+    except InputError as error:
+        raise SdoAbort(Abort.VALUE) from error
 
 
 class Emulator:
@@ -165,14 +180,8 @@ class Emulator:
             self._restart()
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        if index != SCENARIO:
-            return
-        if self.device.state is NmtState.OPERATIONAL:
-            raise SdoAbort(Abort.STATE)
-        try:
-            self.load_scenario(Scenario.from_bytes(data))
-        except InputError as error:
-            raise SdoAbort(Abort.VALUE) from error
+        if index == SCENARIO:
+            accept_scenario(self.device, data, self.load_scenario)
 
     def _on_sync(self) -> None:
         """The drive that came last is latched: judge it, read the transducers, leave the rest until they are sent."""

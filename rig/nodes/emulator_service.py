@@ -19,19 +19,19 @@ from dbc import EDS
 from plant import Model
 from plant.compile import compile_function
 from plant.effects import CATALOGUE
-from plant.errors import InputError, RigError
+from plant.errors import RigError
 from plant.flat import list_state_values
 from plant.machine_code import find_function_address
 from plant.model import build_kernel
 from plant.run import load_stored_advance, report_law_errors
 from plant.solve import NOISES, read_flat_sensors
-from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
+from rig.device import Device, EmcyCode, ErrorRegister, NmtState
 from rig.network import codec
 from rig.network.frame import Frame, Send
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.cycle_record import RING, CycleRecord, encode_cycle_record
-from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, Emulator
+from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, Emulator, accept_scenario
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import Plan, Schedule
@@ -218,14 +218,8 @@ class EmulatorService:
             self._bus.wake()
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
-        if index != SCENARIO:
-            return
-        if self.device.state is NmtState.OPERATIONAL:
-            raise SdoAbort(Abort.STATE)
-        try:
-            self.load_scenario(Scenario.from_bytes(data))
-        except InputError as error:
-            raise SdoAbort(Abort.VALUE) from error
+        if index == SCENARIO:
+            accept_scenario(self.device, data, self.load_scenario)
 
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the loop's own error."""
