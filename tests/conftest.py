@@ -16,6 +16,12 @@ def bus_kind(request: pytest.FixtureRequest) -> str:
     return require_bus_kind(request.param)
 
 
+@pytest.fixture(params=["udp_multicast", "socketcan"])
+def bus_kind_between_programs(request: pytest.FixtureRequest) -> str:
+    """As `bus_kind`, without the back ends inside one process."""
+    return require_bus_kind(request.param)
+
+
 @pytest.fixture(scope="session")
 def preflight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a real preflight run, not to be written to."""

@@ -22,9 +22,11 @@ def read_rows(folder: Path) -> list[bytes]:
         return [m.data for _, _, m in make_reader(stream).iter_messages(topics=["/signals"])]
 
 
-def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(tmp_path: Path, preflight: Path) -> None:
+def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(
+    tmp_path: Path, preflight: Path, bus_kind_between_programs: str
+) -> None:
     skip_without_compiler()
-    where = spec("udp_multicast")
+    where = spec(bus_kind_between_programs)
     said = rig("run", "--controller", "c", "--bus", where, "--json", "--out", tmp_path)
     assert said.status == 0, said.err
     assert said.json["verdict"] == "PASS"
