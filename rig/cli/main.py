@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from plant.errors import RigError, escape_control_characters
@@ -77,7 +78,38 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit status."""
+    """Run one command; return the exit status. Without `argv` it is the program, which ends right after this."""
+    if argv is None:
+        return leave_quickly()(run_command_line(sys.argv[1:]))
+    return run_command_line(argv)
+
+
+def leave_quickly() -> Callable[[int], int]:
+    """Let the program end without taking its modules apart, which takes up to a second with compiled code in memory.
+
+    The function returned takes the exit status and returns it. Everything registered with `atexit` after this call
+    still runs.
+    """
+    known: list[int] = []
+
+    def leave() -> None:
+        if not known:  # an exception or sys.exit ends the program: Python finds the status
+            return
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none
+                stream.flush()
+        os._exit(known[0])
+
+    def note(status: int) -> int:
+        known.append(status)
+        return status
+
+    atexit.register(leave)
+    return note
+
+
+def run_command_line(argv: Sequence[str]) -> int:
+    """Run the command of a command line; return its exit status."""
     args = build_parser().parse_args(argv)
     status: int = 0
     try:

@@ -8,7 +8,8 @@
 /* client command specifiers */
 enum { DOWNLOAD_SEGMENT, DOWNLOAD, UPLOAD, UPLOAD_SEGMENT, ABORT, NOTHING_OPEN = 0xFF };
 
-static const int64_t TIMEOUT_NS = 1000000000; /* between two requests of one transfer */
+/* between two requests of one transfer: a client on a busy machine may stand still */
+static const int64_t TIMEOUT_NS = 30000000000;
 
 void sdo_reset(struct sdo_server *sdo)
 {

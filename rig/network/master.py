@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Container
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import canopen
 from canopen.emcy import EmcyError
@@ -35,11 +35,20 @@ RECORD = 0x2212  # object of the plant
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
 _OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
+R = TypeVar("R")
+_BROKEN_OFF = (0x05030000, 0x05040000, 0x05040001)  # aborts of a server that has lost a transfer, or given it up
 NAMES = {NODE: "rig", CONTROLLER: "controller", PLANT: "plant"}
 
 
 class BusError(RigError):
     """A node does not answer, or refuses a request."""
+
+
+class StartTime(NamedTuple):
+    """Time from NMT start to OPERATIONAL, s. The heartbeat that says so may have waited `waited` s for the rig."""
+
+    seconds: float
+    waited: float = 0.0
 
 
 class _Node(canopen.RemoteNode):
@@ -83,13 +92,15 @@ class Master:
         self.states = {CONTROLLER: -1, PLANT: -1}
         self.heard_ns: dict[int, int] = {}  # node: when its last heartbeat came, by the wire's clock
         self._booted: set[int] = set()
-        self._started_ns = 0  # when the nodes were told to become OPERATIONAL
-        self._operational: dict[int, float] = {}  # node: seconds from then to the heartbeat that says OPERATIONAL
+        self._started_ns: dict[int, int] = {}  # node: when it was told to become OPERATIONAL
+        self._operational: dict[int, StartTime] = {}
         self._before: dict[tuple[int, int, int], bytes] = {}  # objects that the run changes: node, index, sub
         self._rivals: set[int] = set()  # our own COB-IDs that another node sends
         self.network = _Network(wire, self.send)
         self._nodes = {node: self._join(node) for node in (PLANT, CONTROLLER)}
-        self._beat = HeartbeatProducer(NODE, lambda cob_id, data: None if self.silent else self.send(cob_id, data))
+        self._beat = HeartbeatProducer(NODE, self._send_heartbeat)
+        self._beat_ns = self._last_pause_ns = 0  # when the rig's own heartbeat was sent; the time between the last two
+        self._limit_ns = 0  # after which the nodes miss it
         self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
         self._state = NmtState.PRE_OPERATIONAL
         # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
@@ -108,10 +119,30 @@ class Master:
         if state == NmtState.INITIALISING:
             self._booted.add(node)
         if state == NmtState.OPERATIONAL:
-            self._operational.setdefault(node, (self.wire.clock.now() - self._started_ns) * 1e-9)
+            seconds = (self.wire.clock.now() - self._started_ns.get(node, 0)) * 1e-9
+            self._operational.setdefault(node, StartTime(seconds, min(seconds, self.wire.blind_ns * 1e-9)))
         if self.states[node] != state:
             self.states[node] = state
             self.on_state(node, state)
+
+    def _send_heartbeat(self, cob_id: int, data: bytes) -> None:
+        if self.silent:
+            self._beat_ns = 0
+            return
+        now = self.wire.clock.now()
+        self._last_pause_ns = now - self._beat_ns if self._beat_ns else 0
+        self._beat_ns = now
+        self.send(cob_id, data)
+
+    @property
+    def pause(self) -> float:
+        """The longer of the times between the rig's last two heartbeats and since the last one, s."""
+        now = self.wire.clock.now()
+        return 1e-9 * max(self._last_pause_ns, now - self._beat_ns if self._beat_ns else 0)
+
+    def is_behind(self) -> bool:
+        """Whether the rig's heartbeat paused so long that the nodes may have missed it: then the rig stood still."""
+        return 0 < self._limit_ns - HEARTBEAT * 1_000_000 < self.pause * 1e9
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Put a frame on the bus."""
@@ -219,6 +250,7 @@ class Master:
                         raise
         self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
         self._beat.configure(HEARTBEAT, self.wire.clock.now())
+        self._beat_ns, self._last_pause_ns, self._limit_ns = 0, 0, limit_ms * 1_000_000
 
     def restore(self, gone: Container[int] = ()) -> list[str]:
         """Set 0x1006 and 0x1016 back to what they were before `configure`, except in nodes that are gone.
@@ -244,13 +276,13 @@ class Master:
     def start(self) -> None:
         """Tell the nodes to become OPERATIONAL; the rig is from now on."""
         self._operational.clear()
-        self._started_ns = self.wire.clock.now()
+        self._booted.clear()
         self._command(NmtCommand.START, NmtState.OPERATIONAL)
 
-    def wait_for_operational(self, seconds: float) -> dict[int, float]:
+    def wait_for_operational(self, seconds: float) -> dict[int, StartTime]:
         """Wait until the heartbeat of each node says OPERATIONAL, at most `seconds`, and slow the heartbeats down.
 
-        Returns the seconds since `start` by node; a node that did not become OPERATIONAL is missing.
+        Returns the time since `start` by node; a node that did not become OPERATIONAL is missing.
         """
         def are_operational() -> bool:
             self.tick()  # the nodes watch the rig's heartbeat meanwhile
@@ -285,6 +317,7 @@ class Master:
         self._state = state
         for node in self._nodes:
             self._command_node(node, command)
+            self._started_ns[node] = self.wire.clock.now()
 
     def _command_node(self, node: int, command: NmtCommand) -> None:
         """Send it without the library, which fails after a heartbeat with a state that does not exist."""
@@ -311,7 +344,7 @@ class Master:
         """An object's bytes; None if the node does not have it or does not answer."""
         sdo = self._nodes[node].sdo
         try:
-            data: bytes = sdo.upload(index, sub)
+            data: bytes = repeat_transfer(lambda: sdo.upload(index, sub))
         except (SdoAbortedError, SdoCommunicationError):
             return None
         return data
@@ -319,7 +352,8 @@ class Master:
     def _write(self, node: int, index: int, sub: int, value: Any) -> None:
         try:
             entry = self._nodes[node].sdo[index]
-            (entry[sub] if sub else entry).raw = value
+            variable = entry[sub] if sub else entry
+            repeat_transfer(lambda: setattr(variable, "raw", value))
         except (SdoAbortedError, SdoCommunicationError, KeyError) as error:
             raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X} sub {sub}: {error}") from error
 
@@ -327,11 +361,27 @@ class Master:
         sdo = self._nodes[node].sdo
         usual, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
         try:
-            sdo.download(index, sub, data)
+            repeat_transfer(lambda: sdo.download(index, sub, data))
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise BusError(f"node {node} ({NAMES[node]}), object 0x{index:04X}: {error}") from error
         finally:
             sdo.RESPONSE_TIMEOUT = usual
+
+
+def repeat_transfer(transfer: Callable[[], R], attempts: int = 3) -> R:
+    """Make an SDO transfer, and repeat it when the server has lost it: one of the two may have stood still meanwhile.
+
+    Raises:
+        SdoAbortedError: the server refuses, or has lost the last attempt too.
+        SdoCommunicationError: no answer.
+    """
+    for _ in range(attempts - 1):
+        try:
+            return transfer()
+        except SdoAbortedError as error:
+            if error.code not in _BROKEN_OFF:
+                raise
+    return transfer()
 
 
 assert firmware.NODE == CONTROLLER

@@ -38,6 +38,7 @@ class CheckedSdoClient(SdoClient):
     abort by the server SdoAbortedError.
     """
 
+    RESPONSE_TIMEOUT = 1.0  # s: the node may run on the same, busy machine
     _object = bytes(3)  # index and sub-index of the transfer, as the frames carry them
     largest_upload = 1 << 24  # bytes; a server that never ends an upload must not fill the memory
 

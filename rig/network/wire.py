@@ -10,6 +10,7 @@ from rig.network.frame import Frame, Node, Send
 from rig.network.link import Link
 
 MS = 1_000_000  # ns
+_STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
 _PATIENCE = 5  # cycles: a node that is gone must not make clean-up last minutes
 Done = Callable[[], bool]
 
@@ -21,6 +22,8 @@ class Wire(Protocol):
     send: Send
     receive: Callable[[Frame], None]  # where incoming frames go; set by the master
     is_node_gone: Done  # whether a node will not answer any more; set by the session
+    blind_ns: int  # how long at most the frames that come in now have waited to be taken in
+    stalled_ns: int  # how long in all frames were not taken in, pauses of the cycle left out
 
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
@@ -54,6 +57,7 @@ class EmbeddedWire:
         self.clock, self._period = clock, period_ns
         self.receive: Callable[[Frame], None] = _ignore_frame
         self.is_node_gone: Done = _is_false
+        self.blind_ns = self.stalled_ns = 0
         self._bus = EmbeddedBus()
         self.send = self._bus.attach(lambda frame: self.receive(frame))
         self._nodes = [self._bus.add(make) for make in makers]
@@ -106,16 +110,18 @@ class LinkWire:
         self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _ignore_frame
         self.is_node_gone: Done = _is_false
+        self.blind_ns = self.stalled_ns = 0
+        self._looked_ns = clock.now()  # when the link was last seen to be empty
         self.send: Send = link.send
 
     def wait(self, done: Done, seconds: float) -> bool:
-        """See `Wire`."""
+        """See `Wire`. What has come when the time is over counts: this program may have stood still meanwhile."""
         end = self.clock.now() + round(seconds * 1e9)
         while not done():
             left = end - self.clock.now()
+            self.poll(min(max(left, 0) * 1e-9, 0.05))
             if left <= 0:
-                return False
-            self.poll(min(left * 1e-9, 0.05))
+                return done()
         return True
 
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
@@ -156,7 +162,14 @@ class LinkWire:
 
     def poll(self, timeout: float) -> None:
         """Pass on the frames that are waiting; if there are none, wait up to `timeout` seconds for the first."""
-        for frame in self.link.poll(timeout):
+        begin = self.clock.now()
+        frames = self.link.poll(timeout)
+        end = self.clock.now()
+        self.blind_ns = begin - self._looked_ns + max(0, end - begin - round(timeout * 1e9))
+        self._looked_ns = end
+        if self.blind_ns > _STALL:
+            self.stalled_ns += self.blind_ns
+        for frame in frames:
             self.receive(frame)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from plant.segments import Array
 from rig.network.codec import Flags
-from rig.network.master import CONTROLLER, NAMES, NODE, PLANT
+from rig.network.master import CONTROLLER, NAMES, NODE, PLANT, StartTime
 from rig.sequences.faults import BusOff, Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.timing import PERIOD, TimingPolicy
 
@@ -61,7 +61,7 @@ class Trouble(NamedTuple):
 
     t_ns: int  # log time
     node: int
-    kind: str  # kind of the event: emcy, nmt, heartbeat, process, guard, bus, bring_up, operator
+    kind: str  # kind of the event: emcy, nmt, heartbeat, process, guard, bus, bring_up, operator; late: of the bench
     code: int  # of an EMCY; NMT state of kind nmt; else 0
     text: str
 
@@ -168,6 +168,42 @@ def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: C
     stops = [find_cycle(records, trouble.t_ns) for trouble in troubles
              if trouble.node == PLANT and not _is_communication(trouble)]
     return [*stops, records.cycles - 1] if PLANT in gone else stops
+
+
+class StartProblem(NamedTuple):
+    """Why bring-up failed. `kind` as in `Trouble`: "late" if the bench was late, "bring_up" if the node is too slow."""
+
+    node: int  # 0: the bench as a whole
+    kind: str
+    text: str
+
+
+def find_start_problem(times: Mapping[int, StartTime], limit: float) -> StartProblem | None:
+    """Who is to blame when a node was not OPERATIONAL within `limit` s of NMT start; None if all were.
+
+    The controller is blamed only if the plant was in time and the rig was there to take its heartbeat in. If both nodes
+    are too slow, the machine or the bus stood still.
+
+    Args:
+        times: of the nodes that became OPERATIONAL, by node.
+        limit: s.
+    """
+    slow = [node for node in (CONTROLLER, PLANT)
+            if node not in times or times[node].seconds - times[node].waited > limit]
+    said = {node: f"took {times[node].seconds:.2f} s" if node in times else "has not said so" for node in slow}
+    rule = f"must be OPERATIONAL within {limit:g} s of NMT start"
+    if len(slow) == 2:
+        which = ", ".join(f"node {node} {NAMES[node]} {said[node]}" for node in slow)
+        return StartProblem(0, "late", f"the bench was late in bring-up: both nodes {rule}: {which}")
+    for node in slow:
+        is_late = node == PLANT and node in times  # the plant is a part of the bench
+        kind = "late" if is_late else "bring_up"
+        return StartProblem(node, kind, f"node {node} {NAMES[node]} {rule} and {said[node]}")
+    for node, time in times.items():
+        if time.seconds > limit:
+            return StartProblem(NODE, "late", f"the rig stood still for {time.waited:.2f} s and cannot know "
+                                              f"whether node {node} {NAMES[node]} was OPERATIONAL within {limit:g} s")
+    return None
 
 
 def find_last_stop(missing: Mask) -> int:

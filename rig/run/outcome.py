@@ -16,13 +16,14 @@ from fdi.output import write_text
 from fdi.report.json import to_plain
 from plant.segments import RATE, Array
 from rig.network.identity import Identity
-from rig.network.master import NAMES
+from rig.network.master import NAMES, PLANT
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.history import History
 from rig.run.job import Job
 from rig.run.loop import Loop
 from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
+from rig.sequences.protocol import HEARTBEAT
 
 STATUS_OF_VERDICT = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
 INTERRUPTED = 130
@@ -101,15 +102,25 @@ class Outcome:
         return ""
 
     def _is_affected(self, check: CheckResult) -> bool:
-        """Whether a check saw rows that lateness of the bench changed."""
+        """Whether a check saw rows that lateness of the bench changed, or the heartbeats of a bench that was late."""
+        if check.signal == HEARTBEAT:
+            return self._is_plant_off
         first, last = (0.0 if isnan(t) else t for t in (check.t0, check.t1))
         start = self.job.scenario.plan.start
         rows = slice(start + round(first * RATE), start + round(last * RATE) if last > first else None)
         return bool(self.attribution.affected[rows].any())
 
+    @property
+    def _is_plant_off(self) -> bool:
+        """Whether the heartbeat period of the plant, a part of the bench, is wrong: then others' prove nothing."""
+        return any(check.signal == HEARTBEAT and check.name.endswith(NAMES[PLANT]) and not check.passed
+                   for check in self.checks)
+
     def _describe_first_lateness(self) -> str:
         first = min(self.attribution.disturbances, key=lambda found: found.first, default=None)
-        return f"first t = {self.find_time(first.first):.3f} s: {first.text}" if first else ""
+        if first is None:
+            return "the plant's own heartbeat was not on time" if self._is_plant_off else ""
+        return f"first t = {self.find_time(first.first):.3f} s: {first.text}"
 
     def find_time(self, cycle: int) -> float:
         """The time of a cycle, s of main."""
@@ -190,9 +201,11 @@ def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list
 
 
 def name_source(cause: Cause) -> str:
-    """Who a cause names: a node, "sequence" for a fault of the sequence, else the kind of the trouble."""
+    """Who a cause names: a node, "sequence" for a fault of the sequence, "bench", else the kind of the trouble."""
     if cause.kind == "injected":
         return "sequence"
+    if cause.is_lateness and cause.source == 0:
+        return "bench"
     return name_node(cause.source) or cause.kind
 
 

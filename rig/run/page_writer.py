@@ -1,20 +1,24 @@
 """Writes the page of a run in a process of its own, which loads matplotlib while the run is under way.
 
-Loading takes as long as drawing. In lockstep the second process uses the time and a CPU that the run leaves idle; in
-real time it would compete with the loop, and on one CPU there is nothing to gain: then the page is written here. It is
-written here as well if the second process cannot start or ends early: a run that was measured never lacks its page.
+Loading takes as long as drawing. In lockstep the second process uses the time and a CPU that the run leaves idle. In
+real time it would compete with the loop: there the run begins when the process has loaded everything and waits
+(`wait_until_loaded`). On one CPU there is nothing to gain: then the page is written here. It is written here as well if
+the second process cannot start or ends early: a run that was measured never lacks its page.
 """
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import select
 import subprocess
 import sys
 from pathlib import Path
 from types import TracebackType
 
 from plant.errors import InputError
+
+_LOADED = "loaded\n"  # what the second process says when it waits for work
 
 
 class PageWriter:
@@ -35,6 +39,13 @@ class PageWriter:
             self._process.kill()
             self._process.communicate()
 
+    def wait_until_loaded(self, seconds: float = 60.0) -> None:
+        """Wait until the second process has loaded everything, or has ended; at most that long."""
+        if self._process is not None and self._process.stdout is not None:
+            ready, _, _ = select.select([self._process.stdout], [], [], seconds)
+            if ready:
+                self._process.stdout.readline()
+
     def start_page(self, source: Path, out: Path) -> None:
         """Start to write the page of the trace `source` as the HTML file `out`; `finish_page` waits for it."""
         self._source, self._out = source, out
@@ -51,6 +62,7 @@ class PageWriter:
         """
         if self._process is not None:
             answer, _ = self._process.communicate()
+            answer = answer.removeprefix(_LOADED)
             if answer:
                 raise InputError(*json.loads(answer))
             if self._process.returncode == 0:
@@ -88,6 +100,8 @@ def main() -> None:
         figure.text(0.5, 0.5, "0")
         to_svg(figure, "none")
     load_templates().get_template("page.html")
+    with contextlib.suppress(BrokenPipeError):  # the run was killed: the next line ends this process
+        print(end=_LOADED, flush=True)
     line = sys.stdin.readline()
     if not line:
         return

@@ -38,8 +38,11 @@ from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 
 
-def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Outcome:
-    """Run a job; its log and verdict are written to `folder`.
+def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool],
+            prepare: Callable[[], object] = lambda: None) -> Outcome:
+    """Run a job; its log and verdict are written to `folder`, before the nodes that it started are stopped.
+
+    `prepare()` is called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
 
     Raises:
         RigError: bad input, a missing bus or node, or a log that cannot be written. The log is closed first.
@@ -48,40 +51,47 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         Actuator(job.scenario.model).warm()
     if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
         compile_cycle(job.realtime)
-    with lock_folder(folder), open_participants(job) as participants, open_recorder(job, folder) as recorder:
-        session = Session(job, participants, recorder, progress, stop)
-        progress("bring-up", 0.0)
-        session.bring_up()
-        assert session.loop is not None
-        stopwatch = WallClock()
-        with contextlib.ExitStack() as rights:
-            if job.realtime:
-                is_hard = session.loop.kind == "hard"  # then Python only has to keep up; the cycle's thread is above it
-                rights.enter_context(raise_priority(1 if is_hard else LOOP_PRIORITY))
-                rights.enter_context(lock_memory())
-                rights.enter_context(prevent_deep_sleep())
-                rights.enter_context(suspend_garbage_collection())
-            scheduled = name_scheduler()
-            session.run_phases()
-            scheduled = session.loop.scheduler or scheduled
-        spent = stopwatch.now() * 1e-9
-        loop = session.loop
-        kind = f"{loop.kind} real time" if job.realtime else "lockstep"
-        recorder.metadata("timing", {"kind": kind})
-        history = session.history
-        attribution = attribute_run(job, session)
-        checks = judge_run(job, session, attribution.judged)
-        for check in checks:
-            recorder.put(session.now(), _make_check_record(check))
-        outcome = Outcome(
-            job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-            interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind),
-            counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
-            attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
-            identities=session.identities)
-        recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
-                                      "timing": outcome.timing_problem})
-    outcome.save()
+    with lock_folder(folder), open_participants(job) as participants:
+        prepare()
+        with open_recorder(job, folder) as recorder:
+            outcome = play_job(job, folder, Session(job, participants, recorder, progress, stop), recorder, progress)
+        outcome.save()
+    return outcome
+
+
+def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progress: Progress) -> Outcome:
+    """Play the session of a job and judge it. Raises RigError."""
+    progress("bring-up", 0.0)
+    session.bring_up()
+    loop = session.loop
+    assert loop is not None
+    stopwatch = WallClock()
+    with contextlib.ExitStack() as rights:
+        if job.realtime:
+            is_hard = loop.kind == "hard"  # then Python only has to keep up; the cycle's thread is above it
+            rights.enter_context(raise_priority(1 if is_hard else LOOP_PRIORITY))
+            rights.enter_context(lock_memory())
+            rights.enter_context(prevent_deep_sleep())
+            rights.enter_context(suspend_garbage_collection())
+        scheduled = name_scheduler()
+        session.run_phases()
+        scheduled = loop.scheduler or scheduled
+    spent = stopwatch.now() * 1e-9
+    kind = f"{loop.kind} real time" if job.realtime else "lockstep"
+    recorder.metadata("timing", {"kind": kind})
+    history = session.history
+    attribution = attribute_run(job, session)
+    checks = judge_run(job, session, attribution.judged)
+    for check in checks:
+        recorder.put(session.now(), _make_check_record(check))
+    outcome = Outcome(
+        job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
+        interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind),
+        counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
+        attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
+        identities=session.identities)
+    recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
+                                  "timing": outcome.timing_problem})
     return outcome
 
 

@@ -19,6 +19,7 @@ from fdi.progress import Progress
 from plant.errors import InputError
 from plant.profile import Profile, build_profile
 from plant.segments import RATE, Hold
+from rig.device.emcy import EmcyCode
 from rig.device.nmt import NmtState
 from rig.network import codec
 from rig.network.clock import WallClock
@@ -32,7 +33,7 @@ from rig.nodes.cycle_record import CycleRecord
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
-from rig.run.attribution import Mask, Trouble
+from rig.run.attribution import Mask, Trouble, find_start_problem
 from rig.run.hard_loop import open_loop
 from rig.run.history import History
 from rig.run.job import Job
@@ -60,13 +61,15 @@ from rig.run.probe import (
 from rig.run.processes import describe_exit
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import GuardWatch
-from rig.sequences.protocol import Emergency, ProtocolRecord, Rows
+from rig.sequences.protocol import Emergency, Heartbeat, ProtocolRecord, Rows
 from rig.sequences.run_data import DriveFrames
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
 _SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of their errors
 _MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
+_ENDS_BRING_UP = ("bring_up", "late")  # troubles that a run cannot go on with
+_ENDS_RUN = ("process", *_ENDS_BRING_UP)  # whatever the sequence tests, it needs its nodes
 _ENABLING_STEPS = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
 
 
@@ -106,10 +109,11 @@ class Session:
         self._after = History()  # the probe after clean-up
         self._is_probing = False  # before set-up: nothing that happens there ends the run
         self._emergencies: list[Emergency] = []
-        self._heartbeats: dict[int, list[int]] = {node: [] for node in (CONTROLLER, PLANT)}  # ns
+        self._heartbeats: dict[int, list[Heartbeat]] = {node: [] for node in (CONTROLLER, PLANT)}
         self._gains: firmware.Gains | None = None  # object 0x2110 of the controller, if it has it
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self._begun_ns = 0  # when the nodes were started for the run
+        self._stalled_ns = 0  # how long the rig had not received before that
         self.aborted = ""  # why main ended early
         self.interrupted = False
         self.safe = False  # no current from here on, until clean-up
@@ -133,7 +137,8 @@ class Session:
         self._master.on_frame = self._keep_drive if job.sequence.disturbs_bus else recorder.frame
         self._master.on_emcy = self._emcy
         self._master.on_state = self._state
-        self._master.on_heartbeat = lambda node, t_ns: self._heartbeats[node].append(t_ns)
+        self._master.on_heartbeat = lambda node, t_ns: self._heartbeats[node].append(
+            Heartbeat(t_ns * 1e-9, wire.blind_ns * 1e-9))
         self._master.on_lost = self._handle_silence
         self._master.on_rival = lambda cob_id: self._handle_trouble(
             "bus", f"another node sends 0x{cob_id:03X}, a frame of node {NODE} {NAMES[NODE]}")
@@ -211,6 +216,7 @@ class Session:
         for times in self._heartbeats.values():
             times.clear()
         self._begun_ns, self._playing = self._clock.now(), True
+        self._stalled_ns = self._master.wire.stalled_ns
 
     def _start_nodes(self, scenario: Scenario) -> None:
         """Reset, identify, configure and start the nodes. Raises BusError and InputError."""
@@ -302,8 +308,9 @@ class Session:
         return ProtocolRecord(
             run=run, probes=[select_last(read(probe)) for probe in self._probes if len(probe)],
             after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
-            heartbeats={NAMES[node]: [t_ns * 1e-9 for t_ns in times] for node, times in self._heartbeats.items()},
-            heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9), heartbeat_period=HEARTBEAT * 1e-3,
+            heartbeats={NAMES[node]: times for node, times in self._heartbeats.items()},
+            heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9),
+            deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9, heartbeat_period=HEARTBEAT * 1e-3,
             current_limit=model["controller.current_limit"] if self._gains is None else self._gains.current_limit,
             gains=None if has_firmware_effects(model) else self._gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)
@@ -330,16 +337,13 @@ class Session:
 
         A node that is too slow is given three times the limit, so that the time it needs is known.
         """
-        self.start_times = self._master.wait_for_operational(3 * limit)
-        for node in (CONTROLLER, PLANT):
-            seconds = self.start_times.get(node)
-            name = f"node {node} {NAMES[node]}"
-            if seconds is not None:
-                self.log_event("INFO", "nmt", f"{name} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
-            if seconds is None or seconds > limit:
-                was = "has not said so" if seconds is None else f"took {seconds:.2f} s"
-                self._handle_trouble(
-                    "bring_up", f"{name} must be OPERATIONAL within {limit:g} s of NMT start and {was}", node)
+        times = self._master.wait_for_operational(3 * limit)
+        self.start_times = {node: time.seconds for node, time in times.items()}
+        for node, seconds in sorted(self.start_times.items()):
+            self.log_event("INFO", "nmt",
+                           f"node {node} {NAMES[node]} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
+        if problem := find_start_problem(times, limit):
+            self._handle_trouble(problem.kind, problem.text, problem.node)
 
     def run_phases(self) -> None:
         """Run set-up, main and clean-up. Whatever is raised, clean-up runs and the nodes are stopped."""
@@ -369,7 +373,7 @@ class Session:
     def _choose_cleanup(self) -> Profile:
         """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
         self._next_look = 0
-        if self._is_node_gone() or any(trouble.kind == "bring_up" for trouble in self.troubles):
+        if self._is_node_gone() or any(trouble.kind in _ENDS_BRING_UP for trouble in self.troubles):
             self._powered = self._may_power = False
             return build_profile((Hold(time=0.1),), self._demand)
         return self.job.sequence.cleanup_profile(self._demand)
@@ -467,10 +471,10 @@ class Session:
 
     def _handle_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
         """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""
-        if self._is_probing and kind not in ("process", "bring_up"):
+        if self._is_probing and kind not in _ENDS_RUN:
             self.log_event("WARN", kind, f"{what} (in a probe)")
             return
-        if self._playing or self._is_probing:
+        if self._playing or kind in _ENDS_RUN:
             self._note_trouble(kind, what, node, code, t_ns)
         self.log_event("ERROR", kind, what)
         if not self.safe:
@@ -478,8 +482,7 @@ class Session:
             if self.loop:
                 self.loop.override_control(0)
             self.log_event("WARN", "safe_state", f"no current from here on: {what}")
-        is_over = kind in ("process", "bring_up")  # whatever the sequence tests, it needs its nodes
-        if (is_over or self.job.sequence.ends != "safe_state") and not self.aborted:
+        if (kind in _ENDS_RUN or self.job.sequence.ends != "safe_state") and not self.aborted:
             self._abort("abort", what)
 
     def _emcy(self, node: int, error: EmcyError) -> None:
@@ -488,6 +491,9 @@ class Session:
         if error.code & 0xFF00 == 0:
             left = "an error is gone, others stand" if error.register else "no error any more"
             self.log_event("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
+        elif error.code == EmcyCode.HEARTBEAT_LOST and self._master.is_behind():
+            self._handle_trouble("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and node {node} "
+                                         f"{NAMES[node]} reports 0x{error.code:04X}", NODE)
         else:
             self._handle_trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip(),
                                  node, error.code, round(error.timestamp * 1e9))

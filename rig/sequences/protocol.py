@@ -23,6 +23,7 @@ from rig.sequences.check import CheckResult
 Mask = NDArray[np.bool_]
 Whole = NDArray[np.int64]
 KIND = "protocol"  # of the check results
+HEARTBEAT = "heartbeat"  # the signal of those about heartbeats
 CONTROLLER = 2
 DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lists them
     2: frozenset({EmcyCode.RESET, EmcyCode.COMMUNICATION, EmcyCode.HEARTBEAT_LOST, EmcyCode.PDO_TOO_SHORT,
@@ -87,6 +88,13 @@ class Rows(NamedTuple):
     on_time: Mask
 
 
+class Heartbeat(NamedTuple):
+    """A heartbeat that the rig took in at `t`, s; it may have waited for that as long as `waited`, s."""
+
+    t: float
+    waited: float = 0.0
+
+
 class Emergency(NamedTuple):
     """An EMCY frame; `cycle` is the row of the run, negative before the first."""
 
@@ -100,16 +108,17 @@ class ProtocolRecord:
     """All that the protocol checks are judged by.
 
     `gains`: those of object 0x2110, if the controller has them and follows them. `is_response_judged`: real time, and
-    the controller is not in the rig's own process. `heartbeats`: times in s, by the name of the node; `heard`: first
-    and last time at which heartbeats could have been received.
+    the controller is not in the rig's own process. `heartbeats`: by the name of the node; `heard`: first and last time
+    at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s.
     """
 
     run: Rows
     probes: Sequence[Rows] = ()
     after: Rows | None = None
     emergencies: Sequence[Emergency] = ()
-    heartbeats: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    heartbeats: Mapping[str, Sequence[Heartbeat]] = field(default_factory=dict)
     heard: tuple[float, float] = (0.0, 0.0)
+    deaf: float = 0.0
     heartbeat_period: Second = 0.1
     current_limit: float = nan
     gains: object | None = None
@@ -341,17 +350,25 @@ def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[
 
 
 def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
-    """Median heartbeat period of each node; a run shorter than three periods says nothing about it."""
+    """Median heartbeat period of each node.
+
+    A run in which the rig could receive for less than three periods says nothing about it. Nor do heartbeats that may
+    have waited for the rig longer than the tolerance.
+    """
     begin, end = record.heard
     period, tolerance = record.heartbeat_period, limits.heartbeat
-    if end - begin < _LONGEST_PAUSE * period:
+    if end - begin - record.deaf < _LONGEST_PAUSE * period:
         return
-    for node, times in record.heartbeats.items():
-        gaps = np.diff(np.asarray(times, float))
+    for node, beats in record.heartbeats.items():
+        t, waited = np.array(beats, float).reshape(-1, 2).T
+        is_known = np.maximum(waited[1:], waited[:-1]) <= tolerance
+        gaps = np.diff(t)[is_known]
+        if len(gaps) == 0 and len(beats) > 1:
+            continue
         value = 1e3 * float(np.median(gaps)) if len(gaps) else nan
-        detail = "" if len(gaps) else f"{len(times)} heartbeats in {end - begin:.3g} s"
+        detail = "" if len(gaps) else f"{len(beats)} heartbeats in {end - begin:.3g} s"
         low, high = (round(1e3 * (period + sign * tolerance), 6) for sign in (-1, 1))
-        yield _make_result(f"heartbeat period, {node}", "heartbeat", round(value, 6), "ms", low, high, detail)
+        yield _make_result(f"heartbeat period, {node}", HEARTBEAT, round(value, 6), "ms", low, high, detail)
 
 
 def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:

@@ -61,18 +61,23 @@ def run_command(args: argparse.Namespace) -> int:
         bus, why = "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
     job = replace_settings(job, bus=bus)
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
-    with (PageWriter(in_background=not job.realtime) as pages, catch_signals() as is_to_stop,
-          announce_run(job, why, is_silent=args.json or args.quiet) as progress):
-        outcome = run_job(job, folder, progress, is_to_stop)
-        progress("report", 0.0)
-        pages.start_page(folder / "trace.mcap", folder / "report.html")
-        report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
+    with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
+        with announce_run(job, why, is_silent=args.json or args.quiet) as progress:
+            prepare = pages.wait_until_loaded if job.realtime else do_nothing
+            outcome = run_job(job, folder, progress, is_to_stop, prepare)
+            progress("report", 0.0)
+            pages.start_page(folder / "trace.mcap", folder / "report.html")
+            report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
+            if args.fdi:
+                outcome = diagnose_run(outcome, progress)
+        with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
+            show_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
         pages.finish_page()
-        if args.fdi:
-            outcome = diagnose_run(outcome, progress)
-    with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
-        show_answer(add_outcome(report, outcome), args)
     return outcome.status
+
+
+def do_nothing() -> None:
+    """What a run in lockstep waits for before it begins."""
 
 
 @contextlib.contextmanager

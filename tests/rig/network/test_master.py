@@ -114,6 +114,22 @@ def test_bring_up(wire: Wire) -> None:
     assert master.errors() == [] and not master.hears_rival(0.0)
 
 
+def test_a_rig_that_stood_still_knows_how_long_answers_may_have_waited(wire: Wire) -> None:
+    """An answer that has come while the rig stood still counts, and its time is known to be uncertain."""
+    if isinstance(wire, EmbeddedWire):
+        pytest.skip("there the nodes stand still with the rig")
+    master = Master(wire, wire.clock.now)
+    master.reset()
+    master.configure(SCENARIO, read_gains(Model()), 0, 10_000)
+    master.start()
+    threading.Event().wait(1.2)
+    times = master.wait_for_operational(0.0)  # the time to wait is over at once
+    assert set(times) == {CONTROLLER, PLANT}
+    for time in times.values():
+        assert time.seconds >= time.waited >= 1.1
+    assert wire.stalled_ns >= 1_100_000_000
+
+
 def test_who_answers(wire: Wire) -> None:
     master = Master(wire, wire.clock.now)
     assert master.is_present(PLANT, 2.0) and master.is_present(CONTROLLER, 2.0)

@@ -9,7 +9,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.master import PLANT, Master
+from rig.network.master import PLANT, Master, repeat_transfer
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import EmbeddedWire
 
@@ -47,6 +47,22 @@ def client(*script: str | None) -> tuple[CheckedSdoClient, Server]:
     sdo = master.network.nodes[PLANT].sdo
     assert isinstance(sdo, CheckedSdoClient)
     return sdo, servers[0]
+
+
+def test_a_transfer_that_the_server_has_lost_is_repeated() -> None:
+    """The server gave up a second after the first segment, and refuses the next one."""
+    begins, done = "6000100000000000", "2000000000000000"
+    sdo, server = client(begins, done, "8000100001000405", begins, done, "3000000000000000")
+    repeat_transfer(lambda: sdo.download(0x1000, 0, bytes(range(10))))
+    assert [request[:2] for request in server.requests] == ["21", "00", "19", "21", "00", "19"]
+
+
+@pytest.mark.parametrize(("code", "count"), [("00000306", 1), ("01000405", 3), ("00000405", 3)])
+def test_a_refusal_is_not_repeated_and_a_loss_not_for_ever(code: str, count: int) -> None:
+    sdo, server = client(*[f"80001000{code}"] * 4)
+    with pytest.raises(SdoAbortedError):
+        repeat_transfer(lambda: upload(sdo))
+    assert len(server.requests) == count
 
 
 def flush(sdo: CheckedSdoClient) -> None:

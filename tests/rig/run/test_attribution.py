@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rig.network.codec import Flags
-from rig.network.master import CONTROLLER, NODE, PLANT
+from rig.network.master import CONTROLLER, NODE, PLANT, StartTime
 from rig.nodes.cycle_record import CycleRecord
 from rig.run.attribution import (
     Attribution,
@@ -19,6 +19,7 @@ from rig.run.attribution import (
     count_most_in_a_row,
     find_injected,
     find_last_stop,
+    find_start_problem,
 )
 from rig.run.runner import select_plant_delays
 from rig.sequences.faults import Fault, Late, Lost, Offset, Plan, Schedule, Silent
@@ -62,6 +63,26 @@ class Script:
 def source_and_kind(found: Attribution) -> tuple[int, str]:
     assert found.cause is not None
     return found.cause.source, found.cause.kind
+
+
+@pytest.mark.parametrize(("controller", "plant", "blamed"), [
+    (StartTime(0.02), StartTime(0.01), None), (StartTime(1.0), StartTime(0.99), None),
+    (StartTime(1.5), StartTime(0.01), (CONTROLLER, "bring_up")), (None, StartTime(0.01), (CONTROLLER, "bring_up")),
+    (StartTime(1.5, 0.2), StartTime(0.01), (CONTROLLER, "bring_up")),  # the rig stood still, but not that long
+    (StartTime(1.5, 0.6), StartTime(0.01), (NODE, "late")), (StartTime(0.01), StartTime(1.3, 1.2), (NODE, "late")),
+    (StartTime(1.5), StartTime(1.4), (0, "late")), (StartTime(1.5), None, (0, "late")), (None, None, (0, "late")),
+    (StartTime(0.02), StartTime(1.4), (PLANT, "late")), (StartTime(0.02), None, (PLANT, "bring_up")),
+])
+def test_who_is_to_blame_for_a_slow_start(controller: StartTime | None, plant: StartTime | None,
+                                          blamed: tuple[int, str] | None) -> None:
+    times = {node: time for node, time in ((CONTROLLER, controller), (PLANT, plant)) if time is not None}
+    found = find_start_problem(times, 1.0)
+    assert (None if found is None else (found.node, found.kind)) == blamed
+    if found is not None and found.kind == "late":
+        script = Script()
+        script.report(0, found.node, 0, found.kind, found.text)
+        cause = script.attribute().cause
+        assert cause is not None and cause.is_lateness and cause.text == found.text
 
 
 def test_a_run_without_trouble() -> None:

@@ -53,6 +53,31 @@ def test_both_ways_write_the_same_page(preflight: Path, tmp_path: Path) -> None:
     assert (tmp_path / "here.html").read_text() == (tmp_path / "there.html").read_text()
 
 
+def test_a_run_may_wait_until_the_second_process_has_loaded(preflight: Path, tmp_path: Path) -> None:
+    """Afterwards it does nothing until there is a page to write; one that has died is not waited for."""
+    with PageWriter(in_background=True) as pages:
+        pages.wait_until_loaded()
+        assert pages._process is not None
+        spent = [read_cpu_time(pages._process.pid) for _ in range(2) if time.sleep(0.3) is None]
+        assert spent[0] == spent[1]
+        pages.start_page(preflight / "trace.mcap", tmp_path / "page.html")
+        pages.finish_page()
+        assert pages._process.returncode == 0 and is_page(tmp_path / "page.html")
+    with PageWriter(in_background=True) as pages:
+        assert pages._process is not None
+        pages._process.kill()
+        pages.wait_until_loaded()
+        pages.start_page(preflight / "trace.mcap", tmp_path / "second.html")
+        pages.finish_page()
+    assert is_page(tmp_path / "second.html")
+
+
+def read_cpu_time(pid: int) -> tuple[str, str]:
+    """CPU time of a process in clock ticks: user, system."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return words[11], words[12]
+
+
 def test_files_of_the_working_directory_are_not_imported(
     preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -308,6 +308,38 @@ def test_bring_up_waits_until_the_nodes_are_operational(tmp_path: Path, monkeypa
         assert outcome.to_json()["cause"]["source"] == "node 2 controller" and set(control_words(tmp_path)) == {0}
 
 
+def test_a_bench_that_is_late_in_bring_up_is_not_the_controllers_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both nodes come late: the machine stood still, or the bus did."""
+
+    class ReluctantPlant(Emulator):
+        def __init__(self, send: Send) -> None:
+            super().__init__(send)
+            self.waiting: list[tuple[int, Frame]] = []
+            self.take, self.work = self.receive, self.tick
+            self.receive, self.tick = self.delay, self.wait  # type: ignore[method-assign]
+
+        def delay(self, frame: Frame) -> None:
+            if frame.cob_id == 0 and frame.data == b"\x01\x03":
+                self.waiting.append((frame.t_ns + 1_400_000_000, frame))
+            else:
+                self.take(frame)
+
+        def wait(self, t_ns: int) -> None:
+            while self.waiting and self.waiting[0][0] <= t_ns:
+                self.take(self.waiting.pop(0)[1])
+            self.work(t_ns)
+
+    monkeypatch.setattr(Reluctant, "delay_ns", 1_500_000_000)
+    monkeypatch.setattr("rig.run.participants.Firmware", lambda send, model: Reluctant(send))
+    monkeypatch.setattr("rig.run.participants.Emulator", ReluctantPlant)
+    outcome = play(job(), tmp_path)
+    assert (outcome.verdict, outcome.status) == ("INVALID_TIMING", 3)
+    assert "the bench was late in bring-up: both nodes must be OPERATIONAL" in outcome.why
+    assert outcome.to_json()["cause"]["source"] == "bench" and set(control_words(tmp_path)) == {0}
+
+
 def frames_sent(folder: Path) -> list[tuple[int, bytes]]:
     from fdi.trace.mcap_log import open_log
 
