@@ -19,10 +19,11 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     """Run the calling thread under SCHED_FIFO where that is allowed; restore its priority afterwards.
 
     The process's other threads (the recorder) get the lowest real-time priority: while one of them holds the
-    interpreter lock, other programs must not keep it from going on, for the loop would wait with it.
+    interpreter lock, other programs must not keep it from going on, for the loop would wait with it. A thread that has
+    a real-time priority keeps it: a compiled loop that runs already (`enter_loop_thread`) is not to be slowed down.
     """
     others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
-    raised = [thread for thread in others if thread is not None and _set_fifo(thread, 1)]
+    raised = [thread for thread in others if thread is not None and _is_ordinary(thread) and _set_fifo(thread, 1)]
     raised += [0] if _set_fifo(0, priority) else []
     try:
         yield
@@ -107,6 +108,14 @@ def suspend_garbage_collection() -> Iterator[None]:
         sys.setswitchinterval(interval)
         if collecting:
             gc.enable()
+
+
+def _is_ordinary(thread: int) -> bool:
+    """Whether the kernel schedules a thread without real-time priority."""
+    try:
+        return os.sched_getscheduler(thread) == os.SCHED_OTHER
+    except (AttributeError, OSError):  # not Linux; or the thread has ended
+        return False
 
 
 def _set_fifo(thread: int, priority: int) -> bool:

@@ -46,6 +46,26 @@ def test_all_threads_are_raised_and_lowered() -> None:
         helper.join()
 
 
+@pytest.mark.skipif(not allowed(), reason="SCHED_FIFO is not allowed here; as root, or with an rtprio limit, it is")
+def test_a_loop_that_runs_already_keeps_its_priority() -> None:
+    entered, done = threading.Event(), threading.Event()
+
+    def run() -> None:
+        with enter_loop_thread():
+            entered.set()
+            done.wait()
+
+    loop = threading.Thread(target=run)
+    loop.start()
+    try:
+        assert entered.wait(10)
+        with raise_priority(1):
+            assert os.sched_getparam(loop.native_id or 0).sched_priority == LOOP_PRIORITY
+    finally:
+        done.set()
+        loop.join()
+
+
 @pytest.mark.skipif(len(list_cpus()) < 2, reason="one CPU is not divided")
 @pytest.mark.parametrize("from_last", [1, 2])
 def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
