@@ -20,6 +20,9 @@ interpreted, which is slow.
 
 Filters: the kernel drops frames with other COB-IDs (CAN_RAW_FILTER; on UDP a socket filter, which also drops the bus's
 own frames). What still arrives and is not a classical data frame with an 11-bit identifier is counted and dropped.
+
+System calls cost most of the time that a loop takes. `await_frame` waits inside the call that receives, which makes one
+call a frame; `receive_frame` needs three where it has to wait, and keeps its deadline to the microsecond.
 """
 from __future__ import annotations
 
@@ -60,6 +63,7 @@ KINDS = {"socketcan": SOCKETCAN, "udp_multicast": UDP}
 _KIND, _RX, _TX, _TURN, _ERROR = range(5)
 _IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
 _OWN, _COUNTS_LOSSES = 15, 16  # UDP: own port, network order; whether the kernel's count is of losses alone
+_STAMPED, _PAYLOAD_WORD, _LAST_LENGTH = 17, 18, 19  # whether kernel times are used; payload, and length of the last
 _LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
 _ID_AT, _LENGTH_AT, _DATA_AT, _TAIL = range(11, 15)  # byte offsets in the datagram to be sent; length of its end
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
@@ -77,6 +81,7 @@ _TRUNCATED = 0x20  # MSG_TRUNC
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 _RECEIVE_BUFFER = 8 << 20  # bytes asked for
+_RECEIVE_TIMEOUT = struct.pack("@qq", 0, 20_000)  # struct timeval, s and us: the longest that `await_frame` waits
 
 _recvmsg = LibraryFunction("recvmsg", "qiqi")
 _send = LibraryFunction("send", "qiqqi")
@@ -87,6 +92,7 @@ _clock_gettime = LibraryFunction("clock_gettime", "iiq")
 _clock_nanosleep = LibraryFunction("clock_nanosleep", "iiiqq")
 _errno_location = LibraryFunction("__errno_location", "q")
 _memcpy = LibraryFunction("memcpy", "qqqq")
+_memcmp = LibraryFunction("memcmp", "iqqq")
 
 
 class Port(NamedTuple):
@@ -166,25 +172,42 @@ def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int
 
     Returns (status, t_ns, cob_id, length, data): FRAME; or TIMEOUT, WOKEN or FAILED with zeros.
     """
+    while True:
+        status, t_ns, cob_id, length, data = _take_frame(port, _DONTWAIT)
+        if status != TIMEOUT or deadline_ns == 0:
+            return status, t_ns, cob_id, length, data
+        status = _wait_for_input(port, deadline_ns)
+        if status != FRAME:
+            return status, 0, 0, 0, 0
+
+
+@keep_apart
+def await_frame(port: Port) -> tuple[int, int, int, int, int]:
+    """The next frame, as `receive_frame` returns it; TIMEOUT when none has come for 20 ms. `RawBus.wake` does not end
+    the wait.
+    """
+    return _take_frame(port, 0)
+
+
+@keep_apart
+def _take_frame(port: Port, flags: int) -> tuple[int, int, int, int, int]:
+    """The next frame that is asked for: FRAME, TIMEOUT (none is waiting, or has come in time) or FAILED."""
     words = port.words
     while True:
-        size = _take_datagram(port)
+        size = _take_datagram(port, flags)
         if size >= 0:
             if words[_OWN] and words[_OWN] == _integer(port.halves[_SENDER // 4]) >> 16 & 0xFFFF:
                 continue
             kind, cob_id, length, data = _decode(port, size)
             if kind == _DATA:
-                if not port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1:
-                    continue
-                return FRAME, _find_time(port), cob_id, length, data
-            if kind == _ERROR_FRAME:
+                if port.octets[_ALLOWED + (cob_id >> 3)] >> (cob_id & 7) & 1:
+                    return FRAME, _find_time(port), cob_id, length, data
+            elif kind == _ERROR_FRAME:
                 words[_ERROR_FRAMES] += 1
             else:
                 words[_DROPPED] += 1
         elif words[_ERROR] == _EAGAIN:
-            status = _wait_for_input(port, deadline_ns)
-            if status != FRAME:
-                return status, 0, 0, 0, 0
+            return TIMEOUT, 0, 0, 0, 0
         elif words[_ERROR] != _EINTR:
             return FAILED, 0, 0, 0, 0
 
@@ -192,12 +215,12 @@ def receive_frame(port: Port, deadline_ns: int) -> tuple[int, int, int, int, int
 _DATA, _ERROR_FRAME, _OTHER = 0, 1, 2  # what came
 
 
-def _take_datagram(port: Port) -> int:
+def _take_datagram(port: Port, flags: int) -> int:
     """Its length; -1 with the reason in the port. Notes how many the kernel had to drop before it."""
     base = port.octets.ctypes.data
     port.words[(_MESSAGE + 40) // 8] = _CONTROL_SIZE
     port.words[(_MESSAGE + 8) // 8] = _SENDER_SIZE
-    size = _recvmsg(port.words[_RX], base + _MESSAGE, _DONTWAIT)
+    size = _recvmsg(port.words[_RX], base + _MESSAGE, flags)
     if size < 0:
         _note_errno(port)
     return size
@@ -253,7 +276,7 @@ def _find_time(port: Port) -> int:
         place += (size + 7) // 8 * 8
     now = read_clock(port)
     t_ns = now
-    if wall >= 0:
+    if wall >= 0 and words[_STAMPED]:
         t_ns = _integer(wall) - _find_clock_distance(port)
     t_ns = max(min(t_ns, now), _integer(words[_LATEST]))
     words[_LATEST] = t_ns
@@ -279,6 +302,8 @@ def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
     if port.words[_KIND] == UDP:
         if port.halves[(_MESSAGE + 48) // 4] & _TRUNCATED:
             return _ERROR_FRAME, 0, 0, 0
+        if _has_own_layout(port, size):
+            return _decode_own_layout(port, size)
         return decode_datagram(port.octets, _IN, size)
     if size != _CAN_SIZE:
         return _OTHER, 0, 0, 0
@@ -350,12 +375,42 @@ def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
     octets[_OUT + words[_LENGTH_AT]] = length
     place = _OUT + words[_DATA_AT]
     octets[place - 1] = length
-    for i in range(length):
-        octets[place + i] = data >> 8 * i & 0xFF
-    tail = _OUT + _OUT_SIZE - words[_TAIL]  # what follows the payload stands at the end of the buffer
-    for i in range(words[_TAIL]):
-        octets[place + length + i] = octets[tail + i]
+    words[_PAYLOAD_WORD] = data
+    base = octets.ctypes.data
+    _memcpy(base + place, base + 8 * _PAYLOAD_WORD, length)
+    if words[_LAST_LENGTH] != length:
+        words[_LAST_LENGTH] = length
+        _memcpy(base + place + length, base + _OUT + _OUT_SIZE - words[_TAIL], words[_TAIL])
     return _integer(place + length + words[_TAIL] - _OUT)
+
+
+def _has_own_layout(port: Port, size: int) -> bool:
+    """Whether a datagram differs from ours only in identifier, length and payload: most do, and are read at once."""
+    words, base = port.words, port.octets.ctypes.data
+    id_at, length_at, data_at = words[_ID_AT], words[_LENGTH_AT], words[_DATA_AT]
+    length = size - data_at - words[_TAIL]
+    if not 0 <= length <= 8 or port.octets[_IN + length_at] != length or port.octets[_IN + data_at - 1] != length:
+        return False
+    if _memcmp(base + _IN, base + _OUT, id_at) != 0:
+        return False
+    if _memcmp(base + _IN + id_at + 2, base + _OUT + id_at + 2, length_at - id_at - 2) != 0:
+        return False
+    if _memcmp(base + _IN + length_at + 1, base + _OUT + length_at + 1, data_at - length_at - 2) != 0:
+        return False
+    return bool(_memcmp(base + _IN + data_at + length, base + _OUT + _OUT_SIZE - words[_TAIL], words[_TAIL]) == 0)
+
+
+def _decode_own_layout(port: Port, size: int) -> tuple[int, int, int, int]:
+    """As `decode_datagram`, for what `_has_own_layout`."""
+    words, octets = port.words, port.octets
+    place = _IN + words[_ID_AT]
+    cob_id = _integer(octets[place]) << 8 | _integer(octets[place + 1])
+    if cob_id > 0x7FF:
+        return _ERROR_FRAME, 0, 0, 0
+    length = _integer(size - words[_DATA_AT] - words[_TAIL])
+    words[_PAYLOAD_WORD] = 0
+    _memcpy(octets.ctypes.data + 8 * _PAYLOAD_WORD, octets.ctypes.data + _IN + words[_DATA_AT], length)
+    return _DATA, cob_id, length, _integer(words[_PAYLOAD_WORD])
 
 
 @keep_apart
@@ -597,6 +652,7 @@ class RawBus:
         """Fill in what is the same for both kinds of bus."""
         words, halves = self.port.words, self.port.halves
         words[_KIND], words[_LATEST] = kind, time.monotonic_ns()
+        words[_STAMPED] = 1
         words[_COUNTS_LOSSES] = kind == SOCKETCAN or cob_ids is None
         halves[_POLL // 4: _POLL // 4 + 4] = words[_RX], _POLLIN, self._wake, _POLLIN
         self._allow(cob_ids)
@@ -613,6 +669,12 @@ class RawBus:
             raise RigError(f"{self.spec}: {error.strerror}") from error
         self.port.words[_COUNTS_LOSSES] = self.port.words[_KIND] == SOCKETCAN
         self._allow(cob_ids)
+
+    def use_kernel_times(self, is_wanted: bool) -> None:
+        """Whether a frame gets the time at which the kernel received it (the default), or that of the call, which
+        saves three readings of the clock: in lockstep the time does not matter, and in some guests a reading is slow.
+        """
+        self.port.words[_STAMPED] = is_wanted
 
     def _allow(self, cob_ids: Sequence[int] | None) -> None:
         """One bit a COB-ID, for the frames that the kernel lets through."""
@@ -638,11 +700,14 @@ def can_open(spec: str) -> bool:
 
 
 def set_receive_options(raw: socket.socket) -> None:
-    """A large receive buffer (beyond the system's limit where the rights allow), the kernel's time and its losses."""
+    """A large receive buffer (beyond the system's limit where the rights allow), a limit for waiting in the kernel, the
+    kernel's time of each frame and the count of its losses.
+    """
     try:
         raw.setsockopt(_SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
     except OSError:
         raw.setsockopt(_SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    raw.setsockopt(_SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_TIMEOUT)
     raw.setsockopt(_SOL_SOCKET, _SO_TIMESTAMPNS, 1)
     raw.setsockopt(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
@@ -678,4 +743,5 @@ def _prepare_datagram(port: Port) -> None:
     port.words[_ID_AT], port.words[_LENGTH_AT] = identifier, data.index(b"\xa3dlc") + 4
     port.words[_DATA_AT], port.words[_TAIL] = payload, len(tail)
     port.octets[_OUT: _OUT + len(data)] = np.frombuffer(data, np.uint8)
+    port.words[_LAST_LENGTH] = 8
     port.octets[_OUT + _OUT_SIZE - len(tail): _OUT + _OUT_SIZE] = np.frombuffer(tail, np.uint8)

@@ -29,6 +29,7 @@ from rig.network.raw_bus import (
     NEVER,
     SENT,
     Port,
+    await_frame,
     join_halves,
     join_words,
     read_clock,
@@ -125,8 +126,10 @@ def run_emulator(port: Port, m: Memory) -> int:
             words[PUSHED] = 0
             status, t_ns, cob_id = FRAME, words[PUSHED_TIME], words[PUSHED_ID]
             length, data = words[PUSHED_LENGTH], words[PUSHED_DATA]
-        else:
+        elif words[HELD] and words[PERIOD]:
             status, t_ns, cob_id, length, data = receive_frame(port, _find_next_due(m))
+        else:
+            status, t_ns, cob_id, length, data = await_frame(port)
         if status == FRAME:
             if cob_id == words[SYNC_ID]:
                 _take_sync(port, m, t_ns, length)
@@ -437,11 +440,10 @@ def _hold_frame(m: Memory, due: int, cob_id: int, length: int, data: int, what: 
 
 
 def _find_next_due(m: Memory) -> int:
-    """When the next late frame is due, in real time."""
+    """When the next of the late frames is due, in real time."""
     due = NEVER
-    if m.words[PERIOD]:
-        for i in range(m.words[HELD]):
-            due = min(due, _integer(m.words[_HELD_AT + 6 * i]))
+    for i in range(m.words[HELD]):
+        due = min(due, _integer(m.words[_HELD_AT + 6 * i]))
     return due
 
 

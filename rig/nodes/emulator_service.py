@@ -225,6 +225,7 @@ class EmulatorService:
         """What SDO may change, and the error register without the loop's own error."""
         shared, od, pdo = self._memory.words, self.device.od, self.device.pdo
         shared[ec.PERIOD] = od.number(0x1006, 0)
+        self._bus.use_kernel_times(bool(shared[ec.PERIOD]))
         emcy = od.number(0x1014, 0, 1 << 31)
         shared[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
         others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]

@@ -6,6 +6,7 @@
  * two frames are given in hexadecimal as they go out; CYCLE_AT is the place of the cycle counter in VALVE_STATE.
  */
 #define _GNU_SOURCE
+#include <errno.h>
 #include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -52,10 +53,11 @@ int main(int count, char **words) {
     puts("ready");
     fflush(stdout);
     unsigned char sync[512];
-    for (unsigned int cycle = 0; recv(receive, sync, sizeof sync, 0) >= 0; cycle++) {
+    for (unsigned int cycle = 0;; cycle++) {
+        while (recv(receive, sync, sizeof sync, 0) < 0)
+            if (errno != EAGAIN && errno != EINTR) return 1; /* the sockets have a limit for waiting */
         valve.bytes[cycle_at] = (unsigned char)(cycle & 0xFF);
         valve.bytes[cycle_at + 1] = (unsigned char)(cycle >> 8 & 0xFF);
         if (send_frame(transmit, turn, &feedback) != 0 || send_frame(transmit, turn, &valve) != 0) return 1;
     }
-    return 1;
 }

@@ -1,6 +1,7 @@
 """Frames sent and received by compiled code, on UDP here and on SocketCAN where there is a vcan0."""
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import struct
@@ -129,6 +130,21 @@ class TestFrames:
                 assert receive(bus.port, NEVER)[0] == WOKEN
                 timer.join()
 
+    @ways
+    def test_waits_in_the_call_that_receives(self, bus_kind: str, way: str) -> None:
+        await_frame = function("await_frame", way)
+        where = spec(bus_kind)
+        with open_raw_bus(where) as bus, open_can(where) as other:
+            assert await_frame(bus.port) == (TIMEOUT, 0, 0, 0, 0)
+            other.send(can.Message(arbitration_id=0x123, data=b"\x07", is_extended_id=False))
+            status, t_ns, *rest = await_frame(bus.port)
+            assert (status, *rest) == (FRAME, 0x123, 1, 7)
+            bus.use_kernel_times(False)
+            before = time.monotonic_ns()
+            other.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+            time.sleep(0.01)
+            assert t_ns <= before < before + 10_000_000 <= await_frame(bus.port)[1]
+
     def test_a_lost_frame_is_counted(self, bus_kind: str) -> None:
         where = spec(bus_kind)
         receive, send = function("receive_frame"), function("send_frame")
@@ -194,6 +210,14 @@ def read_compiled(data: bytes) -> tuple[int, ...]:
     return (kind, *rest) if kind == 0 else (kind,)
 
 
+@cache
+def open_port() -> raw_bus.Port:
+    """A port of a UDP bus that stays open."""
+    bus = open_raw_bus("udp_multicast:239.74.163.77")
+    atexit.register(bus.close)
+    return bus.port
+
+
 messages = st.builds(
     lambda cob_id, data, flags, t, channel: can.Message(
         arbitration_id=cob_id, data=b"" if flags == "is_remote_frame" else data, timestamp=t, channel=channel,
@@ -230,6 +254,20 @@ class TestDatagrams:
             assert fields.get(b"dlc") in (None, len(bits))
             kinds = (b"is_extended_id", b"is_remote_frame", b"is_error_frame", b"is_fd")
             assert not any(fields.get(kind) for kind in kinds)
+
+    @settings(max_examples=300, deadline=None)
+    @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.integers(0, 400), st.binary(max_size=3))
+    def test_the_short_way_reads_the_same(self, cob_id: int, data: bytes, place: int, bad: bytes) -> None:
+        """Our own layout is read without looking at its keys; whatever differs takes the long way."""
+        port = open_port()
+        size = raw_bus.encode_datagram(port, cob_id, len(data), payload(data))
+        sent = port.octets[raw_bus._OUT: raw_bus._OUT + size].tobytes()
+        assert read_compiled(sent) == (0, cob_id, len(data), payload(data))
+        place %= size
+        for got in (sent, sent[:place] + bad + sent[place + len(bad):], sent[:place], sent + bad):
+            port.octets[raw_bus._IN: raw_bus._IN + len(got)] = np.frombuffer(got, np.uint8)
+            kind, *rest = function("_decode")(port, len(got))
+            assert ((kind, *rest) if kind == 0 else (kind,)) == read_compiled(got)
 
     @given(st.binary(max_size=300))
     def test_foreign_bytes_are_no_frame(self, data: bytes) -> None:
