@@ -6,7 +6,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -108,16 +108,23 @@ class Link:
 
     def _poll_messages(self, timeout: float) -> list[Frame]:
         frames = []
-        message = self._bus.recv(timeout)
-        while message is not None:
+        for message in self._take_messages(timeout):
             if message.is_error_frame:
                 self.error_frames += 1
             elif message.is_extended_id or message.is_remote_frame or message.is_fd:
                 self.dropped += 1
             elif message.arbitration_id not in self._left_out and not message.arbitration_id & self._foreign:
                 frames.append(Frame(self._clock(), message.arbitration_id, bytes(message.data)))
-            message = self._bus.recv(0)
         return frames
+
+    def _take_messages(self, timeout: float) -> Iterator[can.Message]:
+        if isinstance(self._bus, LoopbackBus):
+            yield from self._bus.receive_waiting(timeout)
+            return
+        message = self._bus.recv(timeout)
+        while message is not None:
+            yield message
+            message = self._bus.recv(0)
 
     def _poll_socket(self, raw: socket.socket, timeout: float) -> list[Frame]:
         frames: list[Frame] = []

@@ -56,13 +56,33 @@ class LoopbackBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while select.select([self._rx], [], [], timeout)[0]:
             data, ancillary, _, sender = self._rx.recvmsg(4096, socket.CMSG_SPACE(4))
-            for level, kind, value in ancillary:
-                if (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL) and not self._is_filtered:
-                    (self.overflows,) = struct.unpack("=I", value)
+            self._count_losses(ancillary)
             if sender != self._own:
                 return _decode_message(data), False
             timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
         return None, False
+
+    def receive_waiting(self, timeout: float) -> list[can.Message]:
+        """All messages that are waiting; if there are none, wait up to `timeout` seconds for the first.
+
+        One wait for all of them: `recv` waits, and asks the clock, for each. Raises OSError when the bus is gone.
+        """
+        if timeout > 0:
+            select.select([self._rx], [], [], timeout)
+        messages: list[can.Message] = []
+        while True:
+            try:
+                data, ancillary, _, sender = self._rx.recvmsg(4096, socket.CMSG_SPACE(4), socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return messages
+            self._count_losses(ancillary)
+            if sender != self._own:
+                messages.append(_decode_message(data))
+
+    def _count_losses(self, ancillary: list[tuple[int, int, bytes]]) -> None:
+        for level, kind, value in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL) and not self._is_filtered:
+                (self.overflows,) = struct.unpack("=I", value)
 
     def leave_out(self, cob_ids: Collection[int]) -> None:
         """Let the kernel drop the frames with these COB-IDs: one that Python decodes costs 30 us.

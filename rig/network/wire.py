@@ -174,12 +174,14 @@ class LinkWire:
 
 
 def serve_node(node: Node, link: Link, clock: Clock, stop: Done) -> None:
-    """Run one node on a link until `stop()`: the whole of `rig node`."""
+    """Run one node on a link until `stop()`, which is asked every millisecond: the whole of `rig node`."""
     tick = clock.now() + MS
-    while not stop():
+    while True:
         for frame in link.poll(max(0.0, (tick - clock.now()) * 1e-9)):
             node.receive(frame)
         now = clock.now()
         if now >= tick:
+            if stop():
+                return
             node.tick(now)
             tick = max(tick + MS, now)

@@ -226,7 +226,7 @@ def _keep_drive(m: Memory, length: int, data: int) -> None:
 def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     """One cycle of the plant; while the node is not OPERATIONAL, time goes on and the plant pauses."""
     words = m.words
-    begun_ns = read_clock(port)
+    begun_ns = _read_time(port, m, t_ns)
     while words[NOISE_USED] >= words[NOISE_FILLED]:  # the services draw a minute ahead; never repeat a number
         if words[STOP]:
             return
@@ -260,10 +260,10 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     is_fed = _send_feedback(port, m, k, t_ns)
     if not is_crowded:
         _send_valve_state(port, m, k, t_ns)
-    sent_ns = read_clock(port)
+    sent_ns = _read_time(port, m, t_ns)
     _advance_plant(m, k)
     words[CYCLE] = k + 1
-    done_ns = read_clock(port)
+    done_ns = _read_time(port, m, t_ns)
     _record_cycle(m, k, t_ns, begun_ns, sent_ns, done_ns, flags)
     if not words[PERIOD]:
         if is_crowded:
@@ -274,6 +274,13 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
         if _find_next_held(m, end, is_fed) >= 0:
             words[NOW] = end if is_fed else words[NOW]
             _release_until(port, m, end, is_fed)
+
+
+def _read_time(port: Port, m: Memory, t_ns: int) -> int:
+    """The time for the record, ns; in lockstep, where nobody reads it, that of the SYNC."""
+    if m.words[PERIOD]:
+        return read_clock(port)
+    return t_ns
 
 
 def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:

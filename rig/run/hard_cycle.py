@@ -18,6 +18,7 @@ from rig.network import codec
 from rig.network.raw_bus import (
     FRAME,
     Port,
+    await_frame,
     join_words,
     read_clock,
     receive_frame,
@@ -51,6 +52,7 @@ COLUMNS = 19
 # Columns of a frame; its head is COB-ID | length << 12 | sent by the rig << 16
 TIME, FRAME_HEAD, DATA = range(3)
 
+_LONG_WAIT = 20_000_000  # ns: answers that may take this long are awaited to 20 ms, with fewer system calls
 _PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
 
 
@@ -94,7 +96,11 @@ def play_realtime(port: Port, buffers: Buffers) -> int:
             status = _receive_waiting(port, buffers)
         if status < 0:
             return status
-        _close_row(port, buffers)
+        _end_work(port, words)
+        _complete_row(buffers)
+        # The compiler cannot see into a library call: the row is in memory before the counts say that it is there.
+        _begin_work(port, words)
+        _hand_over_row(buffers)
         if is_end:
             return DONE
         late = read_clock(port) - words[DUE]
@@ -125,7 +131,10 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
         words[STAGE] = WAITING
         _end_work(port, words)
     while words[SEEN] != ALL_CAME:
-        status, t_ns, cob_id, length, data = receive_frame(port, min(words[ANSWER_LIMIT], until_ns))
+        if words[ANSWER_LIMIT] - words[SYNC_AT] >= _LONG_WAIT:
+            status, t_ns, cob_id, length, data = await_frame(port)
+        else:
+            status, t_ns, cob_id, length, data = receive_frame(port, min(words[ANSWER_LIMIT], until_ns))
         if status == FRAME:
             _accept_frame(buffers, t_ns, cob_id, length, data)
         elif status < 0:
@@ -134,14 +143,14 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
             break
         else:
             return WAITING
-    _begin_work(port, words)
     words[MISSED] = 0 if words[SEEN] == ALL_CAME else words[MISSED] + 1
     status = _receive_waiting(port, buffers)
     while status >= 0 and words[HELD] > 0 and buffers.held[0, 0] < words[DUE] + words[PERIOD]:
         status = _send_first_held(port, buffers)
     if status < 0:
         return status
-    _close_row(port, buffers)
+    _complete_row(buffers)
+    _hand_over_row(buffers)
     words[CYCLES] += 1
     words[DUE] += words[PERIOD]
     words[STAGE] = DONE
@@ -336,15 +345,17 @@ def _record_frame(buffers: Buffers, t_ns: int, head: int, data: int) -> None:
     words[FRAMES_WRITTEN] += 1
 
 
-def _close_row(port: Port, buffers: Buffers) -> None:
-    """Hand the row of the cycle under way to Python, and the frames up to now."""
+def _complete_row(buffers: Buffers) -> None:
+    """Complete the row of the cycle under way."""
     words = buffers.words
-    _end_work(port, words)
     row = buffers.rows[words[ROWS] % len(buffers.rows)]
     row[ANSWERS], row[EXECUTION] = words[SEEN], words[WORKED]
     words[WORKED] = 0
-    # The compiler cannot see into a library call: all that stands above it is in memory before the counts below change.
-    _begin_work(port, words)
+
+
+def _hand_over_row(buffers: Buffers) -> None:
+    """Hand the row of the cycle under way to Python, and the frames up to now."""
+    words = buffers.words
     if words[OPEN]:
         if words[ROWS] + 1 - words[ROWS_READ] < len(buffers.rows):
             words[ROWS] += 1
@@ -353,4 +364,3 @@ def _close_row(port: Port, buffers: Buffers) -> None:
     words[OPEN] = 0
     words[FRAMES] = words[FRAMES_WRITTEN]
     words[COMPLETE_UNTIL] = words[DUE]
-

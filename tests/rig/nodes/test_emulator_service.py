@@ -209,7 +209,8 @@ class TestServices:
         run_cycle(desk, None)
         desk.link.send(codec.DRIVE, b"123")
         assert run_cycle(desk).flags == 1
-        assert desk.await_frame(0x083)[:2] == b"\x10\x82"
+        desk.settle()
+        assert [data[:2] for cob_id, data in desk.heard if cob_id == 0x083][0] == b"\x10\x82"
 
     def test_a_plant_without_a_number_says_so_and_stops(self, desk: BusDesk) -> None:
         run_cycle(desk)
