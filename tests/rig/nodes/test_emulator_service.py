@@ -210,7 +210,7 @@ class TestServices:
         desk.link.send(codec.DRIVE, b"123")
         assert run_cycle(desk).flags == 1
         desk.settle()
-        assert [data[:2] for cob_id, data in desk.heard if cob_id == 0x083][0] == b"\x10\x82"
+        assert next(data[:2] for cob_id, data in desk.heard if cob_id == 0x083) == b"\x10\x82"
 
     def test_a_plant_without_a_number_says_so_and_stops(self, desk: BusDesk) -> None:
         run_cycle(desk)
