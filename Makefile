@@ -19,7 +19,7 @@ test: lint
 
 pytest: env-test
 	@echo "== pytest"
-	@$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: env-test
 	@echo "== ruff, then mypy --strict"
