@@ -66,7 +66,7 @@ def wait_for_node(where: str, node: int, seconds: float = 300.0) -> None:
 def play_short(folder: Path, where: str, fault: str, seed: int = 1) -> Outcome:
     """A short run in lockstep against the firmware that is on the bus."""
     text = LONG if fault == "no_heartbeat" else SHORT
-    limit = {"slow_start": 1, "no_heartbeat": 2}.get(fault, 20)  # s; long where it is not spent: the machine may be busy
+    limit = {"slow_start": 1, "no_heartbeat": 2}.get(fault, 20)  # s; a busy machine may need long
     text += f"[timing]\noperational = {limit}\n"
     return play(job(text, seed=seed, controller="external", plant="external", bus=where), folder)
 
