@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fdi.trace.csv_table import read_csv, write_csv
 from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import Section, find_sections
+from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, escape_control_characters
 
@@ -127,6 +128,7 @@ class Trace:
     timing: Timing = NO_TIMING
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
     units: Mapping[str, str] = field(default_factory=lambda: dict(UNITS))
+    sensors: Mapping[str, SensorDynamics] = field(default_factory=dict)  # by signal, of those that are not ideal
 
     def __len__(self) -> int:
         return len(self.t)
@@ -290,6 +292,7 @@ def _from_log(log: Log, everything: bool) -> Trace:
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
     return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
                        units=dict(UNITS) | log.units("/signals"), attachments=log.attachments, notes=tuple(notes),
+                       sensors=read_sensors(log.path, run),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
                        nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),

@@ -16,7 +16,7 @@ HELP_OF_COMMAND = {
     "explain": "find the physical effects that a model lacks, and rank the candidates",
     "export": "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
     "fdi": "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
-    "import": "make a trace.mcap from a CSV (signals) or from a CAN log (.log of candump, .blf, .asc, .trc)",
+    "import": "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
     "node": "run one node (plant or controller) on a bus, for example with real hardware",
     "recover": "salvage a log whose writer died: keep everything up to the last intact chunk and index it again",
     "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",

@@ -4,12 +4,17 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from fdi.output import writable
+from fdi.trace.importing.import_map import ImportMap
 from fdi.trace.mcap_log import open_log
+from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.device.nmt import NmtState as State
@@ -18,6 +23,9 @@ from rig.network.frame import Frame
 from rig.recorder.provenance import collect_provenance
 from rig.recorder.schema import Event, NmtState, Record, Signals
 from rig.recorder.writer import Recorder
+
+if TYPE_CHECKING:
+    import can
 
 RAW_SUFFIXES = (".log", ".blf", ".asc", ".trc")
 NAN = math.nan
@@ -66,21 +74,34 @@ def import_csv(source: Path, out: Path) -> int:
     return len(trace)
 
 
+def write_imported(trace: Trace, chosen: ImportMap, out: Path) -> None:
+    """Write an imported trace as a log, with its map as an attachment and where it comes from as metadata."""
+    attached = replace(trace, attachments={"map.toml": chosen.text.encode()})
+    write_mcap(attached, out, collect_provenance(period=repr(trace.period), pace="imported", **trace.provenance))
+
+
 def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = None) -> None:
     """Write a trace's signals as a log; `metadata` is its own provenance by default.
 
     Raises InputError for a place that cannot be written; unlike a run it makes no folder.
     """
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
+    given = {**given, **write_sensors(trace.sensors)}
     attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
     recorder = Recorder(_require_mcap(out), attachments, given)
-    columns = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
-    for k, (phase, *values) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+    columns: tuple[NDArray[Any], ...] = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
+    for k, (phase, *values) in enumerate(_list_rows(columns)):
         if not all(math.isnan(value) for value in values):
             com, xj, cor, p12, xs, load = values
             recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
             _wait_for_writer(recorder, k)
     recorder.close()
+
+
+def _list_rows(columns: Sequence[NDArray[Any]], block: int = 10_000) -> Iterator[tuple[Any, ...]]:
+    """The rows of columns as Python numbers, made in blocks: those of a long recording would fill the memory."""
+    for first in range(0, len(columns[0]), block):
+        yield from zip(*(column[first:first + block].tolist() for column in columns), strict=True)
 
 
 def import_frames(source: Path, out: Path, dbc: Path) -> int:
@@ -171,18 +192,29 @@ def _name_state(code: int) -> str:
 
 
 def _read_frames(source: Path) -> Iterator[Frame]:
+    first = None
+    for message in list_can_messages(source):
+        if message.is_extended_id or message.is_fd:
+            continue
+        first = message.timestamp if first is None else first
+        t_ns = max(0, round((message.timestamp - first) * 1e9))
+        yield Frame(t_ns, message.arbitration_id, bytes(message.data))
+
+
+def list_can_messages(source: Path) -> Iterator[can.Message]:
+    """The data frames of a CAN log (.log of candump, .blf, .asc, .trc), one by one.
+
+    Raises:
+        InputError: a file that cannot be read or is no such log.
+    """
     import can
     from can.io.blf import BLFParseError
 
-    first = None
     try:
         with can.LogReader(source) as reader:
             for message in reader:
-                if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
-                    continue
-                first = message.timestamp if first is None else first
-                t_ns = max(0, round((message.timestamp - first) * 1e9))
-                yield Frame(t_ns, message.arbitration_id, bytes(message.data))
+                if not (message.is_error_frame or message.is_remote_frame):
+                    yield message
     except OSError as error:
         raise InputError(source, "", f"a readable file ({error.strerror})") from error
     except (ValueError, IndexError, can.CanError, BLFParseError) as error:

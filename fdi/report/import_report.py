@@ -1,0 +1,53 @@
+"""What `rig import` did with each signal, and what `rig import --guess` takes each column for."""
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from fdi.report.numbers import SIGNAL_NAMES, choose_unit, count_nouns, format_digits
+from fdi.report.report import Cell, Column, Line, Report, Section, Table
+from fdi.trace.importing.conversion import Imported, ImportedSignal
+from fdi.trace.importing.guess import GuessedMap
+from fdi.trace.importing.measurement import Measurement
+from fdi.trace.signals import SIGNALS
+
+
+def build_import_report(imported: Imported, measurement: Measurement, out: Path) -> Report:
+    """Rows and period of the trace; a table of its signals."""
+    trace = imported.trace
+    columns = [Column("signal"), Column("source"), Column("unit"), Column("rate", "Hz", "right"),
+               Column("range", align="right"), Column("gaps", align="right"), Column("missing", "rows", "right")]
+    rows = [[SIGNAL_NAMES[s.name], s.source, s.unit, f"{s.rate:.6g}", _format_range(s), str(s.gaps or "none"),
+             str(s.missing or "none")] for s in imported.signals]
+    table = Table(columns, rows, "Rate and gaps: in the source. Range and missing: in the trace.")
+    lines = [Line(SIGNAL_NAMES[s.name], s.how) for s in imported.signals]
+    sentence = (f"{out}: {count_nouns(len(trace), 'row')} of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
+                f"({measurement.format})")
+    data = {"trace": str(out), "cycles": len(trace), "period": trace.period, "format": measurement.format,
+            "provenance": dict(trace.provenance), "signals": {s.name: asdict(s) for s in imported.signals},
+            "sensors": {name: asdict(sensor) for name, sensor in trace.sensors.items()}}
+    return Report("import", str(measurement.path), sentence=sentence, data=data,
+                  sections=[Section("Signals", [table, *lines])], next_command=f"rig compare {out}")
+
+
+def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path) -> Report:
+    """Which column is taken for which signal."""
+    moods = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
+    rows: list[list[Cell | str]] = []
+    for name, (source, confidence) in guessed.chosen.items():
+        rows.append([SIGNAL_NAMES.get(name, name), source, Cell(confidence, moods[confidence])])  # type: ignore[arg-type]
+    missing = [SIGNAL_NAMES[name] for name in ("com", "xj", "cor") if name not in guessed.chosen]
+    notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
+    table = Table([Column("signal"), Column("source"), Column("confidence")], rows,
+                  "The map says why in comments. Check what is not sure.")
+    return Report("import", str(measurement.path), notes=notes, sections=[Section("Guess", [table])],
+                  sentence=f"{out}: first map of {measurement.path.name} ({measurement.format}); check it",
+                  next_command=f"rig import {measurement.path} --map {out}",
+                  data={"map": str(out), "signals": {name: {"source": source, "confidence": confidence}
+                                                     for name, (source, confidence) in guessed.chosen.items()}})
+
+
+def _format_range(s: ImportedSignal) -> str:
+    scale, unit = choose_unit(SIGNALS[s.name].unit, max(abs(s.low), abs(s.high)))
+    size = max(abs(s.low), abs(s.high)) / scale
+    return f"{format_digits(s.low / scale, 4, size)} .. {format_digits(s.high / scale, 4, size)} {unit}"

@@ -1,0 +1,143 @@
+"""What a measuring chain does to a signal: moving mean, first-order lag, delay, rounding; applied to a model's output.
+
+A filtered measurement is compared with a filtered model. The filters are those of the recording's logger; a moving mean
+of n samples is kept as its length in seconds, because the rows of a trace need not be the logger's.
+"""
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorDynamics:
+    """The measuring chain of one signal, in the order in which it acts."""
+
+    lag: float = 0.0  # s, time constant
+    moving_mean: float = 1.0  # samples of the logger
+    sample_period: float = 0.0  # s, of the logger; 0: the trace's own period
+    centred: bool = False  # the mean is over samples before and after, as made afterwards; else over the last ones
+    delay: float = 0.0  # s, what is left of a delay after whole rows
+    quantum: float = 0.0  # step of the reading, SI
+
+    @property
+    def filters(self) -> bool:
+        """Whether it changes more than the last digit."""
+        return self.lag > 0.0 or self.moving_mean > 1.0 or self.delay != 0.0
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether it changes nothing."""
+        return not self.filters and self.quantum == 0.0
+
+    def describe(self, period: float) -> str:
+        """In a few words, for a trace of this period."""
+        parts = []
+        if self.lag:
+            parts.append(f"lag {1e3 * self.lag:g} ms")
+        if self.moving_mean > 1.0:
+            kind = "centred mean" if self.centred else "moving mean"
+            span = 1e3 * self.moving_mean * (self.sample_period or period)
+            parts.append(f"{kind} of {self.moving_mean:g} samples ({span:g} ms)")
+        if self.delay:
+            parts.append(f"delay {1e3 * self.delay:.3g} ms")
+        if self.quantum:
+            parts.append(f"steps of {self.quantum:.4g}")
+        return ", ".join(parts)
+
+    def apply(self, x: Floats, period: float) -> Floats:
+        """The sensor's output for the true signal `x`, (.., n), one sample a `period`; it rests before the first."""
+        if self.lag > 0.0:
+            x = filter_lag(x, self.lag, period)
+        if self.moving_mean > 1.0 or self.delay != 0.0:
+            x = _convolve(x, *self._make_kernel(period))
+        if self.quantum > 0.0:
+            x = self.quantum * np.floor(x / self.quantum + 0.5)
+        return x
+
+    def measure_noise_gain(self, period: float) -> float:
+        """RMS of what the chain makes of white noise of 1 that enters before the mean, rounding left out."""
+        if self.moving_mean <= 1.0 and self.delay == 0.0:
+            return 1.0
+        return float(np.sqrt(np.sum(self._make_kernel(period)[0] ** 2)))
+
+    def _make_kernel(self, period: float) -> tuple[Floats, int]:
+        """Weights of mean and delay on the rows, and the rows of the first one back from now (negative: ahead).
+
+        The mean is over the logger's samples, which lie on straight lines between the rows.
+        """
+        step = (self.sample_period or period) / period
+        back = step * np.arange(round(self.moving_mean)) + self.delay / period
+        back = np.round(back - 0.5 * step * (len(back) - 1) if self.centred else back, 9)
+        first = math.floor(back[0])
+        place = np.floor(back).astype(int)
+        part = back - place
+        weights = np.zeros(int(place[-1]) - first + 2)
+        np.add.at(weights, place - first, 1.0 - part)
+        np.add.at(weights, place - first + 1, part)
+        return weights / len(back), first
+
+
+def filter_lag(x: Floats, time: float, period: float) -> Floats:
+    """First-order lag of `x`, (.., n), exact for straight lines between samples; it rests before the first.
+
+    >>> filter_lag(np.array([0.0, 1.0, 1.0]), 1e-3, 1e-3).round(3).tolist()
+    [0.0, 0.368, 0.767]
+    """
+    from scipy.signal import lfilter
+
+    a, r = math.exp(-period / time), time / period
+    start = x[..., :1]
+    y, _ = lfilter([1.0 - r * (1.0 - a), r * (1.0 - a) - a], [1.0, -a], x - start, zi=np.zeros_like(start))
+    out: Floats = y + start
+    return out
+
+
+def _convolve(x: Floats, weights: Floats, first: int) -> Floats:
+    """Sum of weights[i] x[k - first - i]; the end values go on before and after."""
+    n = x.shape[-1]
+    out = np.zeros_like(x)
+    rows = np.arange(n)
+    for i, weight in enumerate(weights.tolist()):
+        if weight:
+            out += weight * x[..., np.clip(rows - first - i, 0, n - 1)]
+    return out
+
+
+PREFIX = "sensor."  # of the names in a log's metadata
+
+
+def write_sensors(sensors: Mapping[str, SensorDynamics]) -> dict[str, str]:
+    """The dynamics as metadata of a log, as JSON."""
+    return {PREFIX + name: json.dumps(asdict(sensor)) for name, sensor in sensors.items()}
+
+
+def read_sensors(where: object, metadata: Mapping[str, str]) -> dict[str, SensorDynamics]:
+    """The dynamics in the metadata of a log.
+
+    Raises:
+        InputError: text that is no dynamics.
+    """
+    out = {}
+    for key, text in metadata.items():
+        if not key.startswith(PREFIX):
+            continue
+        try:
+            sensor = SensorDynamics(**json.loads(text))
+            numbers = (sensor.lag, sensor.moving_mean, sensor.sample_period, sensor.quantum)
+            is_valid = all(math.isfinite(x) and x >= 0.0 for x in numbers) and math.isfinite(sensor.delay)
+            if not (is_valid and 1.0 <= sensor.moving_mean <= 1e6 and abs(sensor.delay) <= 1e3):
+                raise ValueError
+        except (TypeError, ValueError) as error:
+            raise InputError(where, f"metadata run.{key}", f"a sensor's dynamics as JSON, not {text!r}") from error
+        out[key.removeprefix(PREFIX)] = sensor
+    return out

@@ -1,0 +1,176 @@
+"""Time bases, rates, gaps, delays and scales: what an import makes of them."""
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi.trace.importing.conversion import Imported, import_measurement
+from fdi.trace.importing.formats import open_measurement
+from fdi.trace.importing.guess import guess_map
+from fdi.trace.importing.import_map import parse_map
+from fdi.trace.importing.measurement import ArrayMeasurement, Channel
+from fdi.trace.importing.resampling import Samples, place_samples
+from plant.errors import InputError
+
+MAP = """
+[signals.com]
+source = "com"
+[signals.xj]
+source = "xj"
+[signals.cor]
+source = "cor"
+"""
+T = np.arange(1000) * 1e-3
+XJ = 3e-3 * np.sin(2 * math.pi * 2.0 * T)
+
+
+def convert(tmp_path: Path, text: str, **columns: np.ndarray) -> Imported:
+    """The import of columns com, xj, cor (sines unless given) and others."""
+    (tmp_path / "x.bin").write_bytes(b"x")
+    known = {"com": XJ, "xj": XJ, "cor": XJ} | columns
+    channels = {name: Channel(np.asarray(values, float)) for name, values in known.items()}
+    measurement = ArrayMeasurement(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), channels)
+    return import_measurement(measurement, parse_map(text + MAP, tmp_path / "map.toml"), 1e-3)
+
+
+def test_counter_that_wraps_and_a_gap(tmp_path: Path) -> None:
+    """16 bits, 4 counts a row, 25 rows lost over a wrap: one gap of 25 rows, every sample in its row."""
+    there = np.delete(np.arange(1000), np.arange(480, 505))
+    counts = (65536 - 4 * 490 + 4 * there) % 65536
+    text = '[time]\nsource = "n"\nbits = 16\nrate = 4000\n'
+    imported = convert(tmp_path, text, n=counts, com=XJ[there], xj=XJ[there], cor=XJ[there])
+    trace = imported.trace
+    assert len(trace) == 1000 and trace.period == 1e-3
+    assert np.flatnonzero(np.isnan(trace.xj)).tolist() == list(range(480, 505))
+    assert np.array_equal(trace.xj[there], XJ[there])
+    assert {s.name: (s.gaps, s.missing) for s in imported.signals}["xj"] == (1, 25)
+
+
+def test_counter_with_too_few_bits_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"n: expected whole numbers from 0 to 255 \(8 bits\); row 257 has 256"):
+        convert(tmp_path, '[time]\nsource = "n"\nbits = 8\nrate = 1000\n', n=np.arange(1000))
+
+
+def test_scale_offset_and_sign_of_counts(tmp_path: Path) -> None:
+    """Value = sign * (scale * raw + offset)."""
+    text = ('[time]\nrate = 1000\n[signals.p12]\nsource = "adc"\nunit = "bar"\nscale = 0.0625\noffset = -0.625\n'
+            'sign = -1\n')
+    trace = convert(tmp_path, text, adc=np.arange(1000)).trace
+    assert trace.p12[[0, 10, 26]].tolist() == [62500.0, 0.0, -100000.0]
+
+
+def test_delay_moves_a_signal_by_rows(tmp_path: Path) -> None:
+    text = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\ndelay = 0.003\n'
+    trace = convert(tmp_path, text, p=np.arange(1000)).trace
+    assert trace.p12[:5].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0] and np.isnan(trace.p12[-3:]).all()
+
+
+def test_slow_signal_lies_on_straight_lines_and_its_gap_stays(tmp_path: Path) -> None:
+    """100 Hz beside 1 kHz, empty fields between; a second without values is not bridged."""
+    load = np.full(1000, np.nan)
+    load[::10] = 5.0 * np.arange(100)
+    load[400:500] = np.nan
+    imported = convert(tmp_path, '[time]\nrate = 1000\n[signals.load]\nsource = "f"\n', f=load)
+    got = imported.trace.load
+    assert got[:5].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
+    assert np.isnan(got[391:500]).all() and not np.isnan(got[:391]).any() and not np.isnan(got[500:991]).any()
+    assert "straight lines between samples 10 ms apart" in imported.signals[0].how
+
+
+def test_dead_span_is_left_out(tmp_path: Path) -> None:
+    text = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\nsensor = {dead = [[0.2, 0.3]]}\n'
+    got = convert(tmp_path, text, p=np.arange(1000)).trace.p12
+    assert np.flatnonzero(np.isnan(got)).tolist() == list(range(200, 301))
+    with pytest.raises(InputError, match="marked dead"):
+        convert(tmp_path, text.replace("[[0.2, 0.3]]", "true"), p=np.arange(1000))
+
+
+def test_what_would_fold_is_filtered_first() -> None:
+    """A ripple of 4.9 kHz at 10 kHz would read 100 Hz at 1 kHz; with the filter 99.9 % of it is gone."""
+    t = np.arange(20_000) * 1e-4
+    slow, ripple = np.sin(2 * math.pi * 10.0 * t), 0.3 * np.sin(2 * math.pi * 4900.0 * t)
+    rows = np.arange(2000) * 1e-3
+    placed = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", None, "")
+    assert placed.how == "low-pass filtered, every 10th sample"
+    assert np.abs(placed.x - slow[::10])[20:-20].max() < 3e-3
+    raw = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", False, "")
+    assert np.abs(raw.x - slow[::10]).max() > 0.1
+    quiet = place_samples(Samples(t, slow), rows, 1e-3, "auto", None, "")
+    assert quiet.how == "every 10th sample" and np.array_equal(quiet.x, slow[::10])
+
+
+def test_held_answers_of_the_controller_keep_their_cycle() -> None:
+    """At 4 kHz the current is new in the third sample of a cycle: row k still holds the answer to row k."""
+    t = np.arange(4000) * 2.5e-4
+    answer = np.repeat(np.arange(1001.0), 4)[2:4002]  # the first two samples are of the cycle before
+    rows = t[0] + np.arange(1000) * 1e-3
+    placed = place_samples(Samples(t, answer), rows, 1e-3, "auto", None, "answer")
+    assert np.array_equal(placed.x[:-1], np.arange(1.0, 1000.0))
+
+
+def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
+    """1.0003 ms for 1 ms slips by three rows in 10 s: the trace takes the recording's own period."""
+    n = 10_000
+    x = np.sin(np.arange(n) / 50.0)
+    trace = convert(tmp_path, '[time]\nsource = "t"\n', t=np.arange(n) * 1.0003e-3, com=x, xj=x, cor=x).trace
+    assert trace.period == pytest.approx(1.0003e-3) and len(trace) == n and np.array_equal(trace.xj, x)
+
+
+def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
+    """Only motion tells: the growing column is the time, the two that follow each other are Com and XJ."""
+    com = np.where(np.arange(1000) % 400 > 200, 3.0, -3.0)
+    xj = np.convolve(com, np.exp(-np.arange(200) / 20.0) / 20.5, "full")[:1000]
+    lines = [f"{k},{x:.4f},{c:.1f},{k % 7}" for k, (x, c) in enumerate(zip(xj, com, strict=True))]
+    (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
+    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    assert guessed.chosen["com"] == ("column 3", "unsure") and guessed.chosen["xj"][0] == "column 2"
+    assert guessed.chosen["time"][0] == "column 1" and 'unit = "ms"' in guessed.text
+    assert "# [signals.cor]" in guessed.text and "every analysis needs it" in guessed.text
+
+
+def test_guess_finds_a_counter(tmp_path: Path) -> None:
+    lines = ["cnt;Sollwert_mm;Istwert_mm;i_mA"]
+    lines += [f"{(250 + k) % 256};{math.sin(k / 90):.5f};{-math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(2000)]
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    text = guess_map(open_measurement(tmp_path / "x.csv")).text
+    assert 'source = "cnt"\nbits = 8' in text and "sign = -1" in text
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".parquet"])
+def test_matlab_and_parquet(suffix: str, tmp_path: Path) -> None:
+    columns = {"t": T, "com": XJ, "xj": XJ, "cor": XJ, "p12": 2.0 * XJ}
+    path = tmp_path / f"x{suffix}"
+    if suffix == ".mat":
+        from scipy.io import savemat
+
+        savemat(path, {"run": columns})
+        text = '[time]\nsource = "run.t"\n' + MAP.replace('"c', '"run.c').replace('"x', '"run.x')
+    else:
+        pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'eha-rig[measure]'")
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        parquet.write_table(pa.table(columns), path)
+        text = '[time]\nsource = "t"\n' + MAP
+    imported = import_measurement(open_measurement(path), parse_map(text, tmp_path / "map.toml"), 1e-3)
+    assert np.array_equal(imported.trace.xj, XJ)
+
+
+@pytest.mark.parametrize(("name", "word"), [("x.mat", "MAT"), ("x.parquet", "Parquet"), ("x.mf4", "MDF")])
+def test_damaged_files(name: str, word: str, tmp_path: Path) -> None:
+    if name != "x.mat":
+        pytest.importorskip({"x.parquet": "pyarrow", "x.mf4": "asammdf"}[name], reason="pip install 'eha-rig[measure]'")
+    (tmp_path / name).write_bytes(b"not what its name says" * 20)
+    with pytest.raises(InputError, match=rf"{name}: expected an? {word} file"):
+        open_measurement(tmp_path / name)
+
+
+def test_the_map_in_the_manual_is_valid() -> None:
+    text = (Path(__file__).parents[4] / "docs" / "import.md").read_text()
+    block = text.split("shows every key:\n\n")[1].split("\n\n`[time]`")[0]
+    found = parse_map("\n".join(line[4:] for line in block.splitlines()), Path("import.md"))
+    assert found.signals["p12"].delay == 0.0035 and found.signals["p12"].sensor.moving_mean == 20.0
+    assert found.signals["xj"].sensor.quantum == pytest.approx(2.5e-5)
