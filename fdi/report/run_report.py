@@ -1,8 +1,10 @@
 """The report of a run: verdict, checks, signals over time, cycle timing, events, NMT states, provenance."""
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +49,8 @@ def build_run_report(trace: Trace) -> Report:
         verdict=word, mood=MOODS.get(word, "neutral"),
         sentence=reason or ("Every check passed." if trace.checks else "The trace has no checks."),
         facts=_list_facts(trace), notes=_list_notes(trace),
-        sections=[Section("Checks", _tabulate_checks(trace.sequence_checks)),
+        sections=[Section("First cause and consequences", _show_cause(trace), medium=Medium.PAGE),
+                  Section("Checks", _tabulate_checks(trace.sequence_checks)),
                   Section("Protocol", _tabulate_protocol(trace.protocol_checks)),
                   Section("Signals", [_draw_signals(trace)]),
                   Section("Cycle timing", _show_timing(trace), medium=Medium.PAGE),
@@ -65,11 +68,40 @@ def _list_facts(trace: Trace) -> list[tuple[str, str]]:
     named = ((name, trace.provenance.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host"))
     facts += [(name, text) for name, text in named if text]
     kind = trace.provenance.get("timing.kind", "")
-    return [*facts, ("timing", f"{kind}: {_KINDS_OF_TIMING[kind]}")] if kind in _KINDS_OF_TIMING else facts
+    if kind not in _KINDS_OF_TIMING:
+        return facts
+    return [*facts, ("timing", f"{kind}: {trace.provenance.get('timing.reason') or _KINDS_OF_TIMING[kind]}")]
 
 
 _KINDS_OF_TIMING = {"hard real time": "the rig's cycle ran as compiled code",
                     "soft real time": "the rig's cycle ran in Python, on a bus that compiled code cannot use"}
+
+
+def _show_cause(trace: Trace) -> list[Item]:
+    """The first cause of trouble with its evidence, and what followed from it; nothing without trouble."""
+    notes = trace.provenance
+    if not notes.get("cause.text"):
+        return []
+    source = notes.get("cause.source", "")
+    items: list[Item] = [Line("first cause", f"t = {notes.get('cause.t', '?')} s: {notes['cause.text']}", "bad")]
+    items += [Line("who", source)] if source else []
+    items += [Line("evidence", str(text)) for text in _read_list(notes.get("cause.evidence", ""))]
+    rows: list[list[Cell | str]] = [
+        [format_time(float(each.get("t", math.nan))), str(each.get("source", "")), str(each.get("text", ""))]
+        for each in _read_list(notes.get("cause.consequences", "")) if isinstance(each, dict)]
+    if rows:
+        columns = [Column("t", "s", "right"), Column("node"), Column("consequence")]
+        items.append(Table(columns, rows, "What was reported afterwards and follows from the first cause."))
+    return items
+
+
+def _read_list(text: str) -> list[Any]:
+    """A list in JSON; empty for another text, for a log may come from another program."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return []
+    return found if isinstance(found, list) else []
 
 
 def _list_notes(trace: Trace) -> list[str]:
@@ -225,7 +257,8 @@ def _tabulate_nmt(trace: Trace) -> list[Item]:
 
 
 def _list_provenance(trace: Trace) -> list[Item]:
-    rows: list[list[Cell | str]] = [[Cell(name, "muted"), text] for name, text in sorted(trace.provenance.items())]
+    rows: list[list[Cell | str]] = [[Cell(name, "muted"), text] for name, text in sorted(trace.provenance.items())
+                                    if not name.startswith("cause.")]
     items: list[Item] = [Table([Column(""), Column("")], rows, is_list=True)] if rows else []
     return [*items, *(Listing(data.decode("utf-8", "replace"), f"{name} ({len(data)} bytes)")
                       for name, data in sorted(trace.attachments.items()))]

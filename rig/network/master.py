@@ -94,6 +94,7 @@ class Master:
         self._booted: set[int] = set()
         self._started_ns: dict[int, int] = {}  # node: when it was told to become OPERATIONAL
         self._operational: dict[int, StartTime] = {}
+        self._settings: dict[tuple[int, int, int], Any] = {}  # what the run has written: node, index, sub
         self._before: dict[tuple[int, int, int], bytes] = {}  # objects that the run changes: node, index, sub
         self._rivals: set[int] = set()  # our own COB-IDs that another node sends
         self.network = _Network(wire, self.send)
@@ -236,21 +237,38 @@ class Master:
             BusError: a node refused or did not answer.
         """
         self._download(PLANT, SCENARIO, 0, scenario, SCENARIO_TIMEOUT)
+        self._settings.clear()
         for sub, value in enumerate(gains or (), 1):
-            self._write(CONTROLLER, GAINS, sub, value)
+            self._set(CONTROLLER, GAINS, sub, value)
         for node in (CONTROLLER, PLANT):
             foreign = node == CONTROLLER and gains is None
             settings = ((0x1006, 0, sync_period_us), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, QUICK_HEARTBEAT))
             for index, sub, value in settings:
                 self._keep(node, index, sub)
                 try:
-                    self._write(node, index, sub, value)
+                    self._set(node, index, sub, value)
                 except BusError:
                     if not foreign:
                         raise
         self._watch.configure([node << 16 | limit_ms for node in (CONTROLLER, PLANT)])
         self._beat.configure(HEARTBEAT, self.wire.clock.now())
         self._beat_ns, self._last_pause_ns, self._limit_ns = 0, 0, limit_ms * 1_000_000
+
+    def configure_again(self) -> list[str]:
+        """Write what `configure` wrote once more to the nodes that have booted since they were started.
+
+        A reset sets 0x1006, 0x1016 and 0x1017 to their defaults, and a reset of the node the gains as well. Returns the
+        failures in words.
+        """
+        failures = []
+        for node in sorted(self._booted):
+            written = [(index, sub, value) for (at, index, sub), value in self._settings.items() if at == node]
+            try:
+                for index, sub, value in written:
+                    self._write(node, index, sub, value)
+            except (BusError, ConfirmationError) as error:  # it would not answer the others either
+                failures.append(f"after its reset {error}")
+        return failures
 
     def restore(self, gone: Container[int] = ()) -> list[str]:
         """Set 0x1006 and 0x1016 back to what they were before `configure`, except in nodes that are gone.
@@ -291,7 +309,7 @@ class Master:
         self.wire.wait(are_operational, seconds)
         for node in self._operational:
             with contextlib.suppress(BusError):  # of a foreign node whose heartbeat time is fixed
-                self._write(node, 0x1017, 0, HEARTBEAT)
+                self._set(node, 0x1017, 0, HEARTBEAT)
         return dict(self._operational)
 
     def find_silent(self, seconds: float) -> list[int]:
@@ -348,6 +366,11 @@ class Master:
         except (SdoAbortedError, SdoCommunicationError):
             return None
         return data
+
+    def _set(self, node: int, index: int, sub: int, value: Any) -> None:
+        """Write an object and remember the value for `configure_again`."""
+        self._write(node, index, sub, value)
+        self._settings[node, index, sub] = value
 
     def _write(self, node: int, index: int, sub: int, value: Any) -> None:
         try:

@@ -179,6 +179,14 @@ class Outcome:
                                for each in found.disturbances[:100]]}
         return {"cause": cause, "consequences": consequences[:100], "judged": judged}
 
+    def describe_attribution(self) -> dict[str, str]:
+        """First cause and consequences as they stand in the log; evidence and consequences are JSON."""
+        found = self._attribution_to_json()
+        cause = found["cause"] or {}
+        return {"t": f"{cause.get('t', 0.0):.3f}", "source": str(cause.get("source", "")),
+                "text": str(cause.get("text", "")), "evidence": json.dumps(cause.get("evidence", [])),
+                "consequences": json.dumps(found["consequences"])}
+
     def _node_to_json(self, node: int) -> dict[str, Any]:
         seconds = self.start_times.get(node)
         return {"name": NAMES[node], "identity": self.identities[node]._asdict(),
@@ -214,13 +222,14 @@ def name_node(node: int) -> str:
     return f"node {node} {NAMES[node]}" if node in NAMES else ""
 
 
-def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str) -> dict[str, Any]:
+def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, reason: str = "") -> dict[str, Any]:
     """Percentiles of lateness, response and execution in us, as `rig run --json` gives them.
 
     `kind`: "lockstep", "hard real time" (the cycle is compiled code) or "soft real time" (the cycle is Python).
+    `reason`: which cycles are Python in real time, and why.
     """
-    return {"kind": kind, "cycles": len(history), "overruns": loop.overruns, "underruns": loop.underruns,
-            "scheduler": scheduler,
+    return {"kind": kind, "reason": reason, "cycles": len(history), "overruns": loop.overruns,
+            "underruns": loop.underruns, "scheduler": scheduler,
             "execution_us": _compute_percentiles(history.column("execution")),
             "lateness_us": _compute_percentiles(history.column("lateness")),
             "response_us": _compute_percentiles(history.column("response"))}

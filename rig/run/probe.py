@@ -14,6 +14,7 @@ import numpy as np
 
 from plant.effects import CATALOGUE
 from plant.model import Model
+from plant.segments import RATE
 from rig.network.codec import Control
 from rig.nodes.scenario import Scenario
 from rig.run.history import History
@@ -37,13 +38,20 @@ class Step(NamedTuple):
     cycles: int
 
 
-FIRST_STEPS = (
-    Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
-    Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, _STEP, 3), Step(0, DISTANCE, 8),
-)
-FIRST_CYCLES = sum(step.cycles for step in FIRST_STEPS)
 WARM_UP = (Step(0, DISTANCE, 30), Step(Control.RESET, DISTANCE, 1))  # real time: the first cycles may be late
 LAST_STEPS = (Step(0, DISTANCE, 8),)
+
+
+def list_first_steps(step_delay: float) -> tuple[Step, ...]:
+    """The steps of a probe before set-up, whose demand step may be answered `step_delay` s late."""
+    return (Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
+            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, _STEP, 3 + round(step_delay * RATE)),
+            Step(0, DISTANCE, 8))
+
+
+def count_cycles(steps: tuple[Step, ...]) -> int:
+    """The length of a probe in cycles."""
+    return sum(step.cycles for step in steps)
 
 
 def list_inputs(steps: tuple[Step, ...], phase: int, demand: float) -> list[CycleInput]:
@@ -69,17 +77,26 @@ def has_no_answers(probe: History) -> bool:
     return len(last) == _MISSED_LIMIT and bool(np.isnan(last).all())
 
 
-def find_gap(probe: History) -> str:
-    """Who left a cycle of a probe without a frame, not counting the warm-up: "bench", "controller", "" for nobody."""
-    if np.isnan(probe.column("xj")[-FIRST_CYCLES:]).any():
+def find_gap(probe: History, on_time: Mask, cycles: int) -> str:
+    """Who left one of the last `cycles` of a probe without a frame: "bench", "controller", "" for nobody.
+
+    An answer that is missing where the bench was not `on_time`, (n,), is the bench's gap.
+    """
+    missing = np.isnan(probe.column("cor")[-cycles:])
+    if np.isnan(probe.column("xj")[-cycles:]).any() or (missing & ~on_time[-cycles:]).any():
         return "bench"
-    return "controller" if np.isnan(probe.column("cor")[-FIRST_CYCLES:]).any() else ""
+    return "controller" if missing.any() else ""
 
 
-def select_last(rows: Rows) -> Rows:
-    """The rows of a probe without its warm-up."""
-    columns: Any = (column[-FIRST_CYCLES:] for column in rows)
+def select_last(rows: Rows, cycles: int) -> Rows:
+    """The last `cycles` of a probe: without its warm-up."""
+    columns: Any = (column[-cycles:] for column in rows)
     return Rows(*columns)
+
+
+def leave_out_gaps(rows: Rows) -> Rows:
+    """The rows of a probe as if there were no answer in cycles without feedback: there is nothing to answer to."""
+    return rows._replace(cor=np.where(np.isnan(rows.xj), np.nan, rows.cor))
 
 
 def read_rows(history: History, on_time: Mask) -> Rows:
@@ -88,10 +105,11 @@ def read_rows(history: History, on_time: Mask) -> Rows:
 
 
 def find_on_time(history: History, faults: Schedule | None, realtime: bool, period: float) -> Mask:
-    """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came, and no injected fault
-    touched a frame of this cycle or the one before it."""
+    """Cycles that the bench delivered: neither this SYNC nor the next was late, feedback came within half a cycle, and
+    no injected fault touched a frame of this cycle or the one before it."""
     on_time: Mask = ~np.isnan(history.column("xj"))
     if realtime:
+        on_time &= history.column("feedback_response") <= 0.5 * period
         late = history.column("lateness") > 0.1 * period
         on_time &= ~late & ~np.append(late[1:], False)
     if faults is not None:

@@ -33,6 +33,7 @@ from rig.run.priority import (
     suspend_garbage_collection,
 )
 from rig.run.session import MAIN, Session
+from rig.run.soft_time import explain_soft_time
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
@@ -78,7 +79,8 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         scheduled = loop.scheduler or scheduled
     spent = stopwatch.now() * 1e-9
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
-    recorder.metadata("timing", {"kind": kind})
+    reason = explain_soft_time(job)
+    recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.history
     attribution = attribute_run(job, session)
     checks = judge_run(job, session, attribution.judged)
@@ -86,10 +88,12 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         recorder.put(session.now(), _make_check_record(check))
     outcome = Outcome(
         job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-        interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind),
+        interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind, reason),
         counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
         attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
         identities=session.identities)
+    if outcome.attribution.cause is not None:
+        recorder.metadata("cause", outcome.describe_attribution())
     recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
                                   "timing": outcome.timing_problem})
     return outcome

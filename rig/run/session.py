@@ -33,7 +33,7 @@ from rig.nodes.cycle_record import CycleRecord
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
-from rig.run.attribution import Mask, Trouble, find_start_problem
+from rig.run.attribution import Mask, Trouble, find_injected, find_start_problem
 from rig.run.hard_loop import open_loop
 from rig.run.history import History
 from rig.run.job import Job
@@ -44,15 +44,17 @@ from rig.run.probe import (
     AFTER,
     ATTEMPTS,
     BEFORE,
-    FIRST_STEPS,
     LAST_STEPS,
     PROBES,
     WARM_UP,
     Step,
+    count_cycles,
     find_gap,
     find_on_time,
     has_firmware_effects,
     has_no_answers,
+    leave_out_gaps,
+    list_first_steps,
     list_inputs,
     make_probe_scenario,
     read_rows,
@@ -103,11 +105,14 @@ class Session:
         self.plant_record: CycleRecord | None = None  # the plant's own, read after a real-time run with trouble
         self.identities: dict[int, Identity] = {}
         self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
-        self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9)
+        injected = find_injected(self._plan, self._faults, self._plan.stop)
+        self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,
+                                      set(np.flatnonzero(injected.sync | injected.plant).tolist()))
         self._probes: list[History] = []  # played before set-up
         self._probe = History()  # the one being played
         self._after = History()  # the probe after clean-up
-        self._is_probing = False  # before set-up: nothing that happens there ends the run
+        self._is_probing = False  # before set-up
+        self._is_watching = False  # from the reset of the nodes for the run until its last cycle
         self._emergencies: list[Emergency] = []
         self._heartbeats: dict[int, list[Heartbeat]] = {node: [] for node in (CONTROLLER, PLANT)}
         self._gains: firmware.Gains | None = None  # object 0x2110 of the controller, if it has it
@@ -194,7 +199,8 @@ class Session:
             self._last_answers[PLANT] = signals.cycle
         if signals.cor == signals.cor:
             self._last_answers[CONTROLLER] = signals.cycle
-        self._overruns.add(timing)
+        if self.job.realtime:
+            self._overruns.add(timing)
         if self._watch and signals.phase != CLEANUP:
             self._unjudged.append(signals)
         self.recorder.cycle(t_ns, signals, timing)
@@ -210,7 +216,7 @@ class Session:
         if self.job.sequence.protocol.probe:
             self._play_probes()
         if not self.aborted:
-            self._start_nodes(self.scenario)
+            self._start_nodes(self.scenario, is_run=True)
         self._master.wire.hear_all()
         self.loop = self._make_loop(self._faults)
         for times in self._heartbeats.values():
@@ -218,10 +224,11 @@ class Session:
         self._begun_ns, self._playing = self._clock.now(), True
         self._stalled_ns = self._master.wire.stalled_ns
 
-    def _start_nodes(self, scenario: Scenario) -> None:
-        """Reset, identify, configure and start the nodes. Raises BusError and InputError."""
+    def _start_nodes(self, scenario: Scenario, *, is_run: bool = False) -> None:
+        """Reset, identify, configure and start the nodes, for a probe or the run. Raises BusError and InputError."""
         job = self.job
         self._master.reset()
+        self._is_watching = is_run
         if not self.identities:
             self._identify_nodes()
         gains = firmware.read_gains(job.model) if job.controller != "external" else None
@@ -245,12 +252,15 @@ class Session:
         Raises:
             BusError: a node does not answer or refuses.
         """
-        steps = (*WARM_UP, *FIRST_STEPS) if self.job.realtime else FIRST_STEPS
+        steps = list_first_steps(self.job.sequence.protocol.step_delay)
+        cycles = count_cycles(steps)
+        steps = (*WARM_UP, *steps) if self.job.realtime else steps
         self._is_probing = True
         for _ in range(PROBES):
             probe = self._play_probe(steps)
             attempts = ATTEMPTS if self.job.realtime else 1
-            while (gap := find_gap(probe)) and (attempts := attempts - 1) and not self.aborted:
+            while ((gap := find_gap(probe, self._find_on_time(probe), cycles)) and (attempts := attempts - 1)
+                   and not self.aborted):
                 probe = self._play_probe(steps)
             if self.aborted:
                 break
@@ -299,14 +309,15 @@ class Session:
     def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
         """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
         job, model = self.job, self.job.model
-        seconds = job.period_ns * 1e-9
+        cycles = count_cycles(list_first_steps(job.sequence.protocol.step_delay))
 
         def read(history: History) -> Rows:
-            return read_rows(history, find_on_time(history, None, job.realtime, seconds))
+            rows = read_rows(history, self._find_on_time(history))
+            return leave_out_gaps(rows) if job.realtime else rows
 
-        run = read_rows(self.history, judged & find_on_time(self.history, self._faults, job.realtime, seconds))
+        run = read_rows(self.history, judged & self._find_on_time(self.history, self._faults))
         return ProtocolRecord(
-            run=run, probes=[select_last(read(probe)) for probe in self._probes if len(probe)],
+            run=run, probes=[select_last(read(probe), cycles) for probe in self._probes if len(probe)],
             after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
             heartbeats={NAMES[node]: times for node, times in self._heartbeats.items()},
             heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9),
@@ -314,6 +325,9 @@ class Session:
             current_limit=model["controller.current_limit"] if self._gains is None else self._gains.current_limit,
             gains=None if has_firmware_effects(model) else self._gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)
+
+    def _find_on_time(self, history: History, faults: Schedule | None = None) -> Mask:
+        return find_on_time(history, faults, self.job.realtime, self.job.period_ns * 1e-9)
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse a firmware that the sequence is not meant for.
@@ -360,7 +374,7 @@ class Session:
                 self._play_last_probe()
                 self.loop.finish()
             finally:
-                self._playing = False
+                self._playing = self._is_watching = False
                 self.loop.close()
                 self._find_silent_nodes()
                 self._master.stop()
@@ -388,6 +402,8 @@ class Session:
     def _restore_nodes(self) -> bool:
         """Try to set all nodes to OPERATIONAL without errors; return whether clean-up may use current."""
         if self.safe and not self.gone and any(state != NmtState.OPERATIONAL for state in self._master.states.values()):
+            for failure in self._master.configure_again():
+                self.log_event("WARN", "restore", failure)
             self._master.start()
         return not self.safe or not self._master.errors()
 
@@ -470,9 +486,14 @@ class Session:
             self.troubles.append(Trouble(self.now() if t_ns is None else t_ns, node, kind, code, what))
 
     def _handle_trouble(self, kind: str, what: str, node: int = 0, code: int = 0, t_ns: int | None = None) -> None:
-        """Enter the safe state: no current, and the end of main unless the sequence tests the safe state."""
-        if self._is_probing and kind not in _ENDS_RUN:
-            self.log_event("WARN", kind, f"{what} (in a probe)")
+        """Enter the safe state: no current, and the end of main unless the sequence tests the safe state.
+
+        Before and after the cycles of the run a report of a node ends nothing: SYNC stops after each probe and after
+        the run, and on a busy machine a node may report that before it is reset.
+        """
+        is_foreign = kind == "bus" and not self._begun_ns  # another rig on the bus is reported once
+        if not self._is_watching and not is_foreign and kind not in _ENDS_RUN:
+            self.log_event("WARN", kind, f"{what} ({'before' if not self._begun_ns else 'after'} the run)")
             return
         if self._playing or kind in _ENDS_RUN:
             self._note_trouble(kind, what, node, code, t_ns)

@@ -32,6 +32,7 @@ DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lis
                   EmcyCode.PDO_TOO_SHORT, EmcyCode.PDO_TOO_LONG, EmcyCode.SYNC_LENGTH, EmcyCode.RPDO_TIMEOUT}),
 }
 _LEVELS, _READY = int(Control.ACTIVE), int(Status.READY)
+LONGEST_STEP_DELAY = 0.1  # s: the probe's step lasts as long
 LARGEST_FROZEN_CHANGE = 100e-6  # m: fifty times the noise of the position sensor
 _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
 _LONGEST_PAUSE = 3.0  # heartbeat periods: then a node counts as silent
@@ -44,7 +45,9 @@ class ProtocolLimits:
     status: time in which status word and zero current follow the control word. missing: share of the cycles whose
     drive frame may be missing, late or of another cycle (default: none in lockstep, 0.001 in real time). response_*:
     from SYNC to the drive frame, in real time. heartbeat: tolerance of the median heartbeat period. gain: tolerance of
-    the loop's gain, 1. emcy: codes of node 2 allowed beyond the documented ones. probe: whether to run the probes.
+    the loop's gain, 1. step_delay: from a demand step to the first answer that follows it; above 0 for a controller
+    with a filter in its loop. emcy: codes of node 2 allowed beyond the documented ones. probe: whether to run the
+    probes.
     """
 
     status: Second = 2e-3
@@ -54,6 +57,7 @@ class ProtocolLimits:
     response_max: Second = 1e-3
     heartbeat: Second = 0.01
     gain: Annotated[float, "share"] = 0.1
+    step_delay: Second = 0.0
     emcy: tuple[int, ...] = ()
     probe: bool = True
 
@@ -62,6 +66,8 @@ class ProtocolLimits:
             value = getattr(self, key)
             _require(0 < value <= 1, key, f"above 0 and at most 1 s, not {value:g}")
         _require(self.missing is None or 0 <= self.missing <= 1, "missing", "a share of the cycles from 0 to 1")
+        _require(0 <= self.step_delay <= LONGEST_STEP_DELAY, "step_delay",
+                 f"0 s or more, at most {LONGEST_STEP_DELAY:g}, not {self.step_delay:g}")
         _require(0 < self.gain < 1, "gain", f"a share above 0 and below 1, not {self.gain:g}")
         _require(all(0 < code <= 0xFFFF for code in self.emcy), "emcy", "EMCY codes from 1 to 0xFFFF")
 
@@ -276,7 +282,8 @@ def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
     """Answer to the demand step of the probe, and whether a reset makes the controller forget."""
     first = record.probes[0]
     delay, detail = measure_step_delay(first)
-    yield _make_result("delay of the answer to a step", "current", delay, "ms", high=0.0, detail=detail)
+    yield _make_result("delay of the answer to a step", "current", delay, "ms", high=limits.step_delay * 1e3,
+                       detail=detail)
     if record.gains is not None:
         gain, detail = measure_gain(first, record.gains)
         tolerance = 100 * limits.gain

@@ -115,6 +115,14 @@ def read_blame(answer: dict[str, Any]) -> tuple[str, str]:
     return "bench" if answer["verdict"] == "INVALID_TIMING" else blamed, str(answer.get("why", ""))
 
 
+def disturb(victim: int, stall: float) -> None:
+    """Stop a process for `stall` s, or kill it if that is 0."""
+    with suppress(ProcessLookupError):  # the run was over before
+        os.kill(victim, signal.SIGSTOP if stall else signal.SIGKILL)
+        time.sleep(stall)
+        os.kill(victim, signal.SIGCONT)
+
+
 def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str) -> Trial:
     """One run with one stall or kill at a random cycle."""
     chance = random.Random(f"{case} {number}")
@@ -122,18 +130,15 @@ def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str)
     command = [sys.executable, "-m", "rig.cli.main", "run", str(sequence), "--bus", f"udp_multicast:{group}", "--pace",
                case.pace, "--json", "--plant", "builtin", "--out", str(out)]
     link = Link(open_can(f"udp_multicast:{group}"), time.monotonic_ns)
+    link.leave_out((codec.SYNC, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE))  # this program may be slow
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    is_reached = wait_for_cycle(link, chance.randrange(250, 1500), run)
+    is_reached = wait_for_cycle(link, 1, run)
+    victim = run.pid if case.process == "rig" else find_children(run.pid).get(case.process, 0)
+    is_reached &= victim != 0 and wait_for_cycle(link, chance.randrange(250, 1500), run)
     link.close()
     begin, begin_time = time.monotonic(), time.time()
     if is_reached:
-        victim = run.pid if case.process == "rig" else find_children(run.pid)[case.process]
-        if case.stall:
-            os.kill(victim, signal.SIGSTOP)
-            time.sleep(case.stall)
-            os.kill(victim, signal.SIGCONT)
-        else:
-            os.kill(victim, signal.SIGKILL)
+        disturb(victim, case.stall)
     output, errors = run.communicate(timeout=RUN_LIMIT)
     exit_seconds = time.monotonic() - begin
     try:

@@ -111,6 +111,8 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     else:
         text = f"{timing['cycles']} cycles in lockstep, {outcome.speed:.1f} times real time"
     lines = [Line("timing", text)]
+    if timing["reason"]:
+        lines.append(Line("real time", timing["reason"]))
     judged = outcome.attribution.judged
     if not judged.all():
         reasons = ", ".join(f"{name.replace('_', ' ')} {count}"

@@ -4,17 +4,22 @@ The sequence has no checks of its own.
 """
 from __future__ import annotations
 
+from math import nan
 from pathlib import Path
 
 import firmware_variants as variants
+import numpy as np
 import pytest
 from firmware_variants import Variant
 from short_sequences import job, play
 
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
+from rig.recorder import Signals, Timing
 from rig.run import participants
+from rig.run.history import History
 from rig.run.outcome import Outcome
+from rig.run.probe import find_gap
 
 HOLD = 'title = "Holds"\nmain = [{ kind = "hold", time = 0.4 }]\n'
 MOVE = """
@@ -89,6 +94,49 @@ def test_limits_of_the_sequence_count(tmp_path: Path, monkeypatch: pytest.Monkey
     for make in (variants.OneOfFifty, variants.GainLow, variants.SlowStatus, variants.HalfTheHeartbeats):
         assert failures(play_with(make, tmp_path, monkeypatch, lenient)) == set(), make
     assert EMCY not in failures(play_with(variants.StrangeEmcy, tmp_path, monkeypatch, lenient))
+
+
+class Filtered(Variant):
+    """A sound controller with a filter in its loop: the mean of the currents of the two cycles before."""
+
+    _last = (0.0, 0.0)
+
+    def answer(self, drive: variants.Drive) -> variants.Drive:
+        if drive.status & 7 != 7:
+            self._last = (0.0, 0.0)
+            return drive
+        mean, self._last = sum(self._last) / 2, (self._last[1], drive.current)
+        return drive._replace(current=mean)
+
+
+def test_a_controller_with_a_filter_passes_with_a_limit_of_its_own(tmp_path: Path,
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers a step one cycle late, and its gain over the few cycles of the probe is lower."""
+    assert DELAY in failures(play_with(Filtered, tmp_path, monkeypatch))
+    lenient = HOLD + "[protocol]\nstep_delay = 1e-3\ngain = 0.9\n"
+    assert failures(play_with(Filtered, tmp_path, monkeypatch, lenient)) == set()
+    assert DELAY not in failures(play_with(variants.OldCurrent, tmp_path, monkeypatch,
+                                           HOLD + "[protocol]\nstep_delay = 1e-3\n"))
+
+
+def test_a_longer_probe_changes_no_row(tmp_path: Path) -> None:
+    rows = []
+    for step_delay in (0.0, 20e-3):
+        play(job(MOVE + f"[protocol]\nstep_delay = {step_delay}\n"), tmp_path)
+        trace = Trace.read(tmp_path, all=True)
+        rows.append([trace.com, trace.xj, trace.cor, trace.xs])
+    assert np.array_equal(*rows)
+
+
+def test_a_gap_where_the_bench_was_late_is_not_the_controllers() -> None:
+    probe = History()
+    for k in range(10):
+        probe.add(Signals(k, 3, 0.0, 0.0, nan if k == 5 else 0.0, 0.0, 0.0, 0.0, 7, 7, 0),
+                  Timing(k, False, 0.0, 1e-4, 2e-4, 1e-4, 1e-4, 0.0))
+    on_time = np.ones(10, bool)
+    assert find_gap(probe, on_time, 10) == "controller" and find_gap(probe, on_time, 4) == ""
+    on_time[5] = False
+    assert find_gap(probe, on_time, 10) == "bench"
 
 
 def test_without_probes(tmp_path: Path) -> None:

@@ -48,6 +48,23 @@ def test_the_reference_firmware_reacts_and_recovers(tmp_path: Path, name: str, s
     assert (outcome.verdict, outcome.why) == ("PASS", "") and outcome.safe
 
 
+def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
+    """Supervision of SYNC and heartbeat, its own heartbeat, and the gains, which the run has set."""
+    from fdi.trace.mcap_log import open_log
+
+    outcome = play_sequence("reset_in_mid_run", tmp_path, set_={"controller.current_limit": 7e-3})
+    frames = [(message.cob_id, message.data) for _, _, message in open_log(tmp_path / "trace.mcap").messages("/can")]
+    booted = max(k for k, frame in enumerate(frames) if frame == (0x702, b"\0"))
+    started = next(k for k in range(booted, len(frames)) if frames[k] == (0x000, b"\x01\x02"))
+    written = {data[1:4]: data for cob_id, data in frames[booted:started] if cob_id == 0x602 and data[0] >> 5 == 1}
+    first = {data[1:4]: data for cob_id, data in frames[:booted] if cob_id == 0x602 and data[0] >> 5 == 1}
+    indexes = {int.from_bytes(key[:2], "little") for key in written}
+    assert indexes == {0x1006, 0x1016, 0x1017, firmware.GAINS}
+    assert all(first[key] == data for key, data in written.items() if key[:2] != b"\x17\x10")
+    assert written[b"\x17\x10\0"][4:6] == (100).to_bytes(2, "little")
+    assert outcome.verdict == "PASS"
+
+
 @pytest.mark.parametrize("name", [*LOSSES, "reset_in_mid_run"])
 def test_it_does_so_in_real_time(tmp_path: Path, name: str) -> None:
     """However late the machine is: the reaction is counted in cycles."""

@@ -13,7 +13,8 @@ import pytest
 from short_sequences import SHORT, job, kinds, play, stop_after
 
 from fdi.progress import ignore_progress
-from fdi.report.run_report import write_run_page
+from fdi.report.report import Line, Table
+from fdi.report.run_report import build_run_report, write_run_page
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
 from rig.network.clock import VirtualClock, WallClock
@@ -102,6 +103,23 @@ def test_trouble_is_the_safe_state_and_ends_main(tmp_path: Path) -> None:
     assert (setup, cleanup) == (50, 50) and 200 < main < 210
     assert not {check.name: check.passed for check in outcome.checks}["no emergency"]
     assert outcome.counters["plant_drive_missing"] == 3
+
+
+def test_the_page_has_a_section_for_the_first_cause(tmp_path: Path) -> None:
+    """With time and evidence, and what followed; a run without trouble has no such section."""
+    title = "First cause and consequences"
+    outcome = play(job(with_faults(SHORT, 'kind = "lost", frame = "feedback", start = 0.2')), tmp_path)
+    sections = {section.title: section for section in build_run_report(Trace.read(tmp_path, all=True)).sections}
+    texts = [item.text for item in sections[title].items if isinstance(item, Line)]
+    cause = outcome.to_json()["cause"]
+    assert any(cause["text"] in text and f"{cause['t']:.3f} s" in text for text in texts)
+    rows = [row for item in sections[title].items if isinstance(item, Table) for row in item.rows]
+    assert [row[2] for row in rows] == [each["text"] for each in outcome.to_json()["consequences"]] and len(rows) > 0
+    write_run_page(tmp_path, tmp_path / "p.html")
+    assert title in (tmp_path / "p.html").read_text()
+    play(job(), tmp_path / "sound")
+    write_run_page(tmp_path / "sound", tmp_path / "q.html")
+    assert title not in (tmp_path / "q.html").read_text()
 
 
 def test_a_sequence_may_be_about_trouble(tmp_path: Path) -> None:
