@@ -197,7 +197,8 @@ def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tu
     pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
     level = {"xj": simulate_reading_noise(model, trace.xj)} | {name: f.value for name, f in noise.items()}
     told = model.plant == BALANCED and {"p12", "xs"} & set(trace.outputs)
-    j = blocks.judge_jack(trace, model, run, pairs, level) if told else None
+    # the balances of flow and force take the measured signals as the true ones
+    j = blocks.judge_jack(trace, model, run, pairs, level) if told and not trace.filtered else None
     answered = found.ratio if model.kind.controller else None
     if j is None:
         ratios = blocks.collect_block_ratios(signal, None, None, None, answered)
@@ -245,7 +246,10 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
 
 def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> list[str]:
     """What a reader must know about the floor and about rows left out."""
-    said = []
+    said = [f"{name} of the model passes the sensor of the trace: {sensor.describe(trace.period, SIGNALS[name].unit)}"
+            for name, sensor in trace.sensors.items() if name in trace.outputs]
+    if trace.filtered:
+        said.append(f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor")
     apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
              if f.source == "repeats" and f.difference > REPEAT_DIFFERENCE_RATIO * f.value]
     if apart:

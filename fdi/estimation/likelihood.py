@@ -93,14 +93,14 @@ class Problem:
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
-        """XJ, P12 and XS of one run (default: the first), whichever were measured: (m, 3, n)."""
+        """XJ, P12 and XS of one run (default: the first), as its sensors show them, measured or not: (m, 3, n)."""
         key = tuple(names)
         if key not in self._lanes:
             bare = self.bare is not None and set(key) <= set(self.bare.values)
             self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.cor, trace.load, trace.position, self.anchor)
-        signals: Floats = out.transpose(0, 2, 1)
+        signals: Floats = trace.pass_sensors(out).transpose(0, 2, 1)
         return signals
 
     def compute_residuals(self, free: Sequence[Free], x: Floats) -> Floats:

@@ -64,10 +64,13 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | N
                  anchor: float = ANCHOR_RATE) -> Floats:
     """XJ, P12 and XS, (m, n, 3), of the plant driven by a current (default: the measured one), for each row of values.
 
+    They are what the sensors of the trace show of the plant.
+
     The replay starts at the first measured position, or in the middle where that is not known.
     """
-    position = trace.xj if has_known_start(trace) else None
-    return lanes.replay(values, trace.cor if current is None else current, trace.load, position, anchor)
+    position = trace.unlagged_position if has_known_start(trace) else None
+    out = lanes.replay(values, trace.cor if current is None else current, trace.load, position, anchor)
+    return trace.pass_sensors(out)
 
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
@@ -176,8 +179,9 @@ def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Col
     com = np.concatenate([np.full(before, trace.com[0]), trace.com])
     load = np.concatenate([np.full(before, trace.load[0]), trace.load])
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
-    out = lanes.closed_loop(np.empty((1, 0)), com, load)[0, before:]
-    whole = {"xj": out[:, 0], "cor": out[:, 1], "p12": out[:, 2], "xs": out[:, 3]}
+    out = lanes.closed_loop(np.empty((1, 0)), com, load)[0]
+    shown = trace.pass_sensors(out[:, [0, 2, 3]])[before:]
+    whole = {"cor": out[before:, 1]} | {name: shown[:, i] for i, name in enumerate(OUTPUTS)}
     left = {name: trace.measured(name) - whole[name] for name in trace.outputs}
     return left | {"cor": trace.measured("cor") - whole["cor"]}
 

@@ -1,4 +1,4 @@
-"""What a measuring chain does to a signal: moving mean, first-order lag, delay, rounding; applied to a model's output.
+"""What a measuring chain does to a signal: first-order lag, moving mean, delay, rounding; applied to a model's output.
 
 A filtered measurement is compared with a filtered model. The filters are those of the recording's logger; a moving mean
 of n samples is kept as its length in seconds, because the rows of a trace need not be the logger's.
@@ -39,8 +39,8 @@ class SensorDynamics:
         """Whether it changes nothing."""
         return not self.filters and self.quantum == 0.0
 
-    def describe(self, period: float) -> str:
-        """In a few words, for a trace of this period."""
+    def describe(self, period: float, unit: str = "") -> str:
+        """In a few words, for a trace of this period and a signal in this SI unit."""
         parts = []
         if self.lag:
             parts.append(f"lag {1e3 * self.lag:g} ms")
@@ -51,24 +51,34 @@ class SensorDynamics:
         if self.delay:
             parts.append(f"delay {1e3 * self.delay:.3g} ms")
         if self.quantum:
-            parts.append(f"steps of {self.quantum:.4g}")
+            parts.append(f"steps of {self.quantum:.4g} {unit}".rstrip())
         return ", ".join(parts)
 
     def apply(self, x: Floats, period: float) -> Floats:
-        """The sensor's output for the true signal `x`, (.., n), one sample a `period`; it rests before the first."""
+        """The sensor's output for the true signal `x`, (.., n), one sample a `period`; it rests before the first.
+
+        It is not rounded: a model that is rounded like the measurement would differ from it by more. What rounding
+        leaves belongs to the noise.
+        """
         if self.lag > 0.0:
             x = filter_lag(x, self.lag, period)
         if self.moving_mean > 1.0 or self.delay != 0.0:
             x = _convolve(x, *self._make_kernel(period))
-        if self.quantum > 0.0:
-            x = self.quantum * np.floor(x / self.quantum + 0.5)
         return x
 
-    def measure_noise_gain(self, period: float) -> float:
-        """RMS of what the chain makes of white noise of 1 that enters before the mean, rounding left out."""
-        if self.moving_mean <= 1.0 and self.delay == 0.0:
-            return 1.0
-        return float(np.sqrt(np.sum(self._make_kernel(period)[0] ** 2)))
+    def undo(self, y: Floats, period: float) -> Floats:
+        """The true signal from the output `y`, (n,), as far as its slow part goes: lag inverted, mean moved back.
+
+        The inverted lag raises the noise, so it serves where only the slow part counts.
+        """
+        if self.lag > 0.0:
+            y = y + self.lag * np.gradient(y, period)
+        late = 0.0 if self.centred else 0.5 * (self.moving_mean - 1.0) * (self.sample_period or period)
+        return advance_signal(y, (late + self.delay) / period)
+
+    def measure_noise(self, level: float) -> float:
+        """RMS of the output's noise for white noise of `level` in the logger's samples, with that of rounding."""
+        return math.hypot(level / math.sqrt(max(1.0, self.moving_mean)), self.quantum / math.sqrt(12.0))
 
     def _make_kernel(self, period: float) -> tuple[Floats, int]:
         """Weights of mean and delay on the rows, and the rows of the first one back from now (negative: ahead).
@@ -99,6 +109,20 @@ def filter_lag(x: Floats, time: float, period: float) -> Floats:
     start = x[..., :1]
     y, _ = lfilter([1.0 - r * (1.0 - a), r * (1.0 - a) - a], [1.0, -a], x - start, zi=np.zeros_like(start))
     out: Floats = y + start
+    return out
+
+
+def advance_signal(x: Floats, rows: float) -> Floats:
+    """`x`, (n,), so many rows earlier, on straight lines; the last value goes on, and NaN stays beside a NaN.
+
+    >>> advance_signal(np.arange(4.0), 1.5).tolist()
+    [1.5, 2.5, 3.0, 3.0]
+    """
+    n = len(x)
+    wanted = np.arange(n) + rows
+    left = np.clip(np.floor(wanted).astype(int), 0, n - 1)
+    right, part = np.clip(left + 1, 0, n - 1), wanted - np.floor(wanted)
+    out: Floats = (1.0 - part) * x[left] + part * x[right] if rows % 1.0 else x[left]
     return out
 
 

@@ -194,14 +194,37 @@ class Trace:
         """Where the outputs stand among the columns of a replay."""
         return [OUTPUTS.index(name) for name in self.outputs]
 
+    def pass_sensors(self, outputs: Floats) -> Floats:
+        """A model's XJ, P12 and XS, (.., n, 3), as the sensors of this trace show them."""
+        if not self.sensors:
+            return outputs
+        shown = outputs.copy()
+        for i, name in enumerate(OUTPUTS):
+            if name in self.sensors:
+                shown[..., i] = self.sensors[name].apply(outputs[..., i], self.period)
+        return shown
+
+    @property
+    def filtered(self) -> tuple[str, ...]:
+        """The outputs whose sensors filter or delay."""
+        return tuple(name for name in OUTPUTS if name in self.sensors and self.sensors[name].filters)
+
     @cached_property
     def position(self) -> Floats:
         """XJ as a replay is drawn to it: as measured, and known in the first row, where the replay starts."""
-        if not np.isnan(self.xj[0]):
-            return self.xj
-        position = self.xj.copy()
+        position = self.unlagged_position
+        if not np.isnan(position[0]):
+            return position
+        position = position.copy()
         position[0] = position[~np.isnan(position)][0]
         return position
+
+    @cached_property
+    def unlagged_position(self) -> Floats:
+        """XJ without the lag of its sensor: a replay drawn to it as measured would lag behind."""
+        if "xj" not in self.filtered:
+            return self.xj
+        return self.sensors["xj"].undo(self.xj, self.period)
 
     def with_notes(self, *notes: str) -> Trace:
         """The same trace with more notes."""

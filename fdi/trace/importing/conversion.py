@@ -16,6 +16,7 @@ from fdi.trace.importing.resampling import Samples, find_hold, measure_period, p
 from fdi.trace.importing.time_base import compute_times, require_growth
 from fdi.trace.importing.units import convert_to_si
 from fdi.trace.sensor_dynamics import SensorDynamics
+from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 
@@ -224,7 +225,7 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
     if signal.dead:
         parts.append("dead spans left out")
     if not sensor.is_ideal:
-        parts.append(f"model gets {sensor.describe(period)}")
+        parts.append(f"the model gets {sensor.describe(period, SIGNALS[signal.name].unit)}")
     return sensor, "; ".join(parts)
 
 

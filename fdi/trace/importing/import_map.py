@@ -10,7 +10,7 @@ from typing import Any
 
 from fdi.trace.importing.units import Unit, require_unit
 from fdi.trace.sensor_dynamics import SensorDynamics
-from fdi.trace.signals import SIGNALS
+from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, suggest_name
 
 REQUIRED_SIGNALS = ("com", "xj", "cor")
@@ -232,6 +232,9 @@ def _parse_signal(path: Path, name: str, values: Any) -> SignalMap:
     delay = table.take_number("delay", 0.0, expected="seconds that the signal is late")
     low_pass = table.take("low_pass", bool, "true or false")
     sensor, dead = _parse_sensor(table, term.scaling)
+    if sensor.filters and name not in OUTPUTS:
+        raise InputError(path, table.label("sensor"), f"moving_mean and lag for {', '.join(OUTPUTS)} alone; {name} is "
+                                                      "an input of the model and is used as recorded")
     table.close()
     base = None if time is None else _parse_time(_Table(path, f"signals.{name}.time", time))
     return SignalMap(name, term, other, base, float(delay or 0.0), method, low_pass, sensor, dead)

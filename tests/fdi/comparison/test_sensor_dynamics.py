@@ -1,0 +1,95 @@
+"""A filtered measurement is compared with a filtered model, and the filters are those that a logger makes."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from short_runs import STEPS, build_command
+
+from fdi.comparison.compare import Comparison, compare
+from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors, write_sensors
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+from plant.errors import InputError
+from rig.recorder.convert import write_mcap
+
+MEAN = SensorDynamics(moving_mean=20.0)
+
+
+@cache
+def run_nominal() -> Trace:
+    """The nominal plant with its sensors' noise, 2.5 s."""
+    return Trace.of(simulate(Model(), build_command()[:2500], None, 1, STEPS)._asdict(), 1e-3, {})
+
+
+def filter_by_loop(x: np.ndarray, sensor: SensorDynamics) -> np.ndarray:
+    """Lag and moving mean sample by sample at 1 kHz: nothing of the tested code."""
+    out, state = [], x[0]
+    fine = 50
+    for k in range(len(x)):
+        for i in range(1, fine + 1):  # Euler steps along the straight line to this sample
+            now = x[max(k - 1, 0)] + (x[k] - x[max(k - 1, 0)]) * (i - 0.5) / fine
+            state = state + (now - state) * 1e-3 / fine / sensor.lag if sensor.lag else x[k]
+        out.append(state)
+    n = round(sensor.moving_mean)
+    return np.array([np.mean([out[max(j, 0)] for j in range(k - n + 1, k + 1)]) for k in range(len(out))])
+
+
+def measure(sensors: Mapping[str, SensorDynamics], is_told: bool) -> Comparison:
+    """The nominal plant behind filters, compared with or without them."""
+    trace = run_nominal()
+    shown = {name: filter_by_loop(trace.column(name), sensor) for name, sensor in sensors.items()}
+    return compare(replace(trace, **shown, sensors=sensors if is_told else {}), Model())
+
+
+@pytest.mark.parametrize("sensors", [{"p12": SensorDynamics(moving_mean=8.0)}, {"xj": SensorDynamics(lag=5e-3)},
+                                     {"p12": SensorDynamics(lag=4e-3), "xs": SensorDynamics(moving_mean=5.0)}],
+                         ids=["moving mean", "lag", "both"])
+def test_filters_of_sensors_are_no_error_of_the_model(sensors: Mapping[str, SensorDynamics]) -> None:
+    """Told of the filter, compare leaves noise; not told, a multiple of it."""
+    told, untold = measure(sensors, True), measure(sensors, False)
+    for name in sensors:
+        assert told.signals[name].error < 1.6 * told.signals[name].floor.value
+        assert untold.signals[name].error > 4.0 * told.signals[name].error
+    assert any("passes the sensor" in note for note in told.notes)
+    assert all(told.blocks[block] is None for block in ("jack", "sensor"))
+
+
+def test_rounding_is_noise() -> None:
+    """A step of 1 bar is 0.29 bar of noise, beside the 0.2 bar of the sensor."""
+    trace = run_nominal()
+    rounded = replace(trace, p12=1e5 * np.round(trace.p12 / 1e5), sensors={"p12": SensorDynamics(quantum=1e5)})
+    found = compare(rounded, Model()).signals["p12"]
+    assert found.floor.value == pytest.approx(np.hypot(2e4, 1e5 / np.sqrt(12.0)), rel=1e-6)
+    assert 0.8 < found.ratio < 1.2
+
+
+def test_mean_of_the_loggers_samples() -> None:
+    """Of 40 samples at 2 kHz: 20 ms, and 9.75 ms late; a centred one is not late."""
+    ramp = np.arange(100.0)
+    late = SensorDynamics(moving_mean=40.0, sample_period=5e-4)
+    assert (ramp - late.apply(ramp, 1e-3))[50:] == pytest.approx(9.75)
+    centred = replace(late, centred=True)
+    assert (ramp - centred.apply(ramp, 1e-3))[30:70] == pytest.approx(0.0, abs=1e-9)
+    assert (ramp - SensorDynamics(delay=3.5e-3).apply(ramp, 1e-3))[10:] == pytest.approx(3.5)
+    assert (ramp - SensorDynamics(lag=2e-3).apply(ramp, 1e-3))[50:] == pytest.approx(2.0)
+    whole = replace(MEAN, lag=3e-3, delay=1e-3)
+    assert whole.undo(whole.apply(ramp, 1e-3), 1e-3)[45:80] == pytest.approx(ramp[45:80], abs=1e-3)
+
+
+def test_a_log_keeps_the_sensors(tmp_path: Path) -> None:
+    sensors = {"p12": replace(MEAN, sample_period=5e-4, lag=1e-3), "xj": SensorDynamics(quantum=2.5e-5)}
+    write_mcap(replace(run_nominal(), sensors=sensors), tmp_path / "x.mcap")
+    assert Trace.read(tmp_path / "x.mcap").sensors == sensors
+    assert read_sensors("x", write_sensors(sensors)) == sensors
+
+
+@pytest.mark.parametrize("text", ["no json", "[]", '{"lag": -1}', '{"lag": "x"}', '{"speed": 1}',
+                                  '{"moving_mean": 1e9}', '{"delay": NaN}'])
+def test_damaged_dynamics_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"x\.mcap: metadata run\.sensor\.p12: expected a sensor's dynamics"):
+        read_sensors("x.mcap", {"sensor.p12": text})
