@@ -29,7 +29,8 @@ WORDS: Mapping[str, Sequence[tuple[str, float]]] = {
            ("pos|position|stroke|displacement|weg|hub|course|deplacement|recorrido|posicion|posizione|corsa|lage", 2),
            ("ram|rod|piston|kolben|jack|cylinder|zylinder|verin|cilindro", 1)),
     "p12": (("p12|dp|delta ?p|differenzdruck|pl", 3),
-            ("pressure|druck|pression|presion|pressione|press|p", 2), ("diff|difference|load|last", 1)),
+            ("pressure|druck|pression|presion|pressione|press|p", 2), ("diff|difference|load|last", 1),
+            ("pa|pb|p1|p2", 2)),
     "xs": (("xs|spool|schieber|tiroir|corredera|cursore", 3), ("valve ?pos|ventilweg|ventilhub", 3)),
     "cor": (("cor|current|strom|courant|corriente|corrente|ventilstrom", 3), ("i|iv|servo|coil", 1.5),
             ("valve|ventil|vanne|valvula", 0.5)),
@@ -53,6 +54,7 @@ class Guess:
     unit: str = ""
     sign: int = 1
     reasons: list[str] = field(default_factory=list)
+    minus: str = ""  # a column that is subtracted
 
     @property
     def confidence(self) -> str:
@@ -71,7 +73,7 @@ def guess_map(measurement: Measurement) -> GuessedMap:
     """The map of a recording whose meaning is not known."""
     data = _read_numbers(measurement)
     time_lines, time_source, time_confidence = _guess_time(measurement, data)
-    free = {name: x for name, x in data.items() if name != time_source and float(np.ptp(x)) > 0.0}
+    free = {name: x for name, x in data.items() if name != time_source}
     found = _assign(measurement, free)
     _find_signs(found, free)
     chosen = {"time": (time_source or "its own times", time_confidence)}
@@ -81,7 +83,7 @@ def guess_map(measurement: Measurement) -> GuessedMap:
              *time_lines, ""]
     for name in SIGNAL_NAMES:
         lines += _list_signal_lines(name, found.get(name), measurement)
-    used = {guess.source for guess in found.values()} | {time_source}
+    used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
     left = [f"{name}{_describe_range(data[name])}" if name in data else f"{name} (no numbers)"
             for name in measurement.units if name not in used]
     if left:
@@ -200,7 +202,7 @@ def _assign(measurement: Measurement, data: Mapping[str, Floats]) -> dict[str, G
     """Each signal's column: the pair of most points first."""
     rated = []
     for column, x in data.items():
-        for name in SIGNAL_NAMES:
+        for name in SIGNAL_NAMES if float(np.ptp(x)) > 0.0 else ():
             guess = _rate(measurement, name, column, x)
             if guess is not None:
                 rated.append((name, guess))
@@ -210,6 +212,7 @@ def _assign(measurement: Measurement, data: Mapping[str, Floats]) -> dict[str, G
         if name not in found and guess.source not in {g.source for g in found.values()}:
             found[name] = guess
     _guess_by_motion(found, measurement, data)
+    _pair_chambers(found, data)
     return {name: found[name] for name in SIGNAL_NAMES if name in found}
 
 
@@ -261,6 +264,23 @@ def _is_plausible(name: str, size: float, unit: str) -> bool:
     """Whether an amplitude in a unit is one that the signal of an actuator has."""
     low, high, _ = RANGES[name]
     return low <= float(convert_to_si(np.array([size]), UNITS[unit])[0]) <= high
+
+
+def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
+    """P12 from the pressures of two chambers: columns whose names differ by A and B, or by 1 and 2, alone."""
+    guess = found.get("p12")
+    if guess is None:
+        return
+    for first, second in (("a", "b"), ("1", "2")):
+        mine = re.sub(r"[^a-z0-9]", "", _plain(guess.source))
+        for column in data:
+            other = re.sub(r"[^a-z0-9]", "", _plain(column))
+            places = [i for i, (x, y) in enumerate(zip(mine, other, strict=False)) if x != y]
+            if len(mine) == len(other) and len(places) == 1 and {mine[places[0]], other[places[0]]} == {first, second}:
+                source, minus = (guess.source, column) if mine[places[0]] == first else (column, guess.source)
+                guess.source, guess.minus, guess.points = source, minus, min(guess.points, 4.0)
+                guess.reasons.append("two chambers: check that the first one extends the ram")
+                return
 
 
 def _guess_by_motion(found: dict[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
@@ -365,6 +385,8 @@ def _list_signal_lines(name: str, guess: Guess | None, measurement: Measurement)
                 f'# unit = "{SIGNALS[name].unit}"', ""]
     lines = [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
              f"source = {_quote(guess.source)}", f'unit = "{guess.unit}"']
+    if guess.minus:
+        lines.append(f"minus = {_quote(guess.minus)}")
     if guess.sign < 0:
         lines.append("sign = -1")
     said = measurement.units[guess.source]

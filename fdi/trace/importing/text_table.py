@@ -251,8 +251,9 @@ def _find_separators(path: Path, lines: list[str], separator: str | None, decima
             if dec == sep or width < 2:
                 continue
             parse = _make_number_parser(dec)
-            cells = [cell for row in rows if len(row) == width for cell in row]
-            share = sum(_is_number(cell, parse) for cell in cells) / len(cells)
+            cells = [cell for row in rows if len(row) == width and any(_is_number(cell, parse) for cell in row)
+                     for cell in row]
+            share = sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)
             score = len(cells) * share**3
             if score > best:
                 best, found = score, (sep, dec)

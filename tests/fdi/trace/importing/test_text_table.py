@@ -42,6 +42,11 @@ def test_units_from_a_line_and_from_brackets(tmp_path: Path) -> None:
     assert table.units == {"Zeit": "s", "Weg [mm]": "mm", "p": "bar", "Weg [mm] #2": "mm"}
 
 
+def test_units_below_names_in_a_table_with_tabulators(tmp_path: Path) -> None:
+    (tmp_path / "x.tsv").write_text("Ram Position\tp\n m\tMPa\n0\t1\n1\t2\n")
+    assert open_text_table(tmp_path / "x.tsv").units == {"Ram Position": "m", "p": "MPa"}
+
+
 def test_missing_fields_and_dates(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("when,x,y\n2024-05-01T12:00:00.000,1,2\n2024-05-01T12:00:00.001,NaN,2\n"
                                     "2024-05-01T12:00:00.003,,n/a\n")
