@@ -39,7 +39,8 @@ from rig.network.raw_bus import (
     split_words,
 )
 from rig.nodes.cycle_record import RING
-from rig.sequences.faults import Delay, Drop, Schedule
+from rig.sequences.faults import Schedule
+from rig.sequences.frame_faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 from rig.sequences.injection import AddedSignal
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
@@ -58,11 +59,12 @@ INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 (STATE, BEGUN, FIRST, CYCLE, CHANGED, MISSED, WAITING, WAITING_DATA, CURRENT, STATUS_WORD, ANSWERED, MISSING, LATE,
  ZEROED, FEEDBACK_COUNT, VALVE_COUNT, NOISE_USED, PLANT_CYCLE, HELD, ORDER, NOW, EVENTS, RECORDED, LAST_SYNC,
  LONGEST_WAKE, LONGEST_RESPONSE, LONGEST_CYCLE, XJ, P12, XS, FLAGS, FRAME_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID,
- PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE, RESET_COMMAND) = range(16, 57)
+ PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE, RESET_COMMAND, SYNCED) = range(16, 58)
 # .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
-(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, PARAMETER_VALUES_AT, SIGNALS, SIGNALS_AT, STUCK_AT, ADDED_AT, FRAMES, FRAMES_AT,
- HITS_AT, LOAD, LOAD_AT, FLAT, FLAT_AT, LIVE_AT, RECORD_SIZE, ADVANCE, READ) = range(64, 83)
-LEVELS_AT, SENSORS_AT = 84, 87  # of the three transducers: where their noise is in the record, their value in the state
+(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, PARAMETER_VALUES_AT, SIGNALS, SIGNALS_AT, STUCK_AT, ADDED_AT, LOAD, LOAD_AT,
+ FLAT, FLAT_AT, LIVE_AT, RECORD_SIZE, ADVANCE, READ) = range(64, 80)
+LEVELS_AT, SENSORS_AT = 80, 83  # of the three transducers: where their noise is in the record, their value in the state
+HITS_AT = 86  # of the kinds of frames below: where the rows begin, and behind the last where they end
 _WORDS = 96
 EVENTS_AT, _HELD_AT = _WORDS, _WORDS + EVENT_RING
 TIMES_AT = _HELD_AT + 6 * _HELD
@@ -76,11 +78,10 @@ ENDED, RESET, BROKEN = 0, 1, 2
 TIMEOUT_RAISED, TIMEOUT_CLEARED, DRIVE_SHORT, DRIVE_WHOLE, DIVERGED, SYNC_MALFORMED = range(1, 7)
 COMMANDED = 256  # + the NMT command
 
-_FEEDBACK, _VALVE, _DRIVE = range(3)  # frames that faults act on
-_FRAMES = ("feedback", "valve_state", "drive")
+_FEEDBACK, _VALVE, _DRIVE, _SYNC, _BUS_OFF = range(5)  # what faults act on; bus-off is on the whole node
+_FRAMES = ("feedback", "valve_state", "drive", "sync")
 _SIGNALS = ("xj", "p12", "xs")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
-_DROP = -1
 
 _DRIVE_MISSING, _DRIVE_LATE, _CURRENT_ZEROED = 1, 2, 4  # codec.Flags
 _LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
@@ -101,8 +102,7 @@ class Memory(NamedTuple):
 
     The faults: parameters are rows of (place in the record, first cycle, end, number of the parameter), and of (base,
     value, ramp in s); signals are rows of (signal, kind, first cycle, end, place among the added values), and of
-    (value, last reading) where stuck; frames are rows of (frame, first cycle, cycles, first bit, delay in ns, -1:
-    dropped), and a bit a cycle.
+    (value, last reading) where stuck; frames are rows of (cycle, code, argument), see `Schedule.list_frame_hits`.
 
     reals: current in force, A; period, s; readings of the transducers; a ring of noise, NOISES a cycle;
     real numbers of the faults; load, N a cycle; state and parameters of the plant.
@@ -132,10 +132,11 @@ def run_emulator(port: Port, m: Memory) -> int:
             status, t_ns, cob_id, length, data = await_frame(port)
         if status == FRAME:
             if cob_id == words[SYNC_ID]:
-                _take_sync(port, m, t_ns, length)
+                if not words[BEGUN] or _is_next_sync(port, m, t_ns):
+                    _take_sync(port, m, t_ns, length)
             elif cob_id == words[DRIVE_ID]:
                 _take_drive(m, t_ns, length, data)
-            elif cob_id == 0 and length == 2 and _take_command(m, data):
+            elif cob_id == 0 and length == 2 and not _is_bus_off(m, words[CYCLE] - 1) and _take_command(m, data):
                 return RESET
         elif status < 0:
             words[FAILURE] = status
@@ -191,14 +192,15 @@ def _post_event(m: Memory, event: int) -> None:
 
 
 def _take_drive(m: Memory, t_ns: int, length: int, data: int) -> None:
-    """A drive frame came; a fault may drop or delay it."""
+    """A drive frame came; a fault may drop, delay or change it. One that comes twice counts once."""
     words = m.words
-    action = _find_action(m, _DRIVE, words[CYCLE] - 1)
-    if action == 0:
-        _keep_drive(m, length, data)
-    elif action > 0:
+    code, argument = _find_action(m, _DRIVE, words[CYCLE] - 1)
+    if code == DELAY:
         now = t_ns if words[PERIOD] else words[NOW]
-        _hold_frame(m, now + action, words[DRIVE_ID], length, data, _DRIVE)
+        _hold_frame(m, now + argument, words[DRIVE_ID], length, data, _DRIVE)
+    elif code != DROP:
+        length, data = change_frame(code, argument, length, data)
+        _keep_drive(m, length, data)
 
 
 def _keep_drive(m: Memory, length: int, data: int) -> None:
@@ -227,10 +229,8 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     """One cycle of the plant; while the node is not OPERATIONAL, time goes on and the plant pauses."""
     words = m.words
     begun_ns = _read_time(port, m, t_ns)
-    while words[NOISE_USED] >= words[NOISE_FILLED]:  # the services draw a minute ahead; never repeat a number
-        if words[STOP]:
-            return
-        sleep_until(port, read_clock(port) + 100_000)
+    if not _wait_for_noise(port, m):
+        return
     if not words[PERIOD]:  # lockstep: what was late is late for the cycle that ends now
         _release_until(port, m, words[CYCLE] * words[CYCLE_TIME] - 1, True)
         words[NOW] = words[CYCLE] * words[CYCLE_TIME]
@@ -276,6 +276,67 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
             _release_until(port, m, end, is_fed)
 
 
+def _wait_for_noise(port: Port, m: Memory) -> bool:
+    """Until the services, which draw a minute ahead, have drawn the noise of this cycle: no number is used twice.
+
+    False when the loop is to end.
+    """
+    words = m.words
+    while words[NOISE_USED] >= words[NOISE_FILLED]:
+        if words[STOP]:
+            return False
+        sleep_until(port, read_clock(port) + 100_000)
+    return True
+
+
+def _is_next_sync(port: Port, m: Memory, t_ns: int) -> bool:
+    """Deal with the SYNCs that faults suppress or repeat; whether this one begins a cycle. See `Emulator.receive`."""
+    words = m.words
+    if _is_bus_off(m, words[CYCLE]):
+        _pass_cycle(port, m)
+        return False
+    while _find_action(m, _SYNC, words[CYCLE])[0] == DROP:  # time went on for the plant
+        _pass_cycle(port, m)
+    if words[SYNCED] == words[CYCLE] - 1 and _find_action(m, _SYNC, words[SYNCED])[0] == DOUBLE:
+        words[SYNCED] = -1
+        if words[STATE] == OPERATIONAL:
+            _answer_again(port, m, t_ns)
+        return False
+    words[SYNCED] = words[CYCLE]
+    return True
+
+
+@keep_apart
+def _pass_cycle(port: Port, m: Memory) -> None:
+    """A cycle of which the node hears no SYNC: the current stays, and is zeroed after three."""
+    words = m.words
+    k = words[CYCLE]
+    if words[STATE] == OPERATIONAL:
+        if not _wait_for_noise(port, m):
+            return
+        words[MISSED] += 1
+        words[MISSING] += 1
+        if words[MISSED] >= MISSED_LIMIT:
+            m.reals[_CURRENT] = 0.0
+            _announce_timeout(port, m, 1)
+        _set_parameters(m, k, words[CHANGED])
+        words[CHANGED] = k
+        _advance_plant(m, k)
+    words[CYCLE] = k + 1
+
+
+@keep_apart
+def _answer_again(port: Port, m: Memory, t_ns: int) -> None:
+    """Send the PDOs of the last SYNC once more; the plant does not move twice."""
+    words = m.words
+    k = words[CYCLE]
+    if words[FEEDBACK_ID] >= 0 and 1 <= words[FEEDBACK_TYPE] <= _LAST_SYNCHRONOUS:
+        _send_unless_faulty(port, m, _FEEDBACK, words[FEEDBACK_ID], join_halves(words[XJ], words[P12]), k, t_ns)
+    if words[VALVE_ID] >= 0 and 1 <= words[VALVE_TYPE] <= _LAST_SYNCHRONOUS:
+        data = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
+        _send_unless_faulty(port, m, _VALVE, words[VALVE_ID], data, k, t_ns)
+
+
 def _read_time(port: Port, m: Memory, t_ns: int) -> int:
     """The time for the record, ns; in lockstep, where nobody reads it, that of the SYNC."""
     if m.words[PERIOD]:
@@ -317,7 +378,7 @@ def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
     data = register << 16
     if raised:
         data = _TIMEOUT_CODE | (register | _TIMEOUT_REGISTER) << 16 | 1 << 24
-    if words[EMCY_ID] >= 0:
+    if words[EMCY_ID] >= 0 and not _is_bus_off(m, words[CYCLE] - 1):
         _send(port, m, words[EMCY_ID], 8, data)
 
 
@@ -420,14 +481,18 @@ def _count_down(words: Words, kind: int, count: int, cob_id: int) -> bool:
 
 
 def _send_unless_faulty(port: Port, m: Memory, what: int, cob_id: int, data: int, k: int, t_ns: int) -> bool:
-    action = _find_action(m, what, k)
-    if action == 0:
-        _send(port, m, cob_id, 8, data)
-        return True
-    if action > 0:
+    """Send a frame of cycle k as a fault leaves it; whether it went out now."""
+    code, argument = _find_action(m, what, k)
+    if code == DELAY:
         now = t_ns if m.words[PERIOD] else m.words[NOW]
-        _hold_frame(m, now + action, cob_id, 8, data, what)
-    return False
+        _hold_frame(m, now + argument, cob_id, 8, data, what)
+    if code in (DELAY, DROP):
+        return False
+    length, data = change_frame(code, argument, 8, data)
+    _send(port, m, cob_id, length, data)
+    if code == DOUBLE:
+        _send(port, m, cob_id, length, data)
+    return True
 
 
 # ------------------------------------------------------------------------------------ late frames
@@ -540,17 +605,25 @@ def _await_drive(port: Port, m: Memory) -> None:
 # ------------------------------------------------------------------------------------ faults
 
 
-def _find_action(m: Memory, what: int, k: int) -> int:
-    """What happens to a frame of cycle k: 0 nothing, -1 dropped, else the delay in ns."""
+@keep_apart
+def _find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
+    """What happens to a frame of cycle k: code and argument (frame_faults.py)."""
     words = m.words
-    for i in range(words[FRAMES]):
-        at = words[FRAMES_AT] + 5 * i
-        place = k - words[at + 1]
-        if words[at] == what and 0 <= place < words[at + 2]:
-            bit = words[at + 3] + place
-            if words[words[HITS_AT] + (bit >> 5)] >> (bit & 31) & 1:
-                return _integer(words[at + 4])
-    return 0
+    low, end = _integer(words[HITS_AT + what]), _integer(words[HITS_AT + what + 1])
+    high = end
+    while low < high:  # the first row that is not before cycle k
+        middle = low + (high - low) // 6 * 3
+        if words[middle] < k:
+            low = middle + 3
+        else:
+            high = middle
+    if low < end and words[low] == k:
+        return _integer(words[low + 1]), _integer(words[low + 2])
+    return SENT_NORMALLY, 0
+
+
+def _is_bus_off(m: Memory, k: int) -> bool:
+    return _find_action(m, _BUS_OFF, k)[0] != SENT_NORMALLY
 
 
 def _set_parameters(m: Memory, k: int, before: int) -> None:
@@ -605,12 +678,6 @@ def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
 # ------------------------------------------------------------------------------------ made before the start
 
 
-def can_inject(schedule: Schedule) -> bool:
-    """Whether the loop knows all faults of the emulator's frames: lost and late ones."""
-    known = all(schedule.list_actions(name) <= {Drop, Delay} for name in _FRAMES)
-    return known and schedule.list_actions("sync") <= {Delay} and not schedule.has_bus_off("plant")
-
-
 def make_memory(model: Model, load: list[float], schedule: Schedule, advance: int = 0, read: int = 0) -> Memory:
     """Memory of the loop for a plant at rest, its load (N a cycle) and its faults; no noise is drawn yet.
 
@@ -632,24 +699,19 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
                 kind = _HOLDS_READING if change.value is None else _HOLDS_VALUE
                 signals.append((number, kind, change.cycles.start, change.cycles.stop, 0))
             stuck.append((getattr(change, "value", None) or 0.0, 0.0))
-    frames: list[tuple[int, ...]] = []
-    hits = b""
-    for number, name in enumerate(_FRAMES):
-        for first, hit, action in schedule.list_frame_faults(name):
-            delay = action.ns if isinstance(action, Delay) else _DROP
-            frames.append((number, first, len(hit), len(hits), delay))
-            hits += hit
-    bits = np.packbits(np.frombuffer(hits + bytes(-len(hits) % 32), np.uint8), bitorder="little").view(np.uint32)
+    off = schedule.list_bus_off_cycles("plant")
+    hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
     record = model.record()
     state = list_state_values(model.state())
-    words, places = _join_tables(_TABLES_AT, np.int64, [row for row, _ in parameters], signals, frames, bits)
+    words, places = _join_tables(_TABLES_AT, np.int64, [row for row, _ in parameters], signals, *hits)
     reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, [values for _, values in parameters], stuck, added,
                                       load, state, record.view(np.float64))
     words[CHANGED], words[STATE] = -1, INITIALISING
     words[CYCLE_TIME] = round(model["controller.period"] * 1e9)
-    words[PARAMETERS], words[SIGNALS], words[FRAMES] = len(parameters), len(signals), len(frames)
+    words[PARAMETERS], words[SIGNALS], words[SYNCED] = len(parameters), len(signals), -1
     words[LOAD], words[FLAT] = len(load), len(state)
-    words[PARAMETERS_AT], words[SIGNALS_AT], words[FRAMES_AT], words[HITS_AT], _ = places
+    words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
+    words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]
     (words[PARAMETER_VALUES_AT], words[STUCK_AT], words[ADDED_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT],
      _) = real_places
     words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read

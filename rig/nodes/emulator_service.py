@@ -8,7 +8,7 @@ in its socket.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -31,7 +31,7 @@ from rig.network.frame import Frame, Send
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.cycle_record import RING, CycleRecord, encode_cycle_record
-from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, Emulator, accept_scenario
+from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, accept_scenario
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import Plan, Schedule
@@ -50,11 +50,8 @@ class EmulatorService:
     `send` is for the services; the loop uses `bus`. `is_locked`: the memory of the process is locked.
     """
 
-    def __init__(self, send: Send, bus: RawBus, scenario: Scenario | None = None, is_locked: bool = False,
-                 leave_out: Callable[[Collection[int]], None] = lambda cob_ids: None) -> None:
-        """`leave_out(cob_ids)`: the services need not hear these frames."""
-        self._send, self._bus, self._is_locked, self._leave_out = send, bus, is_locked, leave_out
-        self._slow: Emulator | None = None  # takes over for faults that the loop does not know
+    def __init__(self, send: Send, bus: RawBus, scenario: Scenario | None = None, is_locked: bool = False) -> None:
+        self._send, self._bus, self._is_locked = send, bus, is_locked
         self._thread: threading.Thread | None = None
         self._kind = _COMPILED
         self._obeying = False  # an NMT command, which the loop obeys by itself
@@ -75,9 +72,6 @@ class EmulatorService:
             InputError: a scenario that cannot be run; the previous one stays.
         """
         schedule = Schedule(scenario.plan, scenario.model.values)
-        if not ec.can_inject(schedule):
-            self._hand_over(scenario)
-            return
         memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
         with self._stop_loop():
             state = self._memory.words[ec.STATE] if self._scenario else ec.INITIALISING
@@ -86,10 +80,7 @@ class EmulatorService:
 
     def receive(self, frame: Frame) -> None:
         """A frame for the services arrived."""
-        if self._slow is not None:
-            self._slow.receive(frame)
-            return
-        if frame.cob_id in LEFT_OUT:
+        if frame.cob_id in LEFT_OUT or self._is_bus_off():
             return
         self._book_events()
         if frame.cob_id == _SDO:
@@ -102,9 +93,6 @@ class EmulatorService:
         Raises:
             RigError: the loop's bus is gone.
         """
-        if self._slow is not None:
-            self._slow.tick(t_ns)
-            return
         self._book_events()
         last = int(self._memory.words[ec.LAST_SYNC])
         if last != self._last_sync:
@@ -118,18 +106,6 @@ class EmulatorService:
     def close(self) -> None:
         """Stop the loop."""
         self._halt()
-
-    def _hand_over(self, scenario: Scenario) -> None:
-        """Let the emulator in Python take over, in soft real time, for as long as this program runs."""
-        slow = Emulator(self._send_later, scenario)
-        self._halt()
-        slow.tick(self.device.t_ns)  # its boot-up is not sent: the node has booted
-        self._slow = slow
-        self._leave_out(())
-
-    def _send_later(self, cob_id: int, data: bytes) -> None:
-        if self._slow is not None:
-            self._send(cob_id, data)
 
     # -- the loop's thread
 
@@ -203,7 +179,12 @@ class EmulatorService:
         is_begun = words[ec.BEGUN] and not words[ec.FIRST]  # before the first SYNC there is no cycle
         if cob_id == _HEARTBEAT and is_begun and not self._schedule.is_heartbeat_alive("plant", int(words[ec.CYCLE])):
             return
-        self._send(cob_id, data)
+        if not self._is_bus_off():
+            self._send(cob_id, data)
+
+    def _is_bus_off(self) -> bool:
+        """Whether a fault has the node bus-off: it neither sends nor receives."""
+        return self._schedule.is_bus_off("plant", int(self._memory.words[ec.CYCLE]) - 1)
 
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         if new is NmtState.INITIALISING:

@@ -27,6 +27,7 @@ from rig.network.raw_bus import (
     split_halves,
     split_words,
 )
+from rig.sequences.frame_faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 
 DONE, WAITING = 0, 1  # what the functions return; negative: status of the bus (raw_bus.FAILED, NO_TURN)
 XJ_CAME, XS_CAME, COR_CAME = 1, 2, 4  # bits of ANSWERS
@@ -39,12 +40,16 @@ ALL_CAME = XJ_CAME | XS_CAME | COR_CAME
 (DUE, HEAD, CANCEL_DONE, IDLE_FROM, CYCLES, OVERRUNS, UNDERRUNS, ROWS, FRAMES, COMPLETE_UNTIL, LOST_RECORDS) = range(
     16, 27)
 # Words of the cycle alone
-(OPEN, SYNC_AT, SEEN, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, RAW, CONTROL, DELAY,
- POSITION, IS_HELD) = range(32, 47)
+(OPEN, SYNC_AT, SEEN, STAGE, ANSWER_LIMIT, MISSED, HELD, FRAMES_WRITTEN, AWAKE_SINCE, WORKED, RAW, CONTROL, POSITION,
+ IS_HELD, COMMAND_CODE, COMMAND_ARGUMENT, SYNC_CODE, SYNC_ARGUMENT, DEAF, PLANT_FRAMES_LEFT, DRIVES_LEFT) = range(
+    32, 53)
 WORDS = 64
 # Columns of an input
-RAW_DEMAND, CONTROL_WORD, COMMAND_DELAY = range(3)
-LOST = -1  # a command delay: the frame is never sent
+(RAW_DEMAND, CONTROL_WORD,
+ COMMAND_FAULT, COMMAND_FAULT_ARGUMENT, SYNC_FAULT, SYNC_FAULT_ARGUMENT,  # frame_faults.py
+ IS_DEAF,  # a fault: the rig receives nothing
+ PLANT_FRAMES, DRIVES) = range(9)  # lockstep: how many are to be awaited; 0: until each answer has come
+INPUT_COLUMNS = 9
 # Columns of a row
 (CYCLE, INPUT, INPUT_HELD, WORD, DUE_AT, LATENESS, OVERRUN, ANSWERS, FEEDBACK_AT, VALVE_AT, DRIVE_AT, COMPLETE_AT,
  EXECUTION, XJ, P12, XS, FLAGS, COR, STATUS) = range(19)
@@ -53,6 +58,7 @@ COLUMNS = 19
 TIME, FRAME_HEAD, DATA = range(3)
 
 _LONG_WAIT = 20_000_000  # ns: answers that may take this long are awaited to 20 ms, with fewer system calls
+_SECOND_ANSWER_LIMIT = 80_000_000  # ns
 _PATIENCE = 5  # cycles in a row without all answers: a node that is gone must not make clean-up last minutes
 
 
@@ -60,7 +66,7 @@ class Buffers(NamedTuple):
     """Memory shared by the cycle and Python: single words, and rings of which word n is at n modulo the length."""
 
     words: NDArray[np.int64]
-    inputs: NDArray[np.int64]  # (cycles ahead, 3)
+    inputs: NDArray[np.int64]  # (cycles ahead, INPUT_COLUMNS)
     rows: NDArray[np.int64]  # (cycles, COLUMNS)
     frames: NDArray[np.int64]  # (frames, 3)
     held: NDArray[np.int64]  # (late commands, 2): time at which to send, payload; the earliest first
@@ -71,8 +77,8 @@ def make_buffers(ahead: int, rows: int, frames: int, held: int) -> Buffers:
     def make_block(count: int, columns: int) -> NDArray[np.int64]:
         return np.full((count, columns), 0, np.int64)  # unlike zeros it touches every page
 
-    return Buffers(np.full(WORDS, 0, np.int64), make_block(ahead, 3), make_block(rows, COLUMNS), make_block(frames, 3),
-                   make_block(held, 2))
+    return Buffers(np.full(WORDS, 0, np.int64), make_block(ahead, INPUT_COLUMNS), make_block(rows, COLUMNS),
+                   make_block(frames, 3), make_block(held, 2))
 
 
 def play_realtime(port: Port, buffers: Buffers) -> int:
@@ -130,7 +136,7 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
         words[ANSWER_LIMIT] = words[SYNC_AT] + grace
         words[STAGE] = WAITING
         _end_work(port, words)
-    while words[SEEN] != ALL_CAME:
+    while words[SEEN] != ALL_CAME or words[PLANT_FRAMES_LEFT] > 0 or words[DRIVES_LEFT] > 0:
         if words[ANSWER_LIMIT] - words[SYNC_AT] >= _LONG_WAIT:
             status, t_ns, cob_id, length, data = await_frame(port)
         else:
@@ -139,7 +145,7 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
             _accept_frame(buffers, t_ns, cob_id, length, data)
         elif status < 0:
             return status
-        elif read_clock(port) >= words[ANSWER_LIMIT]:
+        elif read_clock(port) >= _find_answer_limit(words):
             break
         else:
             return WAITING
@@ -157,6 +163,14 @@ def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
     return DONE
 
 
+def _find_answer_limit(words: NDArray[np.int64]) -> int:
+    """How long to wait; not long if only a second drive frame is missing: not every controller answers twice."""
+    limit = int(words[ANSWER_LIMIT])
+    if words[SEEN] == ALL_CAME and words[PLANT_FRAMES_LEFT] <= 0:
+        limit = min(limit, int(words[SYNC_AT]) + _SECOND_ANSWER_LIMIT)
+    return limit
+
+
 def _take_input(buffers: Buffers) -> bool:
     """Take the next input from the queue; from an empty one the last input again, or nothing (False) at the end."""
     words = buffers.words
@@ -168,7 +182,12 @@ def _take_input(buffers: Buffers) -> bool:
         slot = head % len(buffers.inputs)
         words[RAW] = buffers.inputs[slot, RAW_DEMAND]
         words[CONTROL] = buffers.inputs[slot, CONTROL_WORD]
-        words[DELAY] = buffers.inputs[slot, COMMAND_DELAY]
+        words[COMMAND_CODE] = buffers.inputs[slot, COMMAND_FAULT]
+        words[COMMAND_ARGUMENT] = buffers.inputs[slot, COMMAND_FAULT_ARGUMENT]
+        words[SYNC_CODE] = buffers.inputs[slot, SYNC_FAULT]
+        words[SYNC_ARGUMENT] = buffers.inputs[slot, SYNC_FAULT_ARGUMENT]
+        words[DEAF] = buffers.inputs[slot, IS_DEAF]
+        words[PLANT_FRAMES_LEFT], words[DRIVES_LEFT] = buffers.inputs[slot, PLANT_FRAMES], buffers.inputs[slot, DRIVES]
         words[POSITION], words[IS_HELD] = head, 0
         if head < words[OVERRIDE_LIMIT]:
             words[CONTROL] = words[OVERRIDE]
@@ -176,7 +195,9 @@ def _take_input(buffers: Buffers) -> bool:
         return True
     if words[FINISH]:
         return False
-    words[DELAY], words[IS_HELD] = 0, 1
+    words[COMMAND_CODE] = words[SYNC_CODE] = SENT_NORMALLY
+    words[DEAF] = words[PLANT_FRAMES_LEFT] = words[DRIVES_LEFT] = 0
+    words[IS_HELD] = 1
     if head <= words[OVERRIDE_LIMIT] and words[OVERRIDE_LIMIT] > 0:
         words[CONTROL] = words[OVERRIDE]
     if _is_underrun(words):
@@ -231,11 +252,16 @@ def _end_work(port: Port, words: NDArray[np.int64]) -> None:
 
 
 def _send_command(port: Port, buffers: Buffers) -> int:
-    """Send the command of the cycle to come, unless it is to be lost or late."""
+    """Send the command of the cycle to come as a fault leaves it; one that is to be late is sent later."""
     words = buffers.words
-    if words[DELAY] != 0:
+    code = words[COMMAND_CODE]
+    if code in (DROP, DELAY):
         return DONE
-    return _send(port, buffers, codec.COMMAND, 8, _pack_command(buffers))
+    length, data = change_frame(code, words[COMMAND_ARGUMENT], 8, _pack_command(buffers))
+    status = _send(port, buffers, codec.COMMAND, length, data)
+    if code == DOUBLE and status >= 0:
+        status = _send(port, buffers, codec.COMMAND, length, data)
+    return status
 
 
 def _pack_command(buffers: Buffers) -> int:
@@ -248,15 +274,24 @@ def _send_sync(port: Port, buffers: Buffers, due_ns: int, lost: int) -> int:
     words = buffers.words
     row = buffers.rows[words[ROWS] % len(buffers.rows)]
     now = read_clock(port)
-    words[SYNC_AT] = now
-    status = _send(port, buffers, codec.SYNC, 0, 0)
     late = now - due_ns
+    if words[SYNC_CODE] == DELAY:  # a fault, and no lateness of the bench
+        _end_work(port, words)
+        sleep_until(port, words[DUE] + words[SYNC_ARGUMENT])
+        _begin_work(port, words)
+        now = read_clock(port)
+    words[SYNC_AT] = now
+    status = DONE
+    if words[SYNC_CODE] != DROP:
+        status = _send(port, buffers, codec.SYNC, 0, 0)
+    if words[SYNC_CODE] == DOUBLE and status >= 0:
+        status = _send(port, buffers, codec.SYNC, 0, 0)
     row[CYCLE], row[INPUT], row[INPUT_HELD] = words[CYCLES], words[POSITION], words[IS_HELD]
     row[WORD], row[DUE_AT], row[LATENESS] = words[CONTROL], words[DUE], late
     row[OVERRUN] = 1 if 2 * late > words[PERIOD] or _is_underrun(words) else 0
     words[OVERRUNS] += max(lost, row[OVERRUN])
     words[SEEN], words[OPEN] = 0, 1
-    if words[DELAY] > 0:
+    if words[COMMAND_CODE] == DELAY:
         _hold_command(buffers)
     return status
 
@@ -268,7 +303,7 @@ def _hold_command(buffers: Buffers) -> None:
     if place == len(held):
         words[LOST_RECORDS] += 1
         return
-    due = words[DUE] + words[DELAY]
+    due = words[DUE] + words[COMMAND_ARGUMENT]
     while place > 0 and held[place - 1, 0] > due:
         held[place, 0], held[place, 1] = held[place - 1, 0], held[place - 1, 1]
         place -= 1
@@ -307,8 +342,16 @@ def _receive_waiting(port: Port, buffers: Buffers) -> int:
 def _accept_frame(buffers: Buffers, t_ns: int, cob_id: int, length: int, data: int) -> None:
     """Record a frame that came, and put its values into the row of the cycle under way."""
     words = buffers.words
+    if words[DEAF]:
+        return
     _record_frame(buffers, t_ns, cob_id | length << 12, data)
-    if not words[OPEN] or length != 8:
+    if not words[OPEN]:
+        return
+    if cob_id == codec.DRIVE:
+        words[DRIVES_LEFT] -= 1
+    elif cob_id == codec.FEEDBACK or cob_id == codec.VALVE_STATE:
+        words[PLANT_FRAMES_LEFT] -= 1
+    if length != 8:
         return
     row = buffers.rows[words[ROWS] % len(buffers.rows)]
     seen = words[SEEN]

@@ -22,35 +22,29 @@ from plant.compile import compile_function
 from plant.errors import RigError
 from rig.network import codec
 from rig.network.frame import Frame
-from rig.network.master import Master
+from rig.network.master import PLANT, Master
 from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
 from rig.network.wire import LinkWire
 from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import Delay, Drop, Schedule
+from rig.sequences.faults import Cut, Delay, Double, Drop, Schedule, encode_action
 
 RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
+_PLANT_EMCY = 0x080 + PLANT
 _US = 1000  # ns
 
 
 def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, period_ns: int, realtime: bool) -> Loop:
     """The cycle loop for a bus: the hard one where compiled code can use the bus, else `CycleLoop`.
 
-    `CycleLoop` also plays the faults on the bus that the compiled cycle does not have (`needs_soft_loop`).
-
     Raises:
         RigError: the bus cannot be opened.
     """
-    if can_open(bus) and isinstance(master.wire, LinkWire) and not needs_soft_loop(faults):
+    if can_open(bus) and isinstance(master.wire, LinkWire):
         return HardLoop(master, faults, log, open_raw_bus(bus, RECEIVED), period_ns, realtime)
     return CycleLoop(master, faults, log, period_ns, realtime)
-
-
-def needs_soft_loop(faults: Schedule) -> bool:
-    """Whether faults change frames of the rig in a way that the compiled cycle cannot: it loses and delays commands."""
-    return bool(faults.list_actions("sync") or faults.list_actions("command") - {Drop, Delay})
 
 
 @cache
@@ -92,6 +86,7 @@ class HardLoop:
         self._frames: list[tuple[int, Frame]] = []  # of both sockets, until everything before them is known
         self._came_at: int | None = None  # wall time of the service frame under way
         self._last_t_ns = 0
+        self._reported = False  # an EMCY of the plant has come in this cycle
         self.scheduler = ""
         self._write_frame, master.on_frame = master.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
@@ -208,18 +203,48 @@ class HardLoop:
     # ------------------------------------------------------------------------------------ towards the cycle
 
     def _push(self, step: CycleInput) -> None:
-        action = self._faults.frame("command", self.queued)
-        delay = 0 if action is None else action.ns if isinstance(action, Delay) else hc.LOST
+        k = self.queued
+        command, sync = self._faults.frame("command", k), self._faults.frame("sync", k)
+        if not self._realtime and isinstance(sync, Delay):
+            sync = None  # a cycle has no fixed length
         position = int(self._words[hc.TAIL])
         self._inputs[position % len(self._inputs)] = step
         queue = self._buffers.inputs
-        queue[position % len(queue)] = codec.raw_position(step.demand), step.control, delay
+        queue[position % len(queue)] = (
+            codec.raw_position(step.demand), step.control, *encode_action(command), *encode_action(sync),
+            self._faults.is_bus_off("rig", k), *self._count_repeated_frames(k))
         self._words[hc.TAIL] = position + 1
+
+    def _count_repeated_frames(self, k: int) -> tuple[int, int]:
+        """How many frames of the plant and of the controller come in a cycle in which a fault doubles some.
+
+        Zeros where none is doubled. Lockstep waits for all of them, for feedback of the cycle before would count as
+        that of the next one.
+        """
+        is_second = isinstance(self._faults.frame("sync", k), Double)
+        cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
+        actions = {name: [self._faults.frame(name, each) for each in cycles] for name in ("feedback", "valve_state")}
+        if self._realtime or not (is_second or any(isinstance(each[0], Double) for each in actions.values())):
+            return 0, 0
+        sent = {name: [0 if isinstance(action, Drop | Delay) else 2 if isinstance(action, Double) else 1
+                       for action in each] for name, each in actions.items()}
+        answered = sum(count for count, action in zip(sent["feedback"], actions["feedback"], strict=True)
+                       if not isinstance(action, Cut))
+        return sum(map(sum, sent.values())), answered
+
+    def _await_short_drive(self) -> None:
+        """Lockstep: a fault cuts a drive frame; the plant's services report it, beside its cycle."""
+        k = self._k
+        is_first = isinstance(self._faults.frame("drive", k), Cut) and not isinstance(
+            self._faults.frame("drive", k - 1), Cut)
+        if is_first:
+            self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
 
     def _run_one(self) -> None:
         """Lockstep: one cycle, with the services meanwhile, so that Ctrl-C and EMCYs are not kept waiting."""
         self._log_pending()
-        self._master.silent = not self._faults.is_heartbeat_alive("rig", self._k)
+        self._set_rig_faults(self._k)
+        self._reported = False
         status = hc.WAITING
         while status == hc.WAITING:
             status = self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US)
@@ -230,6 +255,7 @@ class HardLoop:
                 self._words[hc.GRACE] = self._period
         if status < 0:
             raise self._bus.explain_failure(status)
+        self._await_short_drive()
         self._drain()
         self._master.tick()
         self._k += 1
@@ -278,8 +304,13 @@ class HardLoop:
     # ------------------------------------------------------------------------------------ from the cycle
 
     def _tick(self) -> None:
-        self._master.silent = not self._faults.is_heartbeat_alive("rig", self.k)
+        self._set_rig_faults(self.k)
         self._master.tick()
+
+    def _set_rig_faults(self, k: int) -> None:
+        """The faults of the rig itself that do not concern the cycle: its heartbeat, and what else it hears."""
+        self._master.silent = not self._faults.is_heartbeat_alive("rig", k)
+        self._master.is_deaf = self._faults.is_bus_off("rig", k)
 
     def _drain(self) -> None:
         """Log the cycles and frames that are complete."""
@@ -305,6 +336,7 @@ class HardLoop:
 
     def _receive_service(self, frame: Frame) -> None:
         self._came_at = frame.t_ns
+        self._reported |= frame.cob_id == _PLANT_EMCY
         try:
             self._receive(frame)
         finally:

@@ -468,7 +468,7 @@ class Schedule:
         for first, actions in reversed(self._frames.get(name, [])):  # the first fault acts, so it is written last
             for k, action in enumerate(actions[:max(0, cycles - first)], first):
                 if action is not None:
-                    table[k] = ACTION_CODES[type(action)], _find_argument(action)
+                    table[k] = encode_action(action)
         return table
 
     def foreign_frames(self, cycle: int) -> list[tuple[int, bytes]]:
@@ -504,11 +504,12 @@ class Schedule:
     def find_disturbed(self, cycles: int) -> NDArray[np.bool_]:
         """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the one after each.
 
-        After a reset of the controller, all cycles of main.
+        After a reset of the controller, and after the rig was bus-off, when it did not hear why the controller has shut
+        off: all cycles of main.
         """
         disturbed = np.zeros(cycles + 1, bool)
-        for k, _ in self._resets:  # the rig starts the controller again after main
-            disturbed[k:self._stop] = True
+        for k in (*(k for k, _ in self._resets), *(cycles.start for cycles in self._bus_off.get("rig", ()))):
+            disturbed[k:self._stop] = True  # the rig starts the controller again after main
         for name in self._frames:
             codes = self.frame_actions(name, cycles)[:, 0]
             hit = np.flatnonzero(codes == ACTION_CODES[Drop] if name == "sync" else codes)
@@ -529,17 +530,19 @@ class Schedule:
         """The faults of a sensor, in the order in which they act."""
         return self._signals.get(name, [])
 
-    def list_frame_faults(self, name: str) -> list[tuple[int, bytes, Action]]:
-        """The faults of a frame: first cycle, one byte a cycle (1: hit), what happens; the first that hits counts."""
-        faults = []
-        for first, actions in self._frames.get(name, []):
-            for what in dict.fromkeys(action for action in actions if action is not None):
-                faults.append((first, bytes(action == what for action in actions), what))
-        return faults
+    def list_frame_hits(self, name: str) -> NDArray[np.int64]:
+        """The cycles in which something happens to a frame, for compiled loops: (n, 3), cycle, code and argument.
 
-    def has_bus_off(self, node: str) -> bool:
-        """Whether the node (rig or plant) is bus-off at some time."""
-        return node in self._bus_off
+        As `frame_actions`, without the cycles in which nothing happens.
+        """
+        table = self.frame_actions(name, max((first + len(actions) for first, actions in self._frames.get(name, [])),
+                                             default=0))
+        cycles = np.flatnonzero(table[:, 0])
+        return np.column_stack((cycles, table[cycles]))
+
+    def list_bus_off_cycles(self, node: str) -> NDArray[np.int64]:
+        """The cycles in which the node (rig or plant) is bus-off, in order."""
+        return np.array(sorted({k for cycles in self._bus_off.get(node, ()) for k in cycles}), np.int64)
 
 
 _SENT_BY: Mapping[str, tuple[str, ...]] = {"rig": ("command", "sync"), "plant": ("feedback", "valve_state")}
@@ -563,16 +566,18 @@ def _choose_actions(fault: _Frames, hit: bytes, rng: np.random.Generator) -> lis
     return [choose() if is_hit else None for is_hit in hit]
 
 
-def _find_argument(action: Action) -> int:
-    """The argument of an action as a signed 64-bit word."""
+def encode_action(action: Action | None) -> tuple[int, int]:
+    """Code (ACTION_CODES; 0: sent normally) and argument of an action, see `Schedule.frame_actions`."""
     match action:
-        case Delay(ns):
-            return ns
+        case None:
+            return 0, 0
+        case Delay(argument) | Cut(argument):
+            pass
         case Corrupt(mask):
-            return mask - (1 << 64) if mask >= 1 << 63 else mask
-        case Cut(length):
-            return length
-    return 0
+            argument = mask - (1 << 64) if mask >= 1 << 63 else mask
+        case _:
+            argument = 0
+    return ACTION_CODES[type(action)], argument
 
 
 def is_noticed_by_time(fault: Fault) -> bool:

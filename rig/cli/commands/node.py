@@ -75,7 +75,7 @@ def open_compiled_plant(args: argparse.Namespace, bus: str, link: Link, stack: c
 
     raw = stack.enter_context(open_raw_bus(bus))
     link.leave_out(LEFT_OUT)
-    service = EmulatorService(link.send, raw, choose_scenario(args), is_locked, link.leave_out)
+    service = EmulatorService(link.send, raw, choose_scenario(args), is_locked)
     stack.callback(service.close)
     return service
 

@@ -18,15 +18,16 @@ from rig.device import NmtState
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
+from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.raw_bus import open_raw_bus
 from rig.network.wire import serve_node
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.cycle_record import decode_cycle_record
-from rig.nodes.emulator import MISSED_LIMIT
+from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Plan
+from rig.sequences.faults import BusOff, Corrupted, Double, Drop, Duplicated, Fault, Lost, Plan, Schedule, Short
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 
@@ -225,6 +226,37 @@ class TestServices:
         assert sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard) == before
         desk.restart()
         assert run_cycle(desk) == (0.0, 0, 0)
+
+    @pytest.mark.parametrize("fault", [
+        Lost(frame="sync", start=0.005, end=0.007), Lost(frame="sync", start=0.005, end=0.010),
+        Duplicated(frame="sync", start=0.003, end=0.009), BusOff(node="plant", start=0.004, end=0.006),
+        BusOff(node="plant", start=0.004, end=0.009), Corrupted(frame="valve_state", bits=3, start=0.003, end=0.009),
+        Short(frame="feedback", length=3, start=0.003, end=0.006),
+    ], ids=lambda fault: f"{fault.label}-{round(1e3 * (fault.end - fault.start))}")
+    def test_faults_on_the_bus_act_as_in_the_emulator_in_python(self, bus_kind: str, fault: Fault) -> None:
+        """The same frames in, the same frames out, also where it hears no SYNC or nothing at all."""
+        scenario = Scenario(QUIET, Plan(faults=(fault,), stop=20))
+        schedule = Schedule(scenario.plan)
+        script: list[tuple[int, bytes]] = []
+        for k in range(14):
+            action = schedule.frame("sync", k)
+            script += [(codec.SYNC, b"")] * (0 if isinstance(action, Drop) else 2 if isinstance(action, Double) else 1)
+            script.append((codec.DRIVE, codec.pack_drive(1e-4 * k, 15, k)))
+        expected: list[tuple[int, bytes]] = []
+        emulator = Emulator(lambda cob_id, data: expected.append((cob_id, data)), scenario)
+        emulator.tick(0)
+        emulator.receive(Frame(0, 0, b"\x01\x00"))
+        for cob_id, data in script:
+            emulator.receive(Frame(0, cob_id, data))
+        with BusDesk(spec(bus_kind), scenario).run() as desk:
+            for cob_id, data in script:
+                desk.link.send(cob_id, data)
+            while codec.unpack_valve_state(desk.await_frame(codec.VALVE_STATE)).cycle != 13:
+                pass
+            desk.settle()
+        sent_in_cycle = codec.FEEDBACK, codec.VALVE_STATE, 0x083
+        expected = [each for each in expected if each[0] in sent_in_cycle]
+        assert [each for each in desk.heard if each[0] in sent_in_cycle] == expected
 
     def test_the_loop_ends_with_the_services(self, bus_kind: str) -> None:
         with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as desk:

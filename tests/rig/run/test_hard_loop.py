@@ -27,7 +27,19 @@ from rig.network.wire import LinkWire
 from rig.recorder import Signals, Timing
 from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
 from rig.run.loop import CycleInput
-from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent
+from rig.sequences.faults import (
+    BusOff,
+    Corrupted,
+    Duplicated,
+    Fault,
+    Jitter,
+    Late,
+    Lost,
+    Plan,
+    Schedule,
+    Short,
+    Silent,
+)
 
 PERIOD = 10_000_000  # ns: ten times the bench's, because the nodes of this test are Python on a busy machine
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
@@ -197,6 +209,27 @@ def test_commands_lost_and_late(bus_kind: str, realtime: bool) -> None:
             f"c{k}" for k in range(12) if k not in (1, 3, 5)]
         assert order.index("s3") < order.index("c3") < order.index("s4")
         assert order.index("s7") < order.index("c5") < order.index("s8")
+
+
+@raw_kinds
+def test_commands_and_syncs_changed_by_faults(bus_kind: str) -> None:
+    faults = (
+        Lost(frame="sync", start=0.002, end=0.003), Duplicated(frame="sync", start=0.004, end=0.005),
+        Corrupted(frame="command", start=0.006, end=0.007, bits=64), Short(frame="command", start=0.007, end=0.008,
+                                                                          length=3),
+        Duplicated(frame="command", start=0.008, end=0.009), BusOff(node="rig", start=0.010, end=0.012),
+        Jitter(size=9e-4, start=0.013, end=0.014))
+    with bench(bus_kind, True, *faults) as one:
+        one.play(*range(16))
+        one.loop.finish()
+        time.sleep(0.05)
+        heard = [frame for frame in one.nodes.heard if frame.cob_id in (codec.SYNC, codec.COMMAND)]
+        assert sum(frame.cob_id == codec.SYNC for frame in heard) == 16 - 1 + 1 - 2
+        commands = [frame.data for frame in heard if frame.cob_id == codec.COMMAND]
+        plain = [codec.pack_command(k * 1e-7, 7, k) for k in range(16)]
+        inverted = bytes(255 - byte for byte in plain[6])
+        assert commands == [*plain[:6], inverted, plain[7][:3], plain[8], *plain[8:10], *plain[12:]]
+        assert all(isnan(row.xj) for row in one.rows if row.cycle in (2, 10, 11))
 
 
 @raw_kinds
