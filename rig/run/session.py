@@ -321,7 +321,8 @@ class Session:
             after=read(self._after) if len(self._after) else None, emergencies=self._emergencies,
             heartbeats={NAMES[node]: times for node, times in self._heartbeats.items()},
             heard=(self._begun_ns * 1e-9, self._clock.now() * 1e-9),
-            deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9, heartbeat_period=HEARTBEAT * 1e-3,
+            deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
+            deaf_cycles=self._faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             current_limit=model["controller.current_limit"] if self._gains is None else self._gains.current_limit,
             gains=None if has_firmware_effects(model) else self._gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)

@@ -504,12 +504,11 @@ class Schedule:
     def find_disturbed(self, cycles: int) -> NDArray[np.bool_]:
         """Of the first `cycles` those in which a fault acts on a cyclic frame or SYNC, and the one after each.
 
-        After a reset of the controller, and after the rig was bus-off, when it did not hear why the controller has shut
-        off: all cycles of main.
+        After a reset of the controller, all cycles of main.
         """
         disturbed = np.zeros(cycles + 1, bool)
-        for k in (*(k for k, _ in self._resets), *(cycles.start for cycles in self._bus_off.get("rig", ()))):
-            disturbed[k:self._stop] = True  # the rig starts the controller again after main
+        for k, _ in self._resets:  # the rig starts the controller again after main
+            disturbed[k:self._stop] = True
         for name in self._frames:
             codes = self.frame_actions(name, cycles)[:, 0]
             hit = np.flatnonzero(codes == ACTION_CODES[Drop] if name == "sync" else codes)

@@ -115,7 +115,8 @@ class ProtocolRecord:
 
     `gains`: those of object 0x2110, if the controller has them and follows them. `is_response_judged`: real time, and
     the controller is not in the rig's own process. `heartbeats`: by the name of the node; `heard`: first and last time
-    at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s.
+    at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s; `deaf_cycles`:
+    in which, so that an EMCY of the controller may be missing here.
     """
 
     run: Rows
@@ -125,6 +126,7 @@ class ProtocolRecord:
     heartbeats: Mapping[str, Sequence[Heartbeat]] = field(default_factory=dict)
     heard: tuple[float, float] = (0.0, 0.0)
     deaf: float = 0.0
+    deaf_cycles: Sequence[int] = ()
     heartbeat_period: Second = 0.1
     current_limit: float = nan
     gains: object | None = None
@@ -228,15 +230,18 @@ def find_expected_status(control: Whole) -> Whole:
 
 
 def _find_faulty(record: ProtocolRecord) -> Mask:
-    """Cycles of the run in which the controller may be in fault: from its EMCY until it is reset."""
+    """Cycles of the run in which the controller may be in fault: from its EMCY, or from when the rig could not hear
+    one, until it is reset.
+    """
     control = record.run.control.astype(int)
     faulty = np.zeros(len(control), bool)
     resets = np.flatnonzero(control & int(Control.RESET))
-    for emergency in record.emergencies:
-        if emergency.node == CONTROLLER and emergency.code & 0xFF00:
-            later = resets[resets > emergency.cycle]
-            end = int(later[0]) + 1 if len(later) else len(control)
-            faulty[max(0, emergency.cycle - _BEFORE_EMCY):end] = True
+    announced = [emergency.cycle for emergency in record.emergencies
+                 if emergency.node == CONTROLLER and emergency.code & 0xFF00]
+    for cycle in (*announced, *record.deaf_cycles):
+        later = resets[resets > cycle]
+        end = int(later[0]) + 1 if len(later) else len(control)
+        faulty[max(0, cycle - _BEFORE_EMCY):end] = True
     return faulty
 
 
