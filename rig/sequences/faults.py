@@ -454,10 +454,6 @@ class Schedule:
                 return action
         return None
 
-    def list_actions(self, name: str) -> set[type]:
-        """The kinds of action that happen to the frame `name` at some time."""
-        return {type(action) for _, actions in self._frames.get(name, ()) for action in actions if action is not None}
-
     def frame_actions(self, name: str, cycles: int) -> NDArray[np.int64]:
         """`frame` of the first `cycles` as a table for compiled loops, (cycles, 2): code (ACTION_CODES) and argument.
 

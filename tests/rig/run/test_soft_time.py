@@ -9,18 +9,16 @@ from short_sequences import SHORT, job, play
 from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
-from rig.run.hard_loop import needs_soft_loop
 from rig.run.job import Job
-from rig.run.soft_time import explain_soft_time, list_faults
-from rig.sequences.faults import Schedule
+from rig.run.soft_time import explain_soft_time
 
 LATE = '{ kind = "late", frame = "command", delay = 1e-4, start = 0.1, end = 0.2 }'
 JITTER = '{ kind = "jitter", name = "uneven", size = 2e-4, start = 0.1, end = 0.2 }'
 BUS_OFF = '{ kind = "bus_off", node = "plant", start = 0.1, end = 0.2 }'
 
 
-def make_job(*faults: str, pace: str = "realtime", bus: str = "udp_multicast", plant: str = "auto") -> Job:
-    return job(f"faults = [{', '.join(faults)}]\n{SHORT}", pace=pace, bus=bus, plant=plant)
+def make_job(*faults: str, pace: str = "realtime", bus: str = "udp_multicast") -> Job:
+    return job(f"faults = [{', '.join(faults)}]\n{SHORT}", pace=pace, bus=bus)
 
 
 def test_only_real_time_is_soft() -> None:
@@ -32,20 +30,8 @@ def test_the_bus_may_be_the_reason() -> None:
     assert said == "the cycles run in Python, because compiled code cannot use the bus virtual"
 
 
-def test_the_faults_that_a_compiled_cycle_cannot_inject_are_named() -> None:
-    """Those of each cycle alone: a sequence may have others beside."""
-    def is_hard(schedule: Schedule) -> bool:
-        return not schedule.list_actions("sync") and not schedule.list_actions("command")
-
-    faulty = make_job(LATE, JITTER)
-    assert list_faults(faulty, lambda schedule: not is_hard(schedule)) == ["late command", "uneven"]
-    said = explain_soft_time(faulty)
-    assert ("'uneven'" in said) == needs_soft_loop(Schedule(make_job(JITTER).scenario.plan))
-    assert "'late command'" not in said
-
-
-def test_a_foreign_plant_is_not_spoken_of() -> None:
-    assert "plant emulator" not in explain_soft_time(make_job(BUS_OFF, plant="external"))
+def test_no_fault_needs_python() -> None:
+    assert explain_soft_time(make_job(LATE, JITTER, BUS_OFF)) == ""
 
 
 @pytest.mark.parametrize("pace", ["realtime", "lockstep"])

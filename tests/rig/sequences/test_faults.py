@@ -223,13 +223,17 @@ def test_the_table_of_a_frame_says_what_frame_says() -> None:
     plan = Plan(faults=(*ONE_OF_EACH, Lost(frame="feedback", start=0.15, count=1)), stop=2000, seed=3)
     s = Schedule(plan, {"filter.clogging": 0.0})
     kinds: dict[int, type] = {code: kind for kind, code in faults.ACTION_CODES.items()}
+    found = set()
     for name in ("command", "sync", "feedback", "valve_state", "drive"):
-        for k, (code, argument) in enumerate(s.frame_actions(name, 1900).tolist()):
+        table = s.frame_actions(name, 1900)
+        hits = s.list_frame_hits(name)
+        assert hits.tolist() == [[k, *row] for k, row in enumerate(table.tolist()) if row[0]]
+        found |= set(hits[:, 1].tolist())
+        for k, (code, argument) in enumerate(table.tolist()):
             action = s.frame(name, k)
             assert type(action) is kinds.get(code, type(None)), (name, k)
             assert argument & (1 << 64) - 1 == (action[0] if action else 0)
-    assert {kind for name in ("command", "sync", "feedback", "valve_state", "drive") for kind in s.list_actions(name)} \
-        == set(kinds.values())
+    assert found == set(kinds)
 
 
 def test_frames_of_other_nodes() -> None:
