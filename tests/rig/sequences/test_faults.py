@@ -227,7 +227,7 @@ def test_the_table_of_a_frame_says_what_frame_says() -> None:
     for name in ("command", "sync", "feedback", "valve_state", "drive"):
         table = s.frame_actions(name, 1900)
         hits = s.list_frame_hits(name)
-        assert hits.tolist() == [[k, *row] for k, row in enumerate(table.tolist()) if row[0]]
+        assert hits[hits[:, 0] < 1900].tolist() == [[k, *row] for k, row in enumerate(table.tolist()) if row[0]]
         found |= set(hits[:, 1].tolist())
         for k, (code, argument) in enumerate(table.tolist()):
             action = s.frame(name, k)
