@@ -15,6 +15,7 @@ from short_sequences import job, play
 
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
+from rig.network.frame import Frame
 from rig.recorder import Signals, Timing
 from rig.run import participants
 from rig.run.history import History
@@ -126,6 +127,23 @@ def test_a_longer_probe_changes_no_row(tmp_path: Path) -> None:
         trace = Trace.read(tmp_path, all=True)
         rows.append([trace.com, trace.xj, trace.cor, trace.xs])
     assert np.array_equal(*rows)
+
+
+class ReportsLostSync(Variant):
+    """Reports SYNC lost just before it obeys a reset or stops, as on a busy machine: SYNC pauses after each probe."""
+
+    def hear(self, frame: Frame) -> Frame:
+        if frame.cob_id == 0x000 and frame.data[0] >= 0x80:
+            self.bus(0x082, (0x8100).to_bytes(2, "little") + bytes((0x11, 0, 0, 0, 0, 0)))
+        return frame
+
+
+def test_a_report_before_or_after_the_cycles_of_the_run_ends_nothing(tmp_path: Path,
+                                                                     monkeypatch: pytest.MonkeyPatch) -> None:
+    outcome = play_with(ReportsLostSync, tmp_path, monkeypatch)
+    said = [event.text for event in outcome.events if event.kind == "emcy"]
+    assert (outcome.verdict, outcome.safe) == ("PASS", False)
+    assert said[0].endswith("0x8100 Monitoring (before the run)") and said[-1].endswith("(after the run)")
 
 
 def test_a_gap_where_the_bench_was_late_is_not_the_controllers() -> None:
