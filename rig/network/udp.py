@@ -65,7 +65,7 @@ class LoopbackBus(can.BusABC):
     def receive_waiting(self, timeout: float) -> list[can.Message]:
         """All messages that are waiting; if there are none, wait up to `timeout` seconds for the first.
 
-        One wait for all of them: `recv` waits, and asks the clock, for each. Raises OSError when the bus is gone.
+        One wait for all of them: python-can waits, and asks the clock, for each. Raises OSError when the bus is gone.
         """
         if timeout > 0:
             select.select([self._rx], [], [], timeout)
