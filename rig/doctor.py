@@ -19,7 +19,6 @@ from rig.network import bus
 from rig.run import lateness
 
 Status = Literal["ok", "limited", "missing"]
-LOG_BYTES_PER_S = 500e3  # raw frames, signals and timing of a 1 kHz run, compressed
 
 
 class Finding(NamedTuple):
@@ -187,7 +186,8 @@ def examine_storage() -> Iterator[Finding]:
     remedy = "" if kept else "a writable home folder, or EHA_RIG_CACHE=FOLDER"
     yield Finding("storage", "compiled code", status, str(folder), "the plant starts in 0.2 s, not 10 s", remedy)
     free = shutil.disk_usage(Path.cwd()).free
-    hours = free / LOG_BYTES_PER_S / 3600
+    log_bytes_per_s = 500e3  # raw frames, signals and timing of a 1 kHz run, compressed
+    hours = free / log_bytes_per_s / 3600
     status = "ok" if hours > 1 else "limited"
     remedy = "" if hours > 1 else "make room"
     yield Finding("storage", "disk", status, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", remedy)

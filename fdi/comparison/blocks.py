@@ -44,14 +44,10 @@ Flags = NDArray[np.bool_]
 SPAN = 0.02  # s; the flow is compared over the ram's way in it: longer adds up noise of XS, shorter shows that of XJ
 MEAN = 0.011  # s, over which the direction of motion is told
 SURE = 5.0  # standard deviations of the speed that tell a moving ram
-JERK = 4.0  # standard deviations, that accelerations over two and four samples may differ
 LOOSE = 2e-3  # m/s; the speed of the sensed position must show the direction too
-SATURATED = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
 PLAYS = (2e-5, 6e-5, 1.5e-4)  # m, hysteresis of any shape as a sum of plays
 FEWEST_FORCE_ROWS = 400  # with known forces; fewer are the ends of steps, where speed is hardest to tell
 OWN = {"way": 5e-7, "force": 8e3}  # m, Pa: what straight lines between the samples leave of a perfect model
-SPARSE = 0.2  # of the rows; where more are missing, accelerations are guesses
-FLOAT32 = 1e-7  # of the current limit: a firmware may calculate in single precision
 LAGS = range(-8, 21)  # cycles that Com or XJ may be late in the file
 
 
@@ -85,7 +81,8 @@ def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     if "p12" not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
         error = _compute_force_residual(trace, model, p12, xj, seen)
         p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
-    bad |= np.abs(p12) > SATURATED * model["supply.pressure"]
+    saturated_share = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
+    bad |= np.abs(p12) > saturated_share * model["supply.pressure"]
     sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
     lag = count_span_rows(trace.period)
     way = difference_over(trace.xj - sensed, lag)
@@ -141,7 +138,8 @@ def _find_resolved(speed: Floats, period: float) -> Flags:
     near, wide = np.gradient(speed, period), np.zeros(len(speed))
     wide[2:-2] = (speed[4:] - speed[:-4]) / (4 * period)
     apart = np.abs(near - wide)
-    out: Flags = apart <= JERK * float(np.median(apart)) / 0.6745
+    most_apart = 4.0  # standard deviations by which accelerations over two and four samples may differ
+    out: Flags = apart <= most_apart * float(np.median(apart)) / 0.6745
     return out
 
 
@@ -257,7 +255,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     noisy = floor_from_data(trace.measured("xj")).value > NOISY_SENSOR_RATIO * level["xj"] if "xj" in level else False
     flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
-    is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < SPARSE
+    most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
+    is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
     told = is_enough and floor.get("force", 0.0) > 0.0
     return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
 
@@ -332,7 +331,9 @@ def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> Controlle
     residual[unknown] = np.nan
     gain = abs(model["controller.proportional_gain"]) + abs(model["controller.derivative_gain"]) / trace.period
     cor, xj_step, com_step = (measure_resolution(column) for column in (trace.cor, trace.xj, trace.com))
-    floor = max(float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0), FLOAT32 * limit)
+    single_precision = 1e-7  # of the current limit: a firmware may calculate in single precision
+    rounding = float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0)
+    floor = max(rounding, single_precision * limit)
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
     return ControllerBlock(residual, error, floor, com, xj, limit=limit)
 

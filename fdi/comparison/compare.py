@@ -250,10 +250,10 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> lis
             for name, sensor in trace.sensors.items() if name in trace.outputs]
     if trace.filtered:
         said.append(f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor")
-    apart = [f"{name} {f.difference / f.value:.2g}" for name, f in floor.items()
+    apart = [f"{SIGNALS[name].symbol} by {f.difference / f.value:.2g}" for name, f in floor.items()
              if f.source == "repeats" and f.difference > REPEAT_DIFFERENCE_RATIO * f.value]
     if apart:
-        said.append(f"the error itself differs between the repeats, as stick-slip does, in floors: {', '.join(apart)}")
+        said.append(f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors")
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
         said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_describe_cause(replay)}")

@@ -34,12 +34,10 @@ PLACES = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3)  # m
 PRESSURES = (5e5, 1e6, 2e6, 5e6, 1e7)  # Pa
 OPENINGS = (5e-6, 20e-6, 50e-6, 2e-4)  # m
 DELAYS = (0.005, 0.02, 0.05, 0.1)  # s after a reversal
-SETTLES = 0.05  # s; a section's share of samples below which it is not judged by itself
 REACH = 100  # lags, of the autocorrelation
 AFTER, BEFORE = 60, 20  # lags, of the residual after and before the input
 BINS = 15
 OWN = {("xj", "Cor"), ("p12", "P12")}  # a signal's own noise or error is in these; that they go together says nothing
-WHITENING_ORDER = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
 WILD = 5.0  # standard deviations; what is larger is an event and has no say in a colour
 WHITE = np.ones(1)  # the filter of what is white already
 SHAPES = ("proportional to", "steps with the sign of", "even in")
@@ -99,11 +97,12 @@ def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Plac
     """The sections of the command with their shares of `z2` (n,), the largest first; `limit` A of the current."""
     total = float(np.nansum(z2))
     out = []
+    shortest = 0.05  # s; a section with fewer samples is not judged by itself
     for section in find_sections(trace.com, trace.period):
         rows = slice(section.start, section.stop)
         inside = z2[rows]
         there = ~np.isnan(inside)
-        if total <= 0.0 or there.sum() * trace.period < SETTLES:
+        if total <= 0.0 or there.sum() * trace.period < shortest:
             continue
         chosen = np.zeros(len(z2), bool)
         chosen[rows] = True
@@ -218,7 +217,8 @@ def fit_whitener(x: Floats) -> Floats:
     if level == 0.0:
         return WHITE
     x = np.clip(x, -WILD * level, WILD * level)
-    covariance = correlate(x, x, 0, WHITENING_ORDER) / len(x)
+    whitening_order = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
+    covariance = correlate(x, x, 0, whitening_order) / len(x)
     covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
     weights = solve_yule_walker(covariance, by_elimination=True)
     out: Floats = np.concatenate([WHITE, -weights])

@@ -92,7 +92,7 @@ class RampBand(NamedTuple):
         factor = (1 - self.ease * self.slip) / max(1 - self.ease * slip, 0.1)
         return float(np.clip(factor, 0.9, 1.3))  # what low and high dynamic friction account for
 
-    def sliding(self, half: float, fastest: float) -> float:
+    def estimate_friction_ratio(self, half: float, fastest: float) -> float:
         """1.5 FDS over FSS: the speed of a slip goes with FSS - FDS, which is FSS/3 where it is `slip`."""
         if self.slip <= 0.0:
             return 1.0
@@ -412,7 +412,7 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
         fastest = float(find_lasting_peak(beyond))
         scale = ramp.scale(half, fastest)
         amount = float(np.interp(scale * half, ramp.half_range, bands.friction))
-        shown.append((amount, amount * ramp.sliding(half, fastest)))
+        shown.append((amount, amount * ramp.estimate_friction_ratio(half, fastest)))
         departure = scale * (error - ramp.position.centre)
         out.append(_make_ramp_excursion("position", s, rows.start, departure, ramp.position))
         out.append(_make_ramp_excursion("speed", s, rows.start, beyond - ramp.speed.centre, ramp.speed))

@@ -40,14 +40,14 @@ class Meaning(NamedTuple):
 
 MEANINGS = {
     "overshoot": Meaning("first overshoot", "%", 1.0),
-    "undershoot": Meaning("swing back after it", "%", 1.0),
+    "undershoot": Meaning("undershoot after the overshoot", "%", 1.0),
     "rise_time": Meaning("rise from 10 to 90 %", "ms", 1e3),
     "peak_time": Meaning("time of the first peak", "ms", 1e3),
     "settling_time": Meaning("settling within 5 %", "ms", 1e3),
     "rest_error": Meaning("error at rest, RMS", "um", 1e6),
     "mean_ramp_error": Meaning("mean error on the ramp", "um", 1e6),
-    "ramp_asymmetry": Meaning("half the difference of ramps out and in", "um", 1e6),
-    "break_away": Meaning("break-away resolution", "um", 1e6),
+    "ramp_asymmetry": Meaning("ramp error out less in, half", "um", 1e6),
+    "break_away": Meaning("error at break-away", "um", 1e6),
     "stick_slip_amplitude": Meaning("stick-slip amplitude", "um", 1e6),
     "stick_slip_frequency": Meaning("stick-slip frequency", "Hz", 1.0),
     "speed_ripple": Meaning("speed ripple, s.d.", "mm/s", 1e3),

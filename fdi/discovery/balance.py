@@ -14,7 +14,6 @@ Floats = NDArray[np.float64]
 
 SPEED_WINDOW, ACCELERATION_WINDOW = 15, 31  # samples of the smoothing polynomials; a millisecond apart at 1 kHz
 EDGE = 50  # samples at both ends that smoothing knows one side of only
-DRAWS = 4  # simulated runs without anything missing
 UNITS = {"force": "N", "flow": "m3/s", "current": "A"}
 
 
@@ -64,8 +63,9 @@ def compute_balances(search: Search, h: Hypothesis) -> tuple[list[Balance], Stat
     seen = _compute_terms(measured, before, trace.load, values, period)
     level = [search.estimate_floor(h).get(s, 0.0) for s in OUTPUTS]
     rng = np.random.default_rng(0)
+    draws = 4  # simulated runs without anything missing
     noisy = [_compute_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load,
-                            values, period) for _ in range(DRAWS)]
+                            values, period) for _ in range(draws)]
     found = []
     for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
         missing = seen[place] - own[place]

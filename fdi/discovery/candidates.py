@@ -27,8 +27,6 @@ from fdi.thresholds import (
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_offered_effects
 
-SMALLEST_CHANCE = 1e-300
-
 
 class Value(NamedTuple):
     """A parameter with its 95 % interval, SI."""
@@ -185,11 +183,11 @@ def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
     if effect in e.effects and e.verdict in words:
         return words[e.verdict]
     worst, before = max(h.ratio.values()), max(e.base.ratio.values())
-    if worst <= RESIDUAL_IS_NOISE and not e.base.reached:
+    if worst <= RESIDUAL_IS_NOISE and not e.base.is_at_floor:
         held = e.holdout.get(h.effects, {})
         fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in held.items())
         return "fails on the held-out run" if fails else "less likely"
-    return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.reached else "no"
+    return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.is_at_floor else "no"
 
 
 def _list_firmware_marks(e: Explanation) -> list[Fingerprint]:
@@ -207,7 +205,7 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
     evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
     return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
-                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), SMALLEST_CHANCE),
+                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), 1e-300),
                      "explains" if p.effect in e.effects else "no")
 
 

@@ -29,10 +29,8 @@ from plant.model import Model, list_offered_effects
 Floats = NDArray[np.float64]
 
 FINE = 20  # steps a cycle of the last fits
-FINEST_FIT_STEPS = 50  # the same where that is not enough: a resonance of trapped oil, say
 TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
-MOST_EFFECTS = 3  # effects looked for one after the other
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
     progress("fitting the tolerances", 0.05)
     base = search.fit_base()
-    if base.reached:
+    if base.is_at_floor:
         search.learn_noise(base)
         base = search.refit_hypothesis(base)
     levels = _search_levels(search, base, holdout, progress)
@@ -86,22 +84,23 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
                    ) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
-    for count in range(1, MOST_EFFECTS + 1):
+    most_effects = 3  # effects looked for one after the other
+    for count in range(1, most_effects + 1):
         progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
         tried: list[Hypothesis] = []
         for parent in beam:
             tried = _drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
-            if tried and tried[0].reached:
+            if tried and tried[0].is_at_floor:
                 break  # the other ways would have to get there as well, from further off
         if not tried:
             break
-        if count == 1 and not base.reached:
+        if count == 1 and not base.is_at_floor:
             search.learn_noise(tried[0])
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
         levels.append(tried)
-        if tried[0].reached or not _is_significant(levels[-2][0], tried[0]):
+        if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
             break
         if count > 1 and not _is_way_on(search, levels, holdout):  # two large effects each help little alone
             break
@@ -154,12 +153,12 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and levels[1][0].reached and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
+    if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
         depth = 1
     depth = _prune_level(search, levels, depth)
     search.refine_steps(FINE, TRUEST)
     # where no effect helps, the base is fitted until that is beyond doubt
-    base = search.finish_hypothesis(levels[0][0], 2 if depth or levels[0][0].reached else LONG)
+    base = search.finish_hypothesis(levels[0][0], 2 if depth or levels[0][0].is_at_floor else LONG)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
     close = sorted(search.map_parallel(search.finish_hypothesis, close), key=lambda h: h.cost + h.repeat_cost)
     if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
@@ -171,7 +170,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
     ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.estimate_floor(close[0] if close else base)
     if search.measure_solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
-        search.refine_steps(FINEST_FIT_STEPS, TRUEST)
+        finest_fit_steps = 50  # a cycle: FINE is not enough, for example for a resonance of trapped oil
+        search.refine_steps(finest_fit_steps, TRUEST)
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
@@ -208,17 +208,17 @@ def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequ
     prints = tuple(f.effect for f in found)
     firmware_left = controller > 3.0 and not any(CATALOGUE[f.effect].firmware for f in found)
     if not close:
-        if not base.reached:
+        if not base.is_at_floor:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints
         if firmware_left:
             return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
     least = measure_gain(base, best)
-    if base.reached and least < GAIN_CONVINCES:
+    if base.is_at_floor and least < GAIN_CONVINCES:
         return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
-    there = [h for h in holding if h.reached]
-    if best.reached and there and not firmware_left:
+    there = [h for h in holding if h.is_at_floor]
+    if best.is_at_floor and there and not firmware_left:
         equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * GAIN_TIE]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *dict.fromkeys(e for h in equal for e in h.effects))

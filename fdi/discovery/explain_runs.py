@@ -102,6 +102,6 @@ def discriminate(explanation: Explanation) -> dict[str, Any]:
         return {}
     from fdi.discovery.separate import find_separation
 
-    equal = [h for h in explanation.ranked if h.reached and set(h.effects) <= set(explanation.effects)]
+    equal = [h for h in explanation.ranked if h.is_at_floor and set(h.effects) <= set(explanation.effects)]
     separation = find_separation(explanation.search, equal)
     return separation._asdict() if separation else {}

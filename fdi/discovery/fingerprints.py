@@ -18,7 +18,6 @@ Floats = NDArray[np.float64]
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)
 FINEST_COMB = 2.5e-7  # m; a coarser grid of positions is none of the bus
 SIZES = 41  # trial values of a parameter, logarithmic, one decade beyond its starts on either side
-ZOOMS = 6
 
 
 class Fingerprint(NamedTuple):
@@ -76,7 +75,7 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float) -
     def measure_error(size: float) -> float:
         return _measure_rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
 
-    for _ in range(ZOOMS):
+    for _ in range(6):  # each time closer around the best size
         sizes = np.linspace(low, high, SIZES)
         errors = [measure_error(s) for s in sizes]
         k = int(np.argmin(errors))

@@ -191,7 +191,7 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     healthy = linearise(search.problem, fit.free, np.where(_have_priors(fit.free), 0.0, fit.x))
     found = [*scan_effects(search.problem, fit, [name]), *scan_effects(search.problem, healthy, [name])]
     best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
-    if best.reached:
+    if best.is_at_floor:
         return best
     free, sizes = best.fit.free, CATALOGUE[name].starts
     x = np.array([[(size[f.name] - f.centre) / f.scale if f.name in size else float(v)

@@ -15,7 +15,6 @@ from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 Floats = NDArray[np.float64]
 
 KNOTS = 15  # of a curve
-FEWEST_IN_BIN = 20  # samples in a bin
 PERIODS = np.geomspace(2.0, 60.0, 600)  # over the range of the position
 
 WORDS = {"force": "a force on the ram, against extension", "flow": "a flow that leaves the jack",
@@ -100,7 +99,8 @@ def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats
     edges = np.unique(np.concatenate([np.quantile(x, np.linspace(0.0, 1.0, KNOTS // 2 + 2)), even]))
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(place, minlength=len(edges) - 1)
-    kept = count >= FEWEST_IN_BIN
+    fewest_in_bin = 20  # samples in a bin
+    kept = count >= fewest_in_bin
     total = np.bincount(place, y, len(count))
     at = np.bincount(place, x, len(count))[kept] / count[kept]
     height = total[kept] / count[kept]

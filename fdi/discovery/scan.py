@@ -24,8 +24,6 @@ ZOOM = (  # factors on the size, pass by pass; the first reaches down to sizes t
 LOOKED_AT = (40, 14, 10, 8)  # effects in each of these passes
 TOGETHER = 64  # runs at a time
 FINER = 16  # times the length of a run: bins of a spectrum fine enough for a fit to begin in
-AROUND = 3.0  # Hz, on either side: what a line has to stand out of
-APART = 1.0  # Hz, between lines
 LINES = 4  # tried
 SCAN_STRIDE = 5  # every so many samples, for the linear shift alone
 
@@ -120,15 +118,17 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     period = problem.model.values["controller.period"]
     spectra = np.fft.rfft(product - product.mean(axis=1, keepdims=True), FINER * product.shape[1])
     hertz = np.fft.rfftfreq(FINER * product.shape[1], period)
-    height = (_measure_prominence(np.abs(spectra), round(AROUND / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
+    surroundings = 3.0  # Hz on either side of a line, above which it has to stand out
+    height = (_measure_prominence(np.abs(spectra), round(surroundings / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
     line = spectra.sum(axis=0) * 2.0 / max(float((answer**2).sum()), 1e-300)  # in sizes of the start
     found = []
+    distance = 1.0  # Hz, between lines
     for _ in range(LINES):
         k = int(np.argmax(height))
         found += [{size: still[size] * larger * float(np.abs(line[k])), named["Hz"]: float(hertz[k]),
                    named["rad"]: float(np.angle(line[k])) + turn * np.pi}
                   for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
-        height[np.abs(hertz - hertz[k]) < APART] = 0.0
+        height[np.abs(hertz - hertz[k]) < distance] = 0.0
     return found
 
 

@@ -28,7 +28,6 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 BEAM = 3  # hypotheses from which the next missing effect is looked for
 EASED = (30.0, 6.0)  # times the noise, stage by stage
-SETTLING = 5  # rounds of the last fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class Hypothesis:
     others: tuple[Floats, ...] = ()  # residuals (s, n) on the repeats
 
     @property
-    def reached(self) -> bool:
+    def is_at_floor(self) -> bool:
         """True when nothing but noise is left."""
         return max(self.ratio.values()) <= RESIDUAL_IS_NOISE
 
@@ -80,7 +79,7 @@ class Search:
 
         fits = self.map_parallel(fit_tolerances, (False, True))
         first = self.judge_fit((), min(fits, key=lambda f: f.cost))
-        if first.reached:
+        if first.is_at_floor:
             return first
         return self.retry_from(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
@@ -128,7 +127,7 @@ class Search:
             fits[:kept] = self.map_parallel(partial(self._continue_begun_fit, rounds), fits[:kept])
         done = self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits)
         ranked = sorted(done, key=lambda h: h.cost)
-        if ranked and not ranked[0].reached:
+        if ranked and not ranked[0].is_at_floor:
             x = ranked[0].fit.x
             has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
             ranked[0] = self.retry_from(ranked[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
@@ -200,7 +199,7 @@ class Search:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
         return self.judge_fit(h.effects, fit_unknowns(self.problem, h.fit.free, h.fit.x, rounds))
 
-    def finish_hypothesis(self, h: Hypothesis, rounds: int = SETTLING) -> Hypothesis:
+    def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem))
@@ -231,7 +230,7 @@ def learn_noise(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[No
             difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
             found.append(noises.fit_noise(difference))
         else:
-            found.append(noises.fit_noise(h.fit.residuals[i]) if h.reached else old)
+            found.append(noises.fit_noise(h.fit.residuals[i]) if h.is_at_floor else old)
     return found
 
 

@@ -21,8 +21,6 @@ from plant.lanes import Lanes
 
 Floats = NDArray[np.float64]
 
-SEPARATION_ROUNDS = 3  # of that fit
-PAIRS = 3  # looked at of a larger set
 SECONDS = 3.0
 
 
@@ -40,7 +38,8 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
 
     One explanation's prediction stands for the measurement; the other is fitted to it, its tolerances and all.
     """
-    pairs = list(combinations(equal, 2))[:PAIRS]
+    most_pairs = 3  # of a larger set only the first are compared
+    pairs = list(combinations(equal, 2))[:most_pairs]
     if not pairs:
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
@@ -119,4 +118,4 @@ def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: 
     noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
                                      for s in seen.outputs)
     problem: Problem = replace(search.problem, trace=seen, noise=noise, also=())
-    return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, SEPARATION_ROUNDS).misfit
+    return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, rounds=3).misfit

@@ -24,13 +24,12 @@ from fdi.thresholds import CONVERGED_GAIN
 
 Floats = NDArray[np.float64]
 
-FINAL_FIT_ROUNDS = 8
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
 DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
-def finish_fit(problem: Problem, fit: Fit, rounds: int = FINAL_FIT_ROUNDS, slopes: Problem | None = None) -> Fit:
+def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | None = None) -> Fit:
     """A fit taken to the end, with a covariance that holds at the width of its own intervals.
 
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.

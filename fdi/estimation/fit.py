@@ -14,8 +14,6 @@ from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 Floats = NDArray[np.float64]
 
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-DIFFERENCE_WIDTH_SD = 3.0  # of a parameter: differences wide enough for stick-slip, narrow at the end
-NARROWEST_SHARE = 0.01  # times the first width
 FIT_ROUNDS = 12
 
 
@@ -111,8 +109,9 @@ def _compute_covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -
 
 def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
     widest = np.array([f.step for f in free])
-    wanted = DIFFERENCE_WIDTH_SD / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    widths: Floats = np.clip(wanted, NARROWEST_SHARE * widest, widest)
+    difference_width_sd = 3.0  # of a parameter: differences wide enough for stick-slip, narrow at the end
+    wanted = difference_width_sd / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    widths: Floats = np.clip(wanted, 0.01 * widest, widest)  # times the first width
     return widths
 
 

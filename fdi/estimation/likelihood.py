@@ -23,7 +23,6 @@ from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
 
-FIT_STEPS = 10  # a cycle, 100 us: against 10 us a replay moves by less than the sensors noise; the last fits use more
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 BLOCK = 100  # cycles
 
@@ -77,7 +76,7 @@ class Problem:
     model: Model  # with every effect that may be tried
     trace: Trace
     noise: tuple[Noise, ...]  # of each signal
-    steps: int = FIT_STEPS
+    steps: int = 10  # a cycle, 100 us: differs from 10 us by less than the sensors' noise; last fits use more
     anchor: float = ANCHOR_RATE
     workers: int = 1
     bare: Model | None = None  # the same without the effects at off values: five times as fast where it will do

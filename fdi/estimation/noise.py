@@ -37,14 +37,9 @@ WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than t
 QUIET = 0.2  # the part of all windows that the first guess rests on
 LAGS = 40  # samples, of the noise's autocorrelation
 MAINS = (50.0, 60.0, 400.0)  # Hz, and what is an odd or even multiple of them below half the sampling rate
-HARMONICS = 4
 NEIGHBOURS = (-7.0, -5.0, -3.0, 3.0, 5.0, 7.0)  # Hz beside a line: how large it would look without hum
-FEWEST_HUM_WINDOWS = 10  # windows that a search for hum needs
-WHITE_DIFFERENCE = 6.0  # variance of the second difference of white noise, over its own
 FINEST = {"xj": 5e-8, "p12": 2e3, "xs": 5e-8}  # no transducer is better, and a simulation without noise needs a floor
 SWEEP = 4000  # positions
-NOISE_ORDER = 40  # of the autoregressive model: two periods of 50 Hz hum at 1 kHz
-CONSISTENT = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
 
 
 class Floor(NamedTuple):
@@ -94,7 +89,8 @@ def floor_from_data(signal: Floats) -> Floor:
         return Floor(0.0, "none", True)
     # the median, scaled to a standard deviation, does not see the few samples in which the signal itself bends
     spread = float(np.median(second)) / float(ndtri(0.75))
-    return Floor(spread / np.sqrt(WHITE_DIFFERENCE), "data", True)
+    white_difference = 6.0  # variance of the second difference of white noise, over its own
+    return Floor(spread / np.sqrt(white_difference), "data", True)
 
 
 def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
@@ -187,12 +183,13 @@ def _measure_freedom(pieces: Floats) -> float:
 
 def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, float]]:
     """(Hz, mean square) of the mains' lines that stand out in the quiet half of the windows of the runs (n,)."""
-    mains = sorted({f * k for f in MAINS for k in range(1, HARMONICS + 1) if f * k < 0.45 / period})
+    mains = sorted({f * k for f in MAINS for k in range(1, 5) if f * k < 0.45 / period})
     grid = np.array([[f, *(f + d for d in NEIGHBOURS)] for f in mains])
     power = np.zeros(grid.shape)
+    fewest_hum_windows = 10  # fewer give no spectrum to compare lines in
     for r in runs:
         loud = _measure_loudness(r)
-        if np.isfinite(loud).sum() < FEWEST_HUM_WINDOWS or not grid.size:
+        if np.isfinite(loud).sum() < fewest_hum_windows or not grid.size:
             return []
         rows = loud <= np.nanquantile(loud, 0.5)
         power += np.abs(_fit_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
@@ -280,7 +277,8 @@ def measure_level(difference: Floats, block: int = WINDOW) -> float:
     blocks = difference[:n].reshape(-1, block)
     with np.errstate(invalid="ignore"):
         variance = np.nanmean(blocks**2, axis=1)
-    return float(np.sqrt(np.nanmedian(variance) * CONSISTENT))
+    mean_over_median = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
+    return float(np.sqrt(np.nanmedian(variance) * mean_over_median))
 
 
 def solve_yule_walker(covariance: Floats, by_elimination: bool = False) -> Floats:
@@ -295,7 +293,7 @@ def solve_yule_walker(covariance: Floats, by_elimination: bool = False) -> Float
     return np.asarray(solve_toeplitz(covariance[:-1], covariance[1:]), np.float64)
 
 
-def fit_noise(residual: Floats, order: int = NOISE_ORDER) -> Noise:
+def fit_noise(residual: Floats, order: int = 40) -> Noise:
     """The autoregressive model of noise, (n,), that its length supports (Yule-Walker; Akaike's choice of order)."""
     x = residual[~np.isnan(residual)]
     sigma = measure_level(x)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.replay import measure_misfit
+from fdi.thresholds import SAME_COMMAND_POSITION
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, hold_next
 from plant.errors import InputError
@@ -32,7 +33,6 @@ STILL = 5e-5  # m; a ram that moves further than that moves every sensor
 LIMITS = (("xj", 3.0, "jack.travel"), ("com", 5.0, "jack.travel"), ("xs", 3.0, "spool.travel"),
           ("p12", 3.0, "supply.pressure"), ("cor", 20.0, "controller.current_limit"))  # signal, times, parameter
 FAINT = {"p12": 1e3, "xs": 1e-9}  # a signal whose range is smaller is in another unit
-SAME_DEMAND = 2e-6  # m; demands that differ by less are the same
 COLUMNS = ("t", "com", "cor", "load", *OUTPUTS, "phase", "usable", "filled", "incomplete")
 
 
@@ -343,7 +343,7 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_shar
 
 
 def _find_first_move(com: Floats) -> int:
-    return int(np.argmax(np.abs(com - com[0]) > SAME_DEMAND))
+    return int(np.argmax(np.abs(com - com[0]) > SAME_COMMAND_POSITION))
 
 
 def _measure_agreement(a: Floats, b: Floats, late: int, overlap: float = 0.5) -> float:
@@ -351,7 +351,7 @@ def _measure_agreement(a: Floats, b: Floats, late: int, overlap: float = 0.5) ->
     first, last = max(0, late), min(len(a), len(b) + late)
     if last - first < overlap * len(a):
         return 0.0
-    return float(np.mean(np.abs(a[first:last] - b[first - late:last - late]) <= SAME_DEMAND))
+    return float(np.mean(np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION))
 
 
 def align_columns(columns: Mapping[str, Floats], late: int, rows: int) -> dict[str, Floats]:

@@ -42,9 +42,6 @@ Columns = dict[str, Floats]  # by signal, (n,)
 
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle
 FRICTIONS = ("jack.static_friction", "jack.dynamic_friction", "spool.static_friction", "spool.dynamic_friction")
-SETTLED = 1.0  # s at the first demand, before a closed-loop replay begins
-SCATTER_STEPS = 20  # a cycle; only sizes matter here
-SCATTER_ROUNDS = 2
 SCATTER_DIFFERENCE = 0.3  # tolerances, of the differences that the Jacobian is made of
 ALIKE = 20  # neighbouring samples that say the same thing
 
@@ -175,7 +172,8 @@ def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tupl
 
 def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and `cor` in a run from the command alone, no noise."""
-    before = round(SETTLED / trace.period)
+    rest_time = 1.0  # s at the first demand, before a closed-loop replay begins
+    before = round(rest_time / trace.period)
     com = np.concatenate([np.full(before, trace.com[0]), trace.com])
     load = np.concatenate([np.full(before, trace.load[0]), trace.load])
     lanes = Lanes(model.replace(WITHOUT_NOISE), (), steps)
@@ -208,7 +206,8 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
     known = tolerance_sizes(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
-    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), SCATTER_STEPS)
+    scatter_steps = 20  # a cycle; coarse, because only the size of the residual matters here
+    lanes = Lanes(model.replace(WITHOUT_NOISE), list(known), scatter_steps)
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
 
     def compute_scaled_residuals(x: Floats) -> Floats:
@@ -220,7 +219,7 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
 
     x = np.zeros(len(base))
     now = compute_scaled_residuals(x[None])[0]
-    for _ in range(SCATTER_ROUNDS):
+    for _ in range(2):
         slope = (compute_scaled_residuals(x + SCATTER_DIFFERENCE * np.eye(len(base))) - now) / SCATTER_DIFFERENCE
         weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))

@@ -20,7 +20,6 @@ from fdi.thresholds import FLAT_DIRECTION_MISFIT
 Floats = NDArray[np.float64]
 
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
-RELAXATION_ROUNDS = 6
 LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
 # Powers with which parameters move together; that of Kintas is one of what the filter lets through, 1 - Kintas.
 FLAT: tuple[Mapping[str, float], ...] = (
@@ -98,7 +97,7 @@ def relax_fit(problem: Problem, found: Fit) -> Fit:
         return found
     prior = np.array([f.prior**-2 for f in free])
     low, high = scaled_bounds(free)
-    for _ in range(RELAXATION_ROUNDS):  # Gauss-Newton on the priors alone, along the curved directions
+    for _ in range(6):  # Gauss-Newton on the priors alone, along the curved directions
         ways = np.array([(scale_together(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
         step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]
         for way in (1.0, 0.5, 0.25, 0.1):

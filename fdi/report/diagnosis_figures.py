@@ -26,7 +26,7 @@ from fdi.diagnosis.bands import (
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
-from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
+from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, label_log_axis, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
@@ -207,6 +207,7 @@ def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
         ax.axvline(3.0, color=INK, lw=0.8, ls=":")
         ax.set_xscale("log")
         ax.set_xlim(left=0.1)
+        label_log_axis(ax.xaxis)
         ax.set_yticks(rows, [p.words for p in known])
         ax.invert_yaxis()
         ax.grid(axis="y", visible=False)

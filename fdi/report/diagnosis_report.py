@@ -230,7 +230,7 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
     if not d.events:
         return [Paragraph("None: the response stays within MidBand.", medium=Medium.PAGE)]
     columns = [Column("band"), Column("signal"), Column("section"), Column("events", align="right"),
-               Column("first entry", "s", "right"), Column("last exit", "s", "right"),
+               Column("first begins", "s", "right"), Column("last ends", "s", "right"),
                Column("time outside", "ms", "right"), Column("furthest", align="right", medium=Medium.PAGE)]
     rows = [_summarise_events(group) for group in group_events(d.events)]
     return [Table(columns, rows, "Times outside a band, by band, signal and section of the command. rig fdi --json "

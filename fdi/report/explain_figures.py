@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from fdi.discovery.candidates import Candidate
 from fdi.discovery.model_file import Row
 from fdi.discovery.search import Hypothesis
-from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, shade_sections, start_figure, thin_line, to_svg
+from fdi.report.drawing import (
+    COMMAND,
+    DRAWN_UNITS,
+    INK,
+    label_log_axis,
+    shade_sections,
+    start_figure,
+    thin_line,
+    to_svg,
+)
 from fdi.report.numbers import SIGNAL_NAMES
 from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace
@@ -71,6 +80,7 @@ def draw_ranking(candidates: Sequence[Candidate], floor: Mapping[str, float], mo
         ax.axvline(1.0, color=FLOOR, lw=1.2, label="noise floor")
         ax.set_xscale("log")
         ax.set_xlim(0.8, 1.3 * float(np.nanmax([*own, *held, 2.0])))
+        label_log_axis(ax.xaxis)
         ax.set_yticks(rows, [" + ".join([*c.beside, c.effect]) for c in shown])
         ax.set_xlabel("error of the worst signal over its noise floor")
         ax.legend(loc="lower right", frameon=False)
@@ -91,6 +101,7 @@ def draw_ledger(rows: Sequence[Row], floor: Mapping[str, float]) -> str:
             ax.bar(x + 0.19, held, width=0.36, color=HELD, label="held-out run")
             ax.axhline(1.0, color=FLOOR, lw=1.2)
             ax.set_yscale("log")
+            label_log_axis(ax.yaxis)
             ax.set_xticks(x, names, rotation=20, ha="right")
             ax.set_title(SIGNAL_NAMES[s], fontsize=9, color=INK)
         axes[0].set_ylabel("error over noise floor")

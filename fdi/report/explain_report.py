@@ -97,7 +97,7 @@ def _describe_partly(a: Answer) -> str:
 
 
 def _describe_unexplained(a: Answer) -> str:
-    if a.explanation.base.reached and not a.explanation.effects:
+    if a.explanation.base.is_at_floor and not a.explanation.effects:
         return ("The output of the controller differs from the model's, and no effect of the catalogue explains the "
                 "difference.")
     worst = _find_worst_signal(a)

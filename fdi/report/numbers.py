@@ -140,6 +140,19 @@ def choose_unit(unit: str, size: float) -> tuple[float, str]:
     return found
 
 
+def format_duration(seconds: float) -> str:
+    """A duration in seconds, minutes or hours.
+
+    >>> format_duration(75.0), format_duration(600.0), format_duration(9000.0)
+    ('75 s', '10 min', '2.5 h')
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
 def join_words(words: Iterable[str], conjunction: str = "and") -> str:
     """Words with commas and an "and".
 

@@ -23,7 +23,6 @@ from fdi.trace.trace import Trace
 Floats = NDArray[np.float64]
 COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
 AMBER = "#d9730d"
-SHOWN = 0.1  # s of a step
 LEVELS = 7  # contours
 LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "position [departure, um]",
           ("ramp", "speed"): "speed [departure, mm/s]"}  # of the bands' axes
@@ -39,9 +38,10 @@ def draw_steps(traces: Mapping[str, Trace], number: int = 0) -> str:
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 3.6), layout="constrained")
         near, far = figure.subplots(1, 2, width_ratios=(3, 2))
+        shown_time = 0.1  # s of a step
         for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
             s = _select_section(trace, "step", number)
-            rows = slice(s.start, s.start + round(SHOWN / trace.period))
+            rows = slice(s.start, s.start + round(shown_time / trace.period))
             t = (np.arange(s.start, rows.stop) - s.start) * trace.period * 1e3
             for ax in (near, far):
                 ax.plot(t, trace.xj[rows] * 1e3, color=colour, lw=1.2, label=label)

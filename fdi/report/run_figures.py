@@ -17,7 +17,6 @@ from fdi.trace.trace import Trace
 Floats = NDArray[np.float64]
 FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
-SHORTEST_TIME = 0.1  # us, the left end of a histogram: the resolution of the clock
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [um]", 1e6, "#d9730d"),
           ("close", "error, close up [um]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
           ("p12", "P12 [bar]", 1e-5, "#0f8b8d"), ("xs", "XS [um]", 1e6, "#bf3989"),
@@ -95,7 +94,8 @@ def draw_timing(trace: Trace) -> str:
     columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
                ("controller's response", trace.timing.response, "#d9730d"),
                ("bench's own work", trace.timing.work, "#57606a"))
-    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, SHORTEST_TIME), colour)
+    shortest_time = 0.1  # us, the left end of a histogram: the resolution of the clock
+    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, shortest_time), colour)
              for name, values, colour in columns if (values > 0).any()]
     if not drawn:
         return ""

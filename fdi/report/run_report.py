@@ -129,7 +129,7 @@ def describe_missing_samples(trace: Trace) -> list[str]:
             missing = int(np.isnan(trace.column(name)).sum())
             signals_of_count.setdefault(missing, []).append(name)
     parts = [f"{count} of {', '.join(names)}" for count, names in signals_of_count.items() if count]
-    return [f"missing samples, marked red below the lines: {'; '.join(parts)} (of {len(trace)})"] if parts else []
+    return [f"missing samples (red on the page): {'; '.join(parts)} (of {len(trace)})"] if parts else []
 
 
 def _tabulate_checks(checks: tuple[Check, ...]) -> list[Item]:

@@ -14,7 +14,6 @@ from fdi.report.report import Cell, Column, Item, Line, Listing, Medium, Mood, P
 STYLES: dict[Mood, str] = {"": "", "good": "green", "doubtful": "yellow", "bad": "red", "neutral": "bold",
                            "muted": "dim"}
 GAP = 2  # characters between two columns
-LABEL_WIDTH = 10  # characters of a label, if none is longer
 
 
 def print_report(report: Report, console: Console) -> None:
@@ -74,7 +73,8 @@ def _flush_lines(lines: list[Line], console: Console) -> None:
     if not lines:
         return
     console.print()
-    width = max(LABEL_WIDTH, *(cell_len(line.label) + GAP for line in lines))
+    label_width = 10  # characters of a label, if none is longer
+    width = max(label_width, *(cell_len(line.label) + GAP for line in lines))
     for line in lines:
         label = Text(line.label + " " * (width - cell_len(line.label)), "dim")
         console.print(Text.assemble(label, (line.text, STYLES[line.mood])), soft_wrap=True)

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 RESOLUTION = 0.6e-7  # m; the bus carries 1e-7 m, so a ramp is a staircase of this half-height
-SHORTEST = 0.15  # s; a sine of 0.05 Hz and 1 mm leaves its tangent by RESOLUTION within this time
-JUMP = 2e-6  # m; least step
 
 
 class Section(NamedTuple):
@@ -45,7 +43,8 @@ def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
     Missing rows (NaN) continue the last demand.
     """
     com = _fill_command(command)
-    shortest = max(3, round(SHORTEST / period))
+    shortest_time = 0.15  # s; a sine of 0.05 Hz and 1 mm leaves its tangent by RESOLUTION within this time
+    shortest = max(3, round(shortest_time / period))
     out: list[Section] = []
     for start, stop, slope in _find_lines(com):
         before = com[start - 1] if start else com[0]
@@ -103,7 +102,8 @@ def _is_jump(com: Floats, row: int) -> bool:
     if row == 0:
         return False
     before = np.abs(np.diff(com[max(0, row - 4):row]))
-    return bool(abs(com[row] - com[row - 1]) > JUMP + 3 * (before.max() if len(before) else 0.0))
+    least_step = 2e-6  # m; least step
+    return bool(abs(com[row] - com[row - 1]) > least_step + 3 * (before.max() if len(before) else 0.0))
 
 
 def _merge_short_parts(parts: list[Section], shortest: int) -> list[Section]:

@@ -2,6 +2,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -71,6 +74,12 @@ def write_answer(report: Report, places: Places) -> None:
         from fdi.report.html import write_html
 
         write_html(report, places.page)
+
+
+def discard_output() -> None:
+    """Redirect standard output to /dev/null: what is still in its buffer must not end the program in an error."""
+    with contextlib.suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def show_answer(report: Report, args: argparse.Namespace) -> None:

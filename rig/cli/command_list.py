@@ -6,11 +6,11 @@ import keyword
 from types import ModuleType
 
 HELP_OF_COMMAND = {
-    "add": "add an effect to a model file, fit it, show the error before and after",
-    "bench": "measure the speed of the plant, or how often rig explain is right",
+    "add": "add effects to a model, fit it, and show the error before and after",
+    "bench": "measure speed, real time, reactions to faults on the bus, robustness, or how often rig explain is right",
     "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
     "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
-    "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit and HTML",
+    "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
     "doctor": "report what this machine can do: CAN, vcan, real-time rights, viewer",
     "effects": "list the catalogue of physical effects, or show one in detail",
     "explain": "find the physical effects that a model lacks, and rank the candidates",
@@ -21,7 +21,7 @@ HELP_OF_COMMAND = {
     "recover": "salvage a log whose writer died: keep everything up to the last intact chunk and index it again",
     "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",
     "report": "write one HTML file about a trace; it needs no network",
-    "run": "run a test sequence: log, checks, verdict",
+    "run": "run a test sequence on the bench: log, checks, verdict",
     "simulate": "run a model on a command and write a trace",
     "trend": "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
     "view": "open the rerun viewer on a trace, or save its recording or a picture of it",

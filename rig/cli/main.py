@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from plant.errors import RigError, escape_control_characters
+from rig.cli.answer import discard_output
 from rig.cli.command_list import HELP_OF_COMMAND, import_command
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h
@@ -37,17 +38,22 @@ class _CommandParser(_Parser):
             return super().parse_known_args(args, namespace)
         self._is_parsing = True
         try:
-            return self.parse_known_intermixed_args(args, namespace)
+            parsed, unknown = self.parse_known_intermixed_args(args, namespace)
         finally:
             self._is_parsing = False
+        if unknown:  # reported here, because the parser above this one would name `rig` without the command
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
 
     def _load(self) -> None:
         """Import the command and add its options, once."""
         if self._is_loaded:
             return
         self._is_loaded = True
-        module = import_command(self.prog.split()[-1])
-        self.description = (module.run_command.__doc__ or "").split("\n")[0]
+        name = self.prog.split()[-1]
+        module = import_command(name)
+        what, result = HELP_OF_COMMAND[name], (module.run_command.__doc__ or "").split("\n")[0]
+        self.description = f"{what[0].upper()}{what[1:]}. {result}"
         module.add_arguments(self)
         self.add_argument("--json", action="store_true", help="print one JSON object on standard output, nothing else")
         self.add_argument("--out", metavar="PATH", help="where to write the result")
@@ -121,22 +127,16 @@ def run_command_line(argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return _report_error(args, "interrupted", INTERRUPTED)
     except BrokenPipeError:  # whoever read our output has stopped reading: nothing to report, nobody to report it to
-        _discard_output()
+        discard_output()
         return status
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            _discard_output()
+            discard_output()
             return _report_error(args, f"no space left for the output or the results ({error.strerror})", 2)
         from traceback import print_exc
 
         print_exc()  # an internal error; Python's own exit status 1 would read as a failed check
         return INTERNAL
-
-
-def _discard_output() -> None:
-    """Redirect standard output to /dev/null: what is still in its buffer must not end the program in an error."""
-    with contextlib.suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _report_error(args: argparse.Namespace, message: str, status: int) -> int:

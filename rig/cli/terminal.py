@@ -1,11 +1,9 @@
 """Standard output, as all commands print to it."""
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
-
 from rich.console import Console
+
+from rig.cli.answer import discard_output
 
 
 class _Pipe(Console):
@@ -14,8 +12,7 @@ class _Pipe(Console):
     def on_broken_pipe(self) -> None:
         """Replace rich's method, which ends the program with status 1."""
         self.quiet = True
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
 
 
 def open_console() -> Console:

@@ -1,7 +1,7 @@
 """A test case: its number, what it expects, and the function that finds out; and what can come of it."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -111,3 +111,18 @@ def require_applicable(condition: object, reason: str) -> None:
     """End the case as not applicable unless the condition holds. Raises CaseNotApplicable."""
     if not condition:
         raise CaseNotApplicable(reason)
+
+
+def require_none(problems: Sequence[str]) -> None:
+    """Fail the case with the problems that were found, unless there are none. Raises CaseFailed."""
+    require(not problems, join_labels(problems))
+
+
+def join_labels(labels: Sequence[str], most: int = 4) -> str:
+    """A few of the labels, and how many more there are.
+
+    >>> join_labels(["a", "b", "c"], 2)
+    'a, b and 1 more'
+    """
+    shown = ", ".join(labels[:most])
+    return f"{shown} and {len(labels) - most} more" if len(labels) > most else shown

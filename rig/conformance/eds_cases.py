@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 
-from rig.conformance.case import CaseFailed, case, require
+from rig.conformance.case import CaseFailed, case, join_labels, require, require_none
 from rig.conformance.data_sheet import (
     DOMAIN,
     MAPPING,
@@ -20,7 +20,7 @@ from rig.conformance.data_sheet import (
     Variable,
 )
 from rig.conformance.identifiers import is_restricted
-from rig.conformance.target import Target, join_labels
+from rig.conformance.target import Target
 
 # Data type and access of objects of the communication profile, CiA 301, 7.5.2.
 STANDARD = {
@@ -86,7 +86,7 @@ def check_lists(t: Target) -> str:
     problems += [f"0x{index:04X} is listed twice" for index in sorted(set(listed)) if listed.count(index) > 1]
     problems += [f"0x{index:04X} is listed and not described" for index in sorted(set(listed) - described)]
     problems += [f"0x{index:04X} is described and not listed" for index in sorted(described - set(listed))]
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{len(listed)} objects in the lists"
 
 
@@ -114,7 +114,7 @@ def check_subindices(t: Target) -> str:
             problems.append(f"0x{index:04X}:0 is {highest}, the highest sub-index is {max(subs)}")
         if is_list and highest is not None and highest > max(subs):
             problems.append(f"0x{index:04X}:0 is {highest}, there are {max(subs)}")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{count} arrays and records"
 
 
@@ -143,7 +143,7 @@ def check_types(t: Target) -> str:
         low, high = variable.low, variable.high
         if (low is not None and variable.default < low) or (high is not None and variable.default > high):
             problems.append(f"{variable.label}: {variable.default} is outside its limits")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{len(t.sheet.variables)} variables"
 
 
@@ -161,7 +161,7 @@ def check_standard_objects(t: Target) -> str:
             problems.append(f"{variable.label} has DataType 0x{variable.data_type:04X}, expected 0x{data_type:04X}")
         if variable.access not in access.split():
             problems.append(f"{variable.label} is {variable.access}, expected {' or '.join(access.split())}")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{count} objects of the standard"
 
 
@@ -182,7 +182,7 @@ def check_pdo_parameters(t: Target) -> str:
         stated = _number(t.sheet, "DeviceInfo", key, -1)
         if stated != count:
             problems.append(f"{key} is {stated}, {count} are described")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{len(t.sheet.pdos)} PDOs"
 
 
@@ -215,7 +215,7 @@ def check_pdo_mapping(t: Target) -> str:
                 problems.append(f"{pdo.name} maps {mapped.label}, which is {mapped.access}")
         if total > 64:
             problems.append(f"{pdo.name} has {total} bits")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{count} mapped objects"
 
 
@@ -231,7 +231,7 @@ def check_identity(t: Target) -> str:
         value, stated = _default(t.sheet, 0x1018, sub), _number(t.sheet, "DeviceInfo", key, -1)
         if value is not None and value != stated:
             problems.append(f"0x1018:{sub} is 0x{value:X}, {key} is {f'0x{stated:X}' if stated >= 0 else 'not given'}")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     reserved = " (reserved by CiA: no vendor's)" if 0xAFFF0000 <= vendor <= 0xFFFEFFFF or vendor >= 0xFFFF1000 else ""
     return f"vendor-ID 0x{vendor:08X}{reserved}"
 
@@ -259,7 +259,7 @@ def check_identifiers(t: Target) -> str:
             problems.append(f"{name} and {sent[can_id]} send 0x{can_id:03X}")
         if is_sent:
             sent[can_id] = name
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"{count} COB-IDs"
 
 

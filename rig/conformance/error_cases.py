@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from rig.conformance.case import CaseNotApplicable, case, require, require_applicable
+from rig.conformance.case import CaseNotApplicable, case, join_labels, require, require_applicable
 from rig.conformance.data_sheet import Pdo
 from rig.conformance.identifiers import list_restricted_ends
 from rig.conformance.pdo_cases import INVALID, operational, read_mapped, send_short
@@ -21,7 +21,6 @@ from rig.conformance.target import (
     VALUE,
     Target,
     format_abort,
-    join_labels,
     read_error_code,
 )
 from rig.network.frame import Frame
@@ -39,7 +38,7 @@ def check_sync_identifier(t: Target) -> str:
     require(not word & 1 << 29, f"0x{word:08X} asks for a 29-bit identifier")
     if not variable.is_writable:
         return f"0x{word & 0x7FF:03X}, {variable.access}"
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         accepted = [f"0x{can_id:03X}" for can_id in list_restricted_ends()
                     if t.try_download(0x1005, 0, (word & ~(1 << 30 | 0x7FF) | can_id).to_bytes(4, "little")) != VALUE]
     require(not accepted, f"not refused with 0x06090030: {join_labels(accepted)}")
@@ -55,7 +54,7 @@ def check_emcy_identifier(t: Target) -> str:
         require(word == variable.default, f"0x{word:08X}, the EDS says 0x{variable.default:08X}")
     if not variable.is_writable:
         return f"0x{word & 0x7FF:03X}, {variable.access}"
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         code = t.try_download(0x1014, 0, (word & ~0x7FF | t.find_free_identifiers(1)[0]).to_bytes(4, "little"))
         require(code in (VALUE, STATE, 0x08000020, 0x08000021), f"changed while it is valid: {format_abort(code)}")
         t.write(0x1014, 0, word | INVALID)
@@ -248,7 +247,7 @@ def check_error_behaviour(t: Target) -> str:
 def check_consumer_range(t: Target) -> str:
     """The standard leaves an entry with such a node-ID unused; bits 24 to 31 are reserved."""
     variable = t.require_writable(0x1016, 1)
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         for entry in (0x008000FA, 0x00FF00FA, 0x010100FA, 0x80010000 | LIMIT):
             code = t.try_download(0x1016, 1, entry.to_bytes(4, "little"))
             require(code in (VALUE, TOO_HIGH, TOO_LOW), f"0x{entry:08X}: {format_abort(code)}")
@@ -260,7 +259,7 @@ def check_consumer_duplicate(t: Target) -> str:
     """Where the node has two entries."""
     first, second = t.require_writable(0x1016, 1), t.require_writable(0x1016, 2)
     node = t.find_free_node()
-    with t.restored(first, second):
+    with t.restore_afterwards(first, second):
         t.write(0x1016, 2, 0)
         t.write(0x1016, 1, node << 16 | LIMIT)
         code = t.try_download(0x1016, 2, (node << 16 | LIMIT).to_bytes(4, "little"))
@@ -274,7 +273,7 @@ def check_sync_lost(t: Target) -> str:
     """CiA 301 does not ask for this supervision, nor say after how many periods SYNC counts as lost."""
     variable = t.require_writable(0x1006)
     _require_emcy(t)
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         t.write(0x1006, 0, 10_000)
         with operational(t):
             before = _list_codes(t, t.listen(0.1))

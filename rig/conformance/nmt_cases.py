@@ -3,7 +3,15 @@ from __future__ import annotations
 
 from functools import partial
 
-from rig.conformance.case import CaseFailed, CaseNotApplicable, CaseSkipped, case, require, require_applicable
+from rig.conformance.case import (
+    CaseFailed,
+    CaseNotApplicable,
+    CaseSkipped,
+    case,
+    join_labels,
+    require,
+    require_applicable,
+)
 from rig.conformance.data_sheet import Pdo, Variable
 from rig.conformance.pdo_cases import INVALID, have_all_come, read_mapped, send_short
 from rig.conformance.target import (
@@ -17,7 +25,6 @@ from rig.conformance.target import (
     STOPPED,
     Refusal,
     Target,
-    join_labels,
 )
 
 ALL = (PRE_OPERATIONAL, OPERATIONAL, STOPPED)
@@ -257,7 +264,7 @@ def _check_restored(t: Target, specifier: int, variable: Variable) -> str:
     data = t.upload(variable.index, variable.sub)
     value = variable.decode(data)
     offered = value + 1 if variable.high is None or value + 1 <= variable.high else value - 1
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         t.write(variable.index, variable.sub, offered)
         changed = t.upload(variable.index, variable.sub)
         require(changed == variable.encode(offered), f"{variable.label} does not change")

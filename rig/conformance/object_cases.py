@@ -1,7 +1,16 @@
 """Chapter 2: the object dictionary holds what the EDS says, and refuses what it must."""
 from __future__ import annotations
 
-from rig.conformance.case import CaseFailed, CaseNotApplicable, case, require, require_applicable
+from fdi.report.numbers import count_nouns
+from rig.conformance.case import (
+    CaseFailed,
+    CaseNotApplicable,
+    case,
+    join_labels,
+    require,
+    require_applicable,
+    require_none,
+)
 from rig.conformance.data_sheet import DOMAIN, MAPPING, RPDO, TPDO, Variable
 from rig.conformance.target import (
     HEAD,
@@ -19,7 +28,6 @@ from rig.conformance.target import (
     Refusal,
     Target,
     format_abort,
-    join_labels,
 )
 
 
@@ -32,8 +40,8 @@ def check_all_readable(t: Target) -> str:
         if code and not (code in (NO_DATA, NO_SUB) and (variable.index == 0x1003 or not variable.size)):
             problems.append(f"{variable.label}: {format_abort(code)}")
         count += 1
-    require(not problems, join_labels(problems))
-    return f"{count} objects read"
+    require_none(problems)
+    return f"{count_nouns(count, 'object')} read"
 
 
 @case("2.2", "lengths", "7.1.4", "each value has as many bytes as its data type")
@@ -47,8 +55,8 @@ def check_lengths(t: Target) -> str:
         count += 1
         if len(data) != variable.size:
             problems.append(f"{variable.label} has {len(data)} bytes, expected {variable.size}")
-    require(not problems, join_labels(problems))
-    return f"{count} values"
+    require_none(problems)
+    return count_nouns(count, "value")
 
 
 @case("2.3", "constants", "7.4, 7.5.2.21", "const objects, device type and identity hold the values of the EDS")
@@ -63,8 +71,8 @@ def check_constants(t: Target) -> str:
         data = _read(t, variable)
         if data != variable.default_bytes:
             problems.append(_describe_difference(variable, data))
-    require(not problems, join_labels(problems))
-    return f"{count} constants"
+    require_none(problems)
+    return count_nouns(count, "constant")
 
 
 @case("2.4", "defaults after a reset", "7.3.2.2.1",
@@ -82,8 +90,8 @@ def check_defaults(t: Target) -> str:
         data = _read(t, variable)
         if data != variable.default_bytes:
             problems.append(_describe_difference(variable, data))
-    require(not problems, join_labels(problems))
-    return f"{count} objects"
+    require_none(problems)
+    return count_nouns(count, "object")
 
 
 @case("2.5", "values within their limits", "7.4", "each value lies between LowLimit and HighLimit of the EDS")
@@ -101,8 +109,8 @@ def check_values_in_range(t: Target) -> str:
         if (variable.low is not None and value < variable.low) or (variable.high is not None and value > variable.high):
             problems.append(f"{variable.label} is {value}, limits {variable.low} to {variable.high}")
     require_applicable(count, "the EDS gives no limits")
-    require(not problems, join_labels(problems))
-    return f"{count} values"
+    require_none(problems)
+    return count_nouns(count, "value")
 
 
 @case("2.6", "sub 0 of arrays and records", "7.4", "sub 0 holds the highest sub-index of the EDS")
@@ -117,8 +125,8 @@ def check_highest_sub(t: Target) -> str:
         highest, found = max(variable.sub for variable in variables), t.read(index, 0)
         if found != highest:
             problems.append(f"0x{index:04X}:0 is {found}, the highest sub-index is {highest}")
-    require(not problems, join_labels(problems))
-    return f"{count} objects"
+    require_none(problems)
+    return count_nouns(count, "object")
 
 
 @case("2.7", "unknown object", "7.2.4.3.17, table 22", "upload and download are refused with 0x06020000")
@@ -136,7 +144,7 @@ def check_unknown_object(t: Target) -> str:
             code = t.find_abort(request.ljust(8, b"\0"))
             if code != NO_OBJECT:
                 problems.append(f"{what} of 0x{index:04X}: {format_abort(code)}")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"refused: {', '.join(tried)}"
 
 
@@ -156,8 +164,8 @@ def check_unknown_sub(t: Target) -> str:
                 code = t.find_abort(request.ljust(8, b"\0"))
                 if code != NO_SUB:
                     problems.append(f"{what} of 0x{index:04X}:{sub:X}: {format_abort(code)}")
-    require(not problems, join_labels(problems))
-    return f"{count} requests refused"
+    require_none(problems)
+    return f"{count_nouns(count, 'request')} refused"
 
 
 @case("2.9", "read-only objects", "7.2.4.3.17, table 22",
@@ -173,8 +181,8 @@ def check_read_only(t: Target) -> str:
         code = t.try_download(variable.index, variable.sub, data or b"\0")
         if code != READ_ONLY:
             problems.append(f"{variable.label} ({variable.access}): {format_abort(code)}")
-    require(not problems, join_labels(problems))
-    return f"{count} downloads refused"
+    require_none(problems)
+    return f"{count_nouns(count, 'download')} refused"
 
 
 @case("2.10", "write-only objects", "7.2.4.3.17, table 22", "an upload is refused with 0x06010001")
@@ -187,7 +195,7 @@ def check_write_only(t: Target) -> str:
         code = t.try_upload(variable.index, variable.sub)
         if code != WRITE_ONLY:
             problems.append(f"{variable.label}: {format_abort(code)}")
-    require(not problems, join_labels(problems))
+    require_none(problems)
     return f"refused: {join_labels([variable.label for variable in chosen])}"
 
 
@@ -210,8 +218,8 @@ def check_write_back(t: Target) -> str:
         elif _read(t, variable) != data:
             problems.append(f"{variable.label} holds another value then")
     require_applicable(count, "the EDS has no such object")
-    require(not problems, join_labels(problems))
-    return f"{count} objects"
+    require_none(problems)
+    return count_nouns(count, "object")
 
 
 @case("2.12", "wrong length", "7.2.4.3.17, table 22",
@@ -234,8 +242,8 @@ def check_wrong_length(t: Target) -> str:
                 if not code:
                     t.try_download(variable.index, variable.sub, data)
     require_applicable(count, "the EDS has no such object")
-    require(not problems, join_labels(problems))
-    return f"{count} downloads refused"
+    require_none(problems)
+    return f"{count_nouns(count, 'download')} refused"
 
 
 @case("2.13", "value out of range", "7.2.4.3.17, table 22",
@@ -259,8 +267,8 @@ def check_out_of_range(t: Target) -> str:
                 if not code and data is not None:
                     t.try_download(variable.index, variable.sub, data)
     require_applicable(count, "no writable object has limits in the EDS")
-    require(not problems, join_labels(problems))
-    return f"{count} values refused"
+    require_none(problems)
+    return f"{count_nouns(count, 'value')} refused"
 
 
 @case("2.14", "device name and versions", "7.5.2.8 to 7.5.2.10",

@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rig.conformance.case import CaseSkipped, case, require, require_applicable
+from rig.conformance.case import CaseSkipped, case, join_labels, require, require_applicable
 from rig.conformance.data_sheet import Pdo, Variable
 from rig.conformance.identifiers import list_restricted_ends
 from rig.conformance.target import (
@@ -14,7 +14,6 @@ from rig.conformance.target import (
     VALUE,
     Target,
     format_abort,
-    join_labels,
 )
 from rig.network.frame import Frame
 
@@ -124,7 +123,7 @@ def check_reserved_types(t: Target) -> str:
     for pdo in _list_pdos(t):
         if not t.sheet.is_writable(pdo.parameter, 2):
             continue
-        with t.restored(t.variable(pdo.parameter, 2)):
+        with t.restore_afterwards(t.variable(pdo.parameter, 2)):
             for kind in (241, 251):
                 code = t.try_download(pdo.parameter, 2, bytes((kind,)))
                 require(code == VALUE, f"{pdo.name}, type {kind}: {format_abort(code)}")

@@ -1,7 +1,7 @@
 """Chapter 3: the SDO server, frame by frame: transfers, toggle bits, aborts, lengths, malformed requests."""
 from __future__ import annotations
 
-from rig.conformance.case import CaseFailed, CaseNotApplicable, case, require, require_applicable
+from rig.conformance.case import CaseFailed, CaseNotApplicable, case, join_labels, require, require_applicable
 from rig.conformance.data_sheet import DOMAIN, Variable
 from rig.conformance.target import (
     COMMAND,
@@ -14,7 +14,6 @@ from rig.conformance.target import (
     Refusal,
     Target,
     format_abort,
-    join_labels,
 )
 
 LENGTH_CODES = (TOO_LONG, TOO_SHORT, WRONG_LENGTH)
@@ -35,7 +34,7 @@ def check_expedited_upload(t: Target) -> str:
 def check_expedited_download(t: Target) -> str:
     """The producer heartbeat time is changed and changed back."""
     variable = find_harmless(t)
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         old = t.read(variable.index, variable.sub)
         data = variable.encode(_other_value(variable, old))
         request = HEAD.pack(0x23 | (4 - len(data)) << 2, variable.index, variable.sub) + data.ljust(4, b"\0")
@@ -51,7 +50,7 @@ def check_expedited_download(t: Target) -> str:
 def check_download_without_length(t: Target) -> str:
     """The bit that announces the number of bytes is 0."""
     variable = find_harmless(t)
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         data = variable.encode(_other_value(variable, t.read(variable.index, variable.sub)))
         response = t.demand(HEAD.pack(0x22, variable.index, variable.sub) + data.ljust(4, b"\0"))
         require(response[:4] == HEAD.pack(0x60, variable.index, variable.sub), response.hex(" "))
@@ -121,7 +120,7 @@ def check_download_toggle(t: Target) -> str:
     variable = find_harmless(t)
     before = t.upload(variable.index, variable.sub)
     offered = variable.encode(_other_value(variable, int.from_bytes(before, "little")))
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         _begin_segmented_download(t, variable)
         code = t.find_abort(bytes((0x10 | (7 - len(offered)) << 1 | 1,)) + offered.ljust(7, b"\0"))
         require(code == TOGGLE, format_abort(code))
@@ -191,7 +190,7 @@ def check_announced_length(t: Target) -> str:
     """A segmented download announces one byte more, and one less, than the object has."""
     variable = find_harmless(t)
     found = []
-    with t.restored(variable):
+    with t.restore_afterwards(variable):
         data = t.upload(variable.index, variable.sub)
         for offered, what in ((data + b"\0", "one more"), (data[:-1], "one less")):
             try:
@@ -213,7 +212,7 @@ def check_segment_length(t: Target) -> str:
     before = t.upload(variable.index, variable.sub)
     other = variable.encode(_other_value(variable, int.from_bytes(before, "little")))
     for offered, what in ((other + b"\0", "one more"), (other[:-1], "one less")):
-        with t.restored(variable):
+        with t.restore_afterwards(variable):
             _begin_segmented_download(t, variable)
             code = t.find_abort(bytes(((7 - len(offered)) << 1 | 1,)) + offered.ljust(7, b"\0"))
             require(code in LENGTH_CODES, f"{what}: {format_abort(code)}")

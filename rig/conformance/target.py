@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -247,7 +247,7 @@ class Target:
         return variable
 
     @contextmanager
-    def restored(self, *variables: Variable) -> Iterator[None]:
+    def restore_afterwards(self, *variables: Variable) -> Iterator[None]:
         """Whatever happens within, write back what these objects held before. Raises Refusal, CaseFailed."""
         before = [(variable, self.upload(variable.index, variable.sub)) for variable in variables]
         try:
@@ -355,13 +355,3 @@ class Target:
 def read_error_code(frame: Frame) -> int:
     """The error code of an emergency; -1 for a frame of another kind."""
     return int.from_bytes(frame.data[:2], "little") if len(frame.data) == 8 else -1
-
-
-def join_labels(labels: Sequence[str], most: int = 4) -> str:
-    """A few of the labels, and how many more there are.
-
-    >>> join_labels(["a", "b", "c"], 2)
-    'a, b and 1 more'
-    """
-    shown = ", ".join(labels[:most])
-    return f"{shown} and {len(labels) - most} more" if len(labels) > most else shown

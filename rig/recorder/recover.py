@@ -58,7 +58,8 @@ def recover_log(path: Path, out: Path) -> Salvage:
         records = iter(reading)
         first = next(records, None)
         if first is None:
-            raise InputError(path, "", f"an MCAP log with something in it ({reading.reason or 'it is empty'})")
+            reason = reading.reason or "it is empty"
+            raise InputError(path, "", f"an MCAP log with at least one intact record ({reason})")
         try:
             return _write_salvage(chain([first], records), reading, writable(out, "--out", source=path))
         except OSError as error:

@@ -85,7 +85,7 @@ class Check(ABC):
         try:
             span = run.span(self.window, self.skip)
             t0, t1 = span.start / RATE, span.stop / RATE
-            missing = run.missing(self.about, span)
+            missing = run.count_missing(self.about, span)
             measured = self.measure(run, span) / find_scale(self.shown_unit, self.si_unit)
             if not isfinite(measured):
                 raise NotMeasurable(f"the measure came to {measured:g}")

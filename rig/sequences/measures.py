@@ -82,14 +82,14 @@ def measure_rise_time(position: Array, com: Array, before: float) -> float:
     size = measure_step_size(com, before)
     done = (filter_median(position) - before) / size
 
-    def reached(level: float) -> float:
+    def find_time(level: float) -> float:
         beyond = np.flatnonzero(done >= level)
         if not len(beyond):
             raise NotMeasurable(f"{100 * level:g} % of the step was never reached")
         k = int(beyond[0])
         return k - (done[k] - level) / (done[k] - done[k - 1]) if k else 0.0
 
-    return float(reached(0.9) - reached(0.1)) / RATE
+    return float(find_time(0.9) - find_time(0.1)) / RATE
 
 
 def measure_ramp_error(error: Array, com: Array) -> float:

@@ -104,7 +104,7 @@ class RunData:
             raise NotMeasurable(f"{name} was not measured")
         return measures.bridge_gaps(np.asarray(column, float)[span], name, LARGEST_MISSING_SHARE)
 
-    def missing(self, name: str, span: slice) -> int:
+    def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
         column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), None)
         return 0 if column is None else int(np.isnan(np.asarray(column, float)[span]).sum())

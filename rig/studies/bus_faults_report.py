@@ -26,9 +26,8 @@ def _tabulate_matrix(cells: Sequence[Cell]) -> Table:
     names = list(dict.fromkeys(cell.fault for cell in cells))
     rows: list[list[TableCell | str]] = [
         [name, *(_describe_cell(found[name, phase]) for phase in PHASES if (name, phase) in found)] for name in names]
-    caption = ("Reaction: from the begin of the fault to zero current of the controller, in ms, with the EMCY or other "
-               "trouble that was reported first and when. Tolerated: nothing was reported; the figure is the largest "
-               "deviation of the position from the run without faults.")
+    caption = ("In ms: time from the begin of the fault to zero current of the controller. Tolerated: nothing was "
+               "reported; the figure is the largest deviation of the position from the run without faults.")
     return Table([Column("fault"), *(Column(phase, align="right") for phase in PHASES)], rows, caption)
 
 

@@ -30,10 +30,6 @@ from rig.view.rerun_log import (
     list_lines,
 )
 
-FEWEST_PIXELS = 500  # pixels; the marks in a legend have some 60 each
-FEWEST_TEXT_PIXELS = 40  # pixels; one level in the list of events has some 60
-GREETING_TIME = 7.0  # s; the viewer's own greeting covers a corner for that long
-LANE_WEIGHT = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
 LEVEL_COLOURS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
 LIMITS = "limits"
 
@@ -62,8 +58,10 @@ def take_screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0
     if wrong:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
     pixels = _count_view_pixels(trace, image)
-    fewest = {TEXTS: FEWEST_TEXT_PIXELS, LIMITS: 0}
-    empty = [title for title, count in pixels.items() if count < fewest.get(title, FEWEST_PIXELS)]
+    fewest_text_pixels = 40  # pixels; one level in the list of events has some 60
+    fewest = {TEXTS: fewest_text_pixels, LIMITS: 0}
+    fewest_pixels = 500  # pixels; the marks in a legend have some 60 each
+    empty = [title for title, count in pixels.items() if count < fewest.get(title, fewest_pixels)]
     if empty:
         raise ViewerError(f"{image}: empty views: {', '.join(empty)}")
     return pixels
@@ -80,7 +78,8 @@ def _count_view_pixels(trace: Trace, image: Path) -> dict[str, int]:
         colours = [line.colour for line in plot.lines if f"{plot.origin}/{line.path}" in there]
         if colours:
             out[plot.title] = sum(_count_pixels(shades, colour) for colour in colours)
-    out[LANES] = sum(_count_pixels(shades, colour, LANE_WEIGHT, 6) for colour in
+    lane_weight = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
+    out[LANES] = sum(_count_pixels(shades, colour, lane_weight, 6) for colour in
                      {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()})
     if trace.events or trace.checks:
         out[TEXTS] = sum(_count_pixels(shades, colour) for colour in LEVEL_COLOURS)
@@ -122,6 +121,7 @@ def _wait_until_loaded(viewer: subprocess.Popen[bytes], url: str, patience: floa
     from rerun.experimental import ViewerClient
 
     deadline = time.monotonic() + patience
+    greeting_time = 7.0  # s; the viewer's own greeting covers a corner for that long
     while time.monotonic() < deadline:
         time.sleep(0.5)
         if viewer.poll() is not None:
@@ -131,7 +131,7 @@ def _wait_until_loaded(viewer: subprocess.Popen[bytes], url: str, patience: floa
         except ConnectionError:
             continue
         if state.recordings and state.views and not state.loading:
-            time.sleep(GREETING_TIME)
+            time.sleep(greeting_time)
             return list(ViewerClient(url).get_state().views)
     raise TimeoutError(f"not ready after {patience:g} s")
 

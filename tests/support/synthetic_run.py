@@ -19,15 +19,15 @@ METADATA = {"seed": "1", "bus": "embedded", "pace": "lockstep", "period": "0.001
 
 
 def build_command() -> np.ndarray:
-    """The preflight command, shape (13500,), m."""
+    """The preflight command, shape (13500,), m; rounded, because NumPy's sin and exp differ by CPU in the last bit."""
     def hold(level: float, seconds: float) -> np.ndarray:
         return np.full(round(seconds * 1000), level)
 
     ramp, t = np.arange(2000) / 2000, np.arange(2000) / 1000
     chirp = np.sin(2 * math.pi * (t + 4.75 * t**2)) * (1 - np.exp(-20 * t))
-    return 1e-3 * np.concatenate([
+    return np.round(1e-3 * np.concatenate([
         hold(0, 0.5), hold(5, 1), hold(0, 1), hold(1, 0.75), hold(0, 0.75), ramp, hold(1, 0.5), 1 - ramp, hold(0, 0.5),
-        3 * np.sin(2 * math.pi * t), chirp, hold(0, 0.5)])
+        3 * np.sin(2 * math.pi * t), chirp, hold(0, 0.5)]), 15)
 
 
 def build_cycles(seed: int = 1,

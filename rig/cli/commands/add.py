@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out (default: the file of --model, else model.toml); exit status 0 if the effect helps, 1 if not."""
+    """The model goes to --out (default: that of --model, else model.toml). Exit status 0 if the effects help."""
     from dataclasses import replace
 
     from fdi.discovery.update_model import add_effects, find_runs, write_model_file

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Measure the speed of the plant beside C and other libraries, or how often `rig explain` is right."""
+    """Without an argument: the speed of the plant, beside C and other libraries."""
     if args.what == "explain":
         return _run_trial(args)
     if args.what == "robustness":

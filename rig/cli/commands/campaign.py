@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Judge every case; results.parquet, summary.json and detection.svg in --out (default: campaigns/NAME)."""
+    """results.parquet, summary.json and detection.svg go to the folder --out (default: campaigns/NAME)."""
     from rig.studies.campaign.folder import read_campaign_rows
     from rig.studies.campaign.run_campaign import run_campaign
     from rig.studies.resumable.batch import Workers
@@ -127,8 +127,9 @@ def _choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     listed, more = tables.get("case", []), matrix.parse_faults(args.fault)
     tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
     if not tables["case"]:
-        shipped = ", ".join(matrix.list_shipped_matrices())
-        raise InputError("CAMPAIGN", "", f"a matrix file, {shipped}, --fault or a folder")
+        shipped = " or ".join(matrix.list_shipped_matrices())
+        raise InputError("MATRIX.toml|FOLDER", "", f"a matrix file, the shipped matrix {shipped}, a folder of "
+                                                   "traces, or --fault EFFECT=SIZE,..")
     return (matrix.build_matrix(tables, model, work, args.what or "--fault"),
             _choose_folder(args.out, Path(args.what).stem if args.what else "options"))
 

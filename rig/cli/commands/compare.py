@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Replay a trace with a model; exit status 0 if only noise is left, 1 otherwise."""
+    """Exit status 0 if the residual is noise, 1 otherwise."""
     from fdi.comparison.compare import compare
     from fdi.report.compare_report import build_comparison_report
     from fdi.trace.trace import Trace

@@ -32,10 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Test a CANopen node against CiA 301 and its EDS.
-
-    Exit status 1 if a test failed, 3 if none failed and some times could not be measured.
-    """
+    """Exit status 1 if a test failed, 3 if none failed and some times could not be measured."""
     from fdi.output import writable, write_text
     from plant.errors import InputError
     from rig.cli.answer import choose_file, show_answer
@@ -56,8 +53,8 @@ def run_command(args: argparse.Namespace) -> int:
     for option, value, least in (("--tolerance", args.tolerance, 0.0), ("--timeout", args.timeout, 0.01)):
         if not least <= value <= 60_000:
             raise InputError(option, f"{value:g}", f"a number from {least:g}")
-    junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")
     folder = _make_folder(args.out)
+    junit = choose_file(args.junit, (".xml",), sheet.path, "--junit")  # may be a file in that folder
     bus, _ = choose_bus(args.bus)
     options = Options(may_write=args.write or is_own, timeout=args.timeout, tolerance=1e-3 * args.tolerance)
     with open_wire(args.node, bus) as wire, show_progress(is_silent=args.json or args.quiet) as progress:
@@ -202,6 +199,8 @@ def _make_folder(out: str | None) -> Path | None:
     if out is None:
         return None
     folder = Path(out)
+    if folder.suffix in (".html", ".json", ".xml"):
+        raise InputError("--out", out, "a folder; the page and the JSON answer go there, JUnit to --junit FILE.xml")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Show every finding; exit status 1 if the embedded bench cannot run on this machine."""
+    """Exit status 1 if the embedded bench cannot run here."""
     from plant.errors import InputError
 
     if not 0 <= args.seconds <= 3600:

@@ -34,7 +34,7 @@ def _path(text: str) -> Path:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """List the catalogue of effects, or show one in detail."""
+    """An effect of --effects, or any with --test, is also tested: exit status 1 if it fails."""
     from fdi.report.json import to_plain
     from plant.model import find_effect, list_offered_effects, load_model
     from rig.cli.answer import show_answer

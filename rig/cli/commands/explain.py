@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Name what is missing; exit status 0 if nothing is, 1 otherwise."""
+    """Exit status 0 if nothing is missing, 1 otherwise."""
     from fdi.discovery.explain_runs import explain_runs
     from fdi.discovery.runs import read_runs
     from fdi.report.explain_report import build_explanation_report

@@ -12,14 +12,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out in the format of its suffix."""
+    """The suffix of --out chooses the format."""
     from fdi.report.report import Report
     from plant.errors import InputError
     from rig.cli.answer import show_answer
     from rig.recorder.convert import export_trace
 
     if args.out is None:
-        raise InputError("--out", "", "the file to write")
+        raise InputError("--out", "", "the file to write, such as run.csv or frames.blf")
     count = export_trace(Path(args.trace), Path(args.out), args.all)
     sentence = f"{args.out}: {count} {'rows' if '.csv' in Path(args.out).suffixes else 'frames'}"
     show_answer(Report("export", args.trace, sentence=sentence, data={"path": str(args.out), "count": count}), args)

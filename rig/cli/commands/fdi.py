@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Diagnose a trace; exit status 0 if both faults are acceptable, 1 otherwise. Or learn bands."""
+    """Exit status 0 if both faults are acceptable, 1 otherwise. --learn-bands makes bands instead."""
     if args.learn_bands is not None:
         return learn_bands(args)
     from plant import InputError

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out (default: FILE with .mcap in place of its suffix)."""
+    """The log goes to --out (default: FILE with .mcap in place of its suffix)."""
     from rig.recorder.convert import RAW_SUFFIXES
 
     source = Path(args.file)

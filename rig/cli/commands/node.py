@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Run the plant emulator (node 3) or the reference firmware (node 2) until Ctrl-C or SIGTERM ends it.
+    """The node runs until Ctrl-C or SIGTERM ends it.
 
     It runs with --model, --set and --seed until a rig loads another scenario.
     """

@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out (default: FILE with .recovered before its suffix) and report what was lost."""
+    """The log goes to --out (default: FILE with .recovered before its suffix)."""
     from fdi.report.report import Report
     from rig.cli.answer import show_answer
     from rig.recorder.recover import recover_log

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out (default: the file of --model, in place)."""
+    """The model goes to --out (default: the file of --model, in place)."""
     from dataclasses import replace
 
     from fdi.discovery.update_model import find_runs, remove_effect, write_model_file
@@ -27,7 +27,7 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.progress_bar import show_progress
 
     if not args.model or not Path(args.model).is_file():
-        raise InputError("--model", str(args.model or ""), "the model FILE to take it out of")
+        raise InputError("--model", str(args.model or ""), "the model file to remove the effect from: --model FILE")
     model, known = discovery_options.load_model(args)
     effects, trace = discovery_options.split_words(args.words, args.trace, model.plant)
     if len(effects) > 1:

@@ -11,7 +11,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Write --out (default: report.html beside the trace)."""
+    """The page goes to --out (default: report.html beside the trace)."""
     from fdi.report.report import Report
     from fdi.report.run_report import write_run_page
     from rig.cli.answer import show_answer

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Run a sequence; results go to --out (default: a new folder in runs/)."""
+    """Results go to the folder --out (default: a new one in runs/). Exit status 0 if no check failed."""
     from fdi.report.run_report import build_run_report
     from fdi.trace.trace import Trace
     from plant import InputError

@@ -18,9 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Simulate a model in closed loop on a command; write t,com,xj,cor,p12,xs,load (default: simulation.csv)."""
+    """Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv)."""
     from pathlib import Path
 
+    from fdi.output import writable
     from fdi.report.numbers import format_amount
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
@@ -32,10 +33,11 @@ def run_command(args: argparse.Namespace) -> int:
     com, load, name = load_command(args.command_file, model["controller.period"])
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
-    columns = simulate(model, com, load, args.seed, args.steps or STEPS)
     out = Path(args.out or "simulation.csv")
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
+    writable(out, "--out", source=args.command_file)
+    columns = simulate(model, com, load, args.seed, args.steps or STEPS)
     trace = Trace.of(columns._asdict(), model["controller.period"], {
         "model": model.name, "seed": str(args.seed), "command": name})
     if out.suffix == ".mcap":

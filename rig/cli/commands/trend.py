@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Follow both faults; exit status 0 if both are within MidBand at the last trace, 1 otherwise."""
+    """Exit status 0 if both faults are within MidBand at the last trace, 1 otherwise."""
     from plant import InputError
 
     if args.score:

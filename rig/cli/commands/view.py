@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Open the viewer on 127.0.0.1, or write what --save and --screenshot ask for."""
+    """The viewer listens on 127.0.0.1 only."""
     from plant.errors import InputError
 
     if args.headless and not args.screenshot:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdi.diagnosis.faults import FAULTS, Fault
-from fdi.report.numbers import NO_NUMBER, format_digits
+from fdi.report.numbers import NO_NUMBER, format_digits, format_duration
 from fdi.report.report import (
     Cell,
     Column,
@@ -27,19 +27,6 @@ def describe_progress(progress: BatchProgress) -> str:
     """How far a campaign is: "120/1400, 2 failed, 35 min left"."""
     failed = f", {progress.failed} failed" if progress.failed else ""
     return f"{progress.done}/{progress.total}{failed}, {format_duration(progress.left)} left"
-
-
-def format_duration(seconds: float) -> str:
-    """A duration in seconds, minutes or hours.
-
-    >>> format_duration(75.0), format_duration(600.0), format_duration(9000.0)
-    ('75 s', '10 min', '2.5 h')
-    """
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
 
 
 def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -> Report:

@@ -27,11 +27,11 @@ from plant.effects import Effect
 from plant.errors import InputError, suggest_name
 from plant.model import Model, find_effect
 from plant.parameters import parse_toml, parse_value, read_toml
+from rig.sequences.timing import PERIOD
 
 SIMULATORS = ("plant", "independent")
 SIGNALS = ("xj,p12,xs", "xj,p12", "xj")
 HEALTHY = "healthy"
-PERIOD = 1e-3  # s
 DEFAULTS: dict[str, Any] = {
     "seeds": 20,  # runs of each size
     "first": 0,  # seed of the first

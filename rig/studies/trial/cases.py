@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.sequences.timing import PERIOD
 from rig.studies.trial import command, hidden
 from rig.studies.trial.hidden import Hidden
-from rig.studies.trial.truth import PERIOD, Run, nominal_symbols, simulate_truth
+from rig.studies.trial.truth import Run, nominal_symbols, simulate_truth
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdi.report.numbers import NO_NUMBER
+from fdi.report.numbers import NO_NUMBER, format_duration
 from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
-from rig.studies.campaign.campaign_report import format_duration
 from rig.studies.resumable.batch import BatchProgress
 
 

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from plant.errors import InputError
 from plant.parameters import load_nominal_values
+from rig.sequences.timing import PERIOD
 
 Array = NDArray[np.float64]
 
-PERIOD = 1e-3  # s, one cycle
 FLAGS = ("-O2", "-shared", "-fPIC")
 SYMBOLS = {
     "GAP": "controller.proportional_gain", "Imax": "controller.current_limit", "GM": "torque_motor.gain",

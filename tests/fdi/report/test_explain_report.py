@@ -39,9 +39,9 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
                      {"xj": 1.0, "p12": 1.0}, 1200.0, 1e-30, word)
 
 
-def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, reached: bool = False,
+def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            **fields: Any) -> Answer:
-    base = SimpleNamespace(reached=reached, ratio={"xj": 22.5, "p12": 15.0})
+    base = SimpleNamespace(is_at_floor=is_at_floor, ratio={"xj": 22.5, "p12": 15.0})
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, controller=1.0,
                                   ledger=[base], search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
@@ -83,7 +83,7 @@ def test_a_size_has_its_interval(case: str) -> None:
 
 
 def test_another_firmware_is_said_to_be_one() -> None:
-    sentence = describe_verdict(answer("UNEXPLAINED", (), reached=True))
+    sentence = describe_verdict(answer("UNEXPLAINED", (), is_at_floor=True))
     assert sentence.startswith("The output of the controller differs from the model's")
 
 

@@ -105,8 +105,8 @@ def test_an_aborted_run_says_why_and_what_is_missing(aborted: Path) -> None:
     page = render_run(Trace.read(aborted, all=True))
     head, text = page[:page.index("</header>")], " ".join(_Page(page).text.split())
     assert ">ABORTED<" in head and "guard 'ram far out' was passed by xj" in html.unescape(head)
-    assert "missing samples, marked red below the lines: 45 of xj, cor, p12; 300 of xs (of 2871)" in text
-    assert text.count("missing samples, marked") == 1
+    assert "missing samples (red on the page): 45 of xj, cor, p12; 300 of xs (of 2871)" in text
+    assert text.count("missing samples (red on the page)") == 1
     assert len(re.findall("not reached ?the run ended at 2.271 s", text)) == 3 and "whole run" not in text
     assert text.count(": not measured") == 3  # the names in the drawing, without a bar
     assert not re.search(r"\bnan\b", text)

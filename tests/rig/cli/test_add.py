@@ -64,6 +64,7 @@ def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Pa
 def test_the_page_has_the_ledger(added: tuple[Said, Path]) -> None:
     page = Path(added[0].json["report"]).read_text()
     assert "null_bias added" in page and page.count("<svg") == 2 and "http" not in page.replace("http://www.w3.org", "")
+    assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
 
 
 def test_such_a_model_simulates_and_lacks_nothing(model: Path, runs: dict[str, Path], tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_a_base_effect_comes_out_at_its_value_before(tmp_path: Path) -> None:
     (["add", "quantisation", "est"], "steps in the measured positions"),
     (["add", "null_bias", "est", "--holdout", "repeat", "--repeat", "repeat"], "a run that no fit has seen"),
     (["add", "null_bias", "est", "--out", "m.json"], "FILE.toml"),
-    (["remove", "null_bias"], "the model FILE to take it out of"),
+    (["remove", "null_bias"], "the model file to remove the effect from"),
     (["remove", "coil_lag", "--model", "model"], "one that the model has (null_bias)"),
     (["remove", "null_bias", "coil_lag", "--model", "model"], "one effect at a time"),
 ])

@@ -82,7 +82,7 @@ FILES = {
 BAD = {
     "no command": ([], "required"),
     "unknown command": (["fly"], "'fly'"),
-    "unknown option": (["run", "--fast"], "--fast"),
+    "unknown option": (["run", "--fast"], "rig run: unrecognized arguments: --fast (rig run --help)"),
     "unknown sequence": (["run", "prefligth"], "'preflight'"),
     "no such file": (["run", "none.toml"], "none.toml"),
     "sequence is a folder": (["run", "folder.toml"], "folder.toml"),
@@ -248,7 +248,7 @@ def test_two_runs_do_not_share_a_folder(short: Path, tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     assert finished(process).status == 130
     assert said.status == 2 and "no other run" in said.err
-    assert Trace.read(tmp_path / "out", all=True).xj.size > 0
+    assert Trace.read(tmp_path / "out", all=True).xj.size > 0  # on a busy machine it may still be in its set-up
 
 
 def test_runs_without_a_folder_get_new_ones(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

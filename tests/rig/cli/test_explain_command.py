@@ -71,6 +71,7 @@ def test_the_page_needs_no_network(found: Said, biased: dict[str, Path]) -> None
     page = biased["est"].with_name("page.html").read_text()
     assert found.status == 1 and "null_bias explains the residual" in page and page.count("<svg") == 2
     assert "http" not in page.replace("http://www.w3.org", "")
+    assert ">1</text>" in page and "math" not in page, "the noise floor on a logarithmic axis, as a plain number"
 
 
 def test_nothing_missing_passes(healthy: dict[str, Path]) -> None:

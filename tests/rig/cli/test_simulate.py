@@ -49,6 +49,13 @@ def test_rows_at_the_models_period_are_the_command(tmp_path: Path) -> None:
     assert (run["com"] == com).all() and run["t"] == pytest.approx(t)
 
 
+def test_the_command_file_is_never_overwritten(tmp_path: Path) -> None:
+    file = written(tmp_path, np.arange(50) / 1000, np.zeros(50), np.zeros(50))
+    before = file.read_text()
+    said = rig("simulate", "--command", file, "--out", file)
+    assert said.status == 2 and "another file than the one that is read" in said.err and file.read_text() == before
+
+
 @pytest.mark.parametrize(("period", "every"), [(0.001, 1), (0.002, 2), (0.01, 10)])
 def test_the_preflight_lasts_as_long_as_ever(period: float, every: int, tmp_path: Path) -> None:
     run = simulated(tmp_path, f"--set=controller.period={period}")

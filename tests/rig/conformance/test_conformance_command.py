@@ -78,7 +78,8 @@ def test_the_manual_lists_every_test() -> None:
 
 
 def test_files(tmp_path: Path) -> None:
-    out, junit = tmp_path / "new" / "folder", tmp_path / "junit.xml"
+    out = tmp_path / "new" / "folder"
+    junit = out / "junit.xml"  # in a folder that the command makes, as docs/conformance.md shows it
     said = rig("conformance", "plant", "--chapter", 1, "--chapter", "3.6", "--out", out, "--junit", junit)
     assert said.status == 0 and said.out.startswith("PASS  Every applicable test passed (11 of 11).")
     assert "3.6" in said.out and "0x05030000" in said.out
@@ -90,6 +91,11 @@ def test_files(tmp_path: Path) -> None:
     suites = ElementTree.parse(junit).getroot()
     assert [suite.get("name") for suite in suites] == ["1 Electronic data sheet", "3 SDO"]
     assert [len(suite) for suite in suites] == [10, 1] and suites.get("failures") == "0"
+
+
+def test_a_page_is_no_folder(tmp_path: Path) -> None:
+    said = rig("conformance", "plant", "--chapter", 1, "--out", tmp_path / "page.html")
+    assert said.status == 2 and "expected a folder" in said.err and not (tmp_path / "page.html").exists()
 
 
 def test_a_failure_is_shown_everywhere(tmp_path: Path) -> None:

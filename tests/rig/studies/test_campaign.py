@@ -214,7 +214,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "healthy", "--work", "math:pi"), "--work: math:pi: expected module:function"),
     (("--fault", "healthy", "--scheduler", "tcp://127.0.0.1:1"), "--scheduler: tcp://127.0.0.1:1: expected the addr"),
     (("--fault", "healthy", "--scheduler", "nowhere"), "--scheduler: nowhere: expected the address"),
-    ((), "expected a matrix file, statistics, --fault or a folder"),
+    ((), "expected a matrix file, the shipped matrix statistics, a folder of traces, or --fault EFFECT=SIZE,.."),
     (("nothing.toml",), "nothing.toml: expected a readable file"),
 ])
 def test_bad_input_is_one_line(words: tuple[str, ...], complaint: str, tmp_path: Path,
