@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from plant.plants import Plant
 from plant.quantity import Quantity
 from plant.state import Input, Ports, State
 
+SHIPPED_MODELS = ("servo",)  # plant/models/NAME.toml, beside the nominal values of the plants
 STEPS = 100  # steps a cycle: 10 us; its error is measured in the docs
 
 
@@ -35,6 +37,11 @@ def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that suit a plant."""
     kind = plants.find_plant(plant)
     return [e for e in CATALOGUE.whole().values() if kind.offers(e)]
+
+
+def list_searched_effects(plant: str = "eha") -> list[Effect]:
+    """The effects that `rig explain` tests on a plant without being asked."""
+    return [e for e in list_offered_effects(plant) if not e.searched_in or plant in e.searched_in]
 
 
 def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Quantity:
@@ -134,17 +141,25 @@ class Model:
 
 
 def load_model(source: str | Path = "eha") -> Model:
-    """The nominal model of a plant ("eha", "ehs"), or the model of a TOML file, which lists what is not nominal.
+    """The nominal model of a plant ("eha", "ehs"), a shipped model ("servo"), or the model of a TOML file.
+
+    A file lists what is not nominal. One that has the name of a plant or of a shipped model is given with its folder.
 
     Raises:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
     """
     if str(source) in plants.list_plants():
         return build_bare_model(str(source)).having(plants.find_plant(str(source)).has)
-    path = Path(source)
+    path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
-        raise InputError(source, "", f"a model file, or one of {', '.join(plants.list_plants())} for a nominal model")
+        names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
+        raise InputError(source, "", f"a model file, or one of {names}")
     return parse_model(read_toml(path), path, path.stem)
+
+
+def find_shipped_model(name: str) -> Path | None:
+    """The file of a shipped model; None for any other name."""
+    return Path(str(files("plant").joinpath("models", f"{name}.toml"))) if name in SHIPPED_MODELS else None
 
 
 def build_bare_model(plant: str, name: str = "") -> Model:

@@ -41,6 +41,8 @@ class Table:
     """How a file of the plant's own rig becomes a trace."""
 
     columns: Mapping[str, tuple[Term, ...]]  # t, com, xj, cor and what else of a trace there is, as sums
+    derive: Callable[[Mapping[str, Array]], dict[str, Array]] | None = None  # further columns, from the file's own
+    derived_from: tuple[str, ...] = ()  # the file's columns that this needs
     skip: int = 0  # rows of start-up
     separator: str = ","
     load: Callable[[Mapping[str, Array]], Array] | None = None  # from these columns, (n,) N
@@ -48,7 +50,7 @@ class Table:
     @property
     def sources(self) -> set[str]:
         """The columns that a file must have."""
-        return {term.source for terms in self.columns.values() for term in terms}
+        return {term.source for terms in self.columns.values() for term in terms} | set(self.derived_from)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,11 @@ class Plant:
     lacks: tuple[str, ...] = ()  # effects that cannot be
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their groups say
     controller: bool = True  # the controller is known, so that Cor can be held against com and XJ
-    table: Table | None = field(default=None, repr=False)
+    tables: tuple[Table, ...] = field(default=(), repr=False)  # of the files that its rig writes
+    # The force on the ram by its measured pressures, (n,) N, positive against extension: from parameter values, chamber
+    # pressures, (n, 2) Pa, drive `cor`, (n,), and period, s. And the names of the values that it uses.
+    compute_force: Callable[[Mapping[str, float], Array, Array, float], Array] | None = None
+    force_parameters: frozenset[str] = frozenset()
 
     @cached_property
     def nominal(self) -> Mapping[str, float]:

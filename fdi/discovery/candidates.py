@@ -25,7 +25,7 @@ from fdi.thresholds import (
     SUSPICIOUS_TOLERANCES,
 )
 from plant.effects import CATALOGUE
-from plant.model import Model, find_quantity, list_offered_effects
+from plant.model import Model, find_quantity, list_searched_effects
 
 
 class Value(NamedTuple):
@@ -122,7 +122,7 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
     blind = tuple(_describe_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
-    noiseless = tuple(c.name for c in list_offered_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
+    noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,
                   tuple(_list_ledger(e, hand)), pattern, separate or {})

@@ -24,7 +24,7 @@ from fdi.thresholds import (
 )
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
-from plant.model import Model, list_offered_effects
+from plant.model import Model, list_searched_effects
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     controller, prints = find_firmware_marks(model, [est, *repeats])
     tooth = find_quantisation(est)
     found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
-    candidates = [e.name for e in list_offered_effects(model.plant)
+    candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, workers)
     if tooth:

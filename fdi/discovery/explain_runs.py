@@ -15,7 +15,7 @@ from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes, compile_kernels
-from plant.model import Model, list_offered_effects
+from plant.model import Model, list_searched_effects
 from plant.run import report_law_errors
 from plant.starts import ensure_starts
 
@@ -55,7 +55,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
     Raises:
         InputError: a user's effect that cannot be compiled and run.
     """
-    for name in [e.name for e in list_offered_effects(runs.model.plant)] if effects is None else effects:
+    for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
         if not CATALOGUE[name].starts and CATALOGUE[name].fitted:
             progress(f"looking for sizes of {name}", 0.0)
             ensure_starts(name, runs.est.com, runs.est.load)

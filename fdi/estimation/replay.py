@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.estimation.driven import replay_measured
 from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.noise import WINDOW
 from fdi.estimation.unknowns import WITHOUT_NOISE, tolerance_sizes
@@ -66,8 +67,8 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | N
     The replay starts at the first measured position, or in the middle where that is not known.
     """
     position = trace.unlagged_position if has_known_start(trace) else None
-    out = lanes.replay(values, trace.cor if current is None else current, trace.load, position, anchor)
-    return trace.pass_sensors(out)
+    driven = trace.cor if current is None else current
+    return trace.pass_sensors(replay_measured(lanes, values, trace, driven, position, anchor))
 
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fdi.estimation.likelihood import Free
 from fdi.thresholds import HEALTHY_TOLERANCES
 from plant.effects import CATALOGUE, Effect
-from plant.model import Model, find_quantity, list_offered_effects
+from plant.model import Model, find_quantity, list_offered_effects, list_searched_effects
 
 Floats = NDArray[np.float64]
 
@@ -87,8 +87,8 @@ def _off_nominal(e: Effect, model: Model) -> bool:
 
 
 def complete_model(model: Model) -> Model:
-    """The model without sensor noise and with all effects that its plant may have, at their off values."""
-    return silence_readings(model.having(e.name for e in list_offered_effects(model.plant) if not e.disturbance))
+    """The model without sensor noise and with all effects that are searched in its plant, at their off values."""
+    return silence_readings(model.having(e.name for e in list_searched_effects(model.plant) if not e.disturbance))
 
 
 def silence_readings(model: Model) -> Model:

@@ -38,7 +38,7 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
         with open_text(path) as stream:
             header = stream.readline()
             plant = _find_recorder(header)
-            table = plant.table if plant else None
+            table = _find_table(header, plant) if plant else None
             rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
             if table is None:
                 return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
@@ -142,9 +142,14 @@ def _parse_number(path: Path, line: int, name: str, text: str) -> float:
 def _find_recorder(header: str) -> Plant | None:
     """The plant whose rig writes a CSV with this first line; None for a trace of this software or any other."""
     for plant in map(find_plant, list_plants()):
-        if plant.table and plant.table.sources <= set(_split_header(header, plant.table)):
+        if _find_table(header, plant):
             return plant
     return None
+
+
+def _find_table(header: str, plant: Plant) -> Table | None:
+    """Which of the plant's own files has this first line."""
+    return next((table for table in plant.tables if table.sources <= set(_split_header(header, table))), None)
 
 
 def _split_header(line: str, table: Table) -> list[str]:
@@ -155,6 +160,8 @@ def _combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, F
     """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
     columns = {name: sum((_shift_term(sources, term) for term in terms), start=np.zeros(1))[table.skip:]
                for name, terms in table.columns.items()}
+    if table.derive:
+        columns |= {name: values[table.skip:] for name, values in table.derive(sources).items()}
     if table.load:
         columns["load"] = table.load(columns)
     return columns

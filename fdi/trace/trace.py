@@ -118,6 +118,7 @@ class Trace:
     usable: Flags  # rows that a replay can be compared with; all rows of a trace that was not prepared
     filled: Flags  # rows whose current is interpolated
     incomplete: Flags  # rows in which Com, XJ or Cor was not recorded, though preparation has filled them
+    chambers: Floats | None = None  # (n, 2) Pa, pressures of both chambers, where they were measured one by one
     outputs: tuple[str, ...] = ()  # of OUTPUTS, measured and chosen; none in a trace that was not prepared
     gaps: tuple[Gap, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
@@ -279,6 +280,8 @@ def _make_trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **mo
     t = grid["t"]
     nothing = np.full(len(t), math.nan)
     columns = {name: grid.get(name, nothing) for name in (*REQUIRED, *OPTIONAL)}
+    if "pa" in grid and "pb" in grid:
+        more["chambers"] = np.column_stack([grid["pa"], grid["pb"]])
     more.setdefault("phase", np.full(len(t), MAIN))
     more.update(usable=np.ones(len(t), bool), filled=np.zeros(len(t), bool), incomplete=np.zeros(len(t), bool))
     in_seconds = tuple(Gap(float(t[int(g.t0)]), float(t[int(g.t1)]), g.cycles) for g in gaps)

@@ -55,6 +55,7 @@ class Effect:
     confused_with: tuple[str, ...] = ()  # effects, or parameters, that position alone cannot tell from it
     source: str = ""  # where the law is from
     plant: str = ""  # the one plant that has it; "" for any that has its port
+    searched_in: tuple[str, ...] = ()  # the plants where `rig explain` tests it unasked; () for all that can have it
 
     @property
     def file(self) -> Path | None:
@@ -77,7 +78,7 @@ class Effect:
 
 
 class Catalogue(dict[str, Effect]):
-    """Effects by name. Those that belong to one plant are found by name, but not listed: they suit no other."""
+    """Effects by name. Those of one plant, or searched in some plants only, are found by name, but not listed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -88,7 +89,7 @@ class Catalogue(dict[str, Effect]):
 
     def enter(self, e: Effect) -> None:
         """Put an effect in its place."""
-        (self.special if e.plant else self)[e.name] = e
+        (self.special if e.plant or e.searched_in else self)[e.name] = e
 
     def whole(self) -> dict[str, Effect]:
         """All of them."""
@@ -115,7 +116,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         disturbance: noise of the bench, which nobody fits.
         fitted: fields that a fit frees; default all.
         starts: values of these, one tuple a start; without any, `plant.starts` finds some.
-        more: `excludes`, `confused_with`, `source`, `plant` of `Effect`.
+        more: `excludes`, `confused_with`, `source`, `plant`, `searched_in` of `Effect`.
 
     Raises:
         ValueError: unknown port or field, a parameter without default, or a name already taken.

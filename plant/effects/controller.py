@@ -8,6 +8,21 @@ from plant.friction import clip
 from plant.quantity import Quantity
 
 
+class AsymmetricGain(NamedTuple):
+    """By what fraction the loop's gain is higher where the ram is to retract; negative: lower."""
+
+    retraction: Annotated[float, Quantity("1", low=-1, high=10, typical="-0.5 to 0.5")] = 0.0
+
+
+@effect("command", AsymmetricGain, law="error (1 + retraction) where Com < XJ",
+        symptoms="another following error out and back at the same speed", starts=(-0.3, 0.3), searched_in=("ehs",),
+        source="firmware that makes up for unequal areas")
+def asymmetric_gain(x: float, s: Any, u: Any, p: Any) -> float:
+    """The firmware's gain depends on the direction of the error."""
+    error = x - s.sensed
+    return x + (p.asymmetric_gain.retraction * error if error < 0.0 else 0.0)
+
+
 class CommandRateLimit(NamedTuple):
     """The fastest demand that the firmware follows."""
 

@@ -52,6 +52,60 @@ def _share(steps: float) -> float:
     return steps if steps < 1.0 - 1e-9 else 1.0
 
 
+class FlowDelay(NamedTuple):
+    """Delay between drive and flow."""
+
+    time: Annotated[float, Quantity("s", low=0, high=0.5, typical="1-30 ms")] = 0.0
+
+
+class Cascade(NamedTuple):
+    """What four equal lags in series show."""
+
+    one: float = 0.0
+    two: float = 0.0
+    three: float = 0.0
+    four: float = 0.0
+
+
+@effect("current", FlowDelay, law="four lags in series: (tau/4 y' + y)^4 = x, tau = time; a delay of tau, spread tau/2",
+        symptoms="the ram starts and stops late, without another speed", memory=Cascade, starts=(3e-3, 1e-2, 3e-2),
+        confused_with=("transport_delay", "sensor_lag", "coil_lag"), searched_in=("ehs",),
+        source="lines and hoses between pump and ram; Erlang's chain for a delay")
+def flow_delay(x: float, m: Cascade, s: Any, u: Any, p: Any) -> tuple[float, Cascade]:
+    """The flow follows its drive later: lines, hoses, and a pump that has to fill (implicit; no delay: exactly x)."""
+    part = 0.25 * p.flow_delay.time
+    keep = part / (part + u.h)
+    one = x + keep * (m.one - x)
+    two = one + keep * (m.two - one)
+    three = two + keep * (m.three - two)
+    four = three + keep * (m.four - three)
+    return four, Cascade(one, two, three, four)
+
+
+class ValveSwitching(NamedTuple):
+    """How long a directional valve takes from one side to the other."""
+
+    time: Annotated[float, Quantity("s", low=0, high=1, typical="10-100 ms")] = 0.0
+
+
+class Switched(NamedTuple):
+    """The side that the valve gives the flow to, and since when."""
+
+    side: float = 0.0
+    since: float = 0.0
+
+
+@effect("current", ValveSwitching, law="no flow for the time after a change of sign of the drive",
+        symptoms="a reversal costs the same time whatever the speed", memory=Switched, starts=(0.02, 0.05, 0.1),
+        searched_in=("ehs",), source="data sheets of directional valves: switching times")
+def valve_switching(x: float, m: Switched, s: Any, u: Any, p: Any) -> tuple[float, Switched]:
+    """The valve's spool travels from one side to the other: the flow waits. The first side is taken at once."""
+    side = 1.0 if x > 0.0 else -1.0 if x < 0.0 else m.side
+    reverses = side * m.side < 0.0
+    since = 0.0 if reverses else m.since + u.h if m.side * side > 0.0 else p.valve_switching.time
+    return (x if since >= p.valve_switching.time else 0.0), Switched(side, since)
+
+
 class CurrentLimit(NamedTuple):
     """What the driver's limit is short of Imax, as a fraction of it."""
 

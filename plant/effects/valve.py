@@ -1,7 +1,7 @@
 """Effects between the metering edges and the piston: what pressure they leave across it at which speed."""
 from __future__ import annotations
 
-from math import sqrt
+from math import exp, log, sqrt
 from typing import Annotated, Any, NamedTuple
 
 from plant.effects import effect
@@ -41,6 +41,35 @@ def compressibility(x: Line, m: Metered, s: Any, u: Any, p: Any) -> tuple[Line, 
     line = Line((1.0 - share) * s.pressure + share * taken, x.slope * new * share, x.limit,
                 (new * x.drive + old * m.drive) * share)
     return line, Metered(x.offset, x.drive)
+
+
+class UndissolvedAir(NamedTuple):
+    """Volume of the air in the oil at atmospheric pressure, how fast it shrinks with pressure, and what preloads it."""
+
+    volume: Annotated[float, Quantity("m3", low=0, high=0.1, typical="0.1-10 cm3, at atmospheric pressure")] = 0.0
+    exponent: Annotated[float, Quantity("1", low=0, high=3, typical="2: isothermal; 1: modulus follows pressure")] = 2.0
+    preload: Annotated[float, Quantity("Pa", low=0, high=1e9, typical="0 to half of PSR")] = 0.0
+
+
+ATMOSPHERE = 1.013e5  # Pa
+
+
+@effect("valve", UndissolvedAir, fitted=("volume",), starts=(1e-6, 4e-6, 2e-5), excludes=("compressibility",),
+        law="V/p0 (p0/p)^exponent P12' = Q - AJ XJ' - CLK P12, p = |P12| + preload + p0",
+        symptoms="soft at low pressure: the ram lags where the pressure rises from nothing", searched_in=("ehs",),
+        source="Boyle's law for free air in oil, Merritt 1967; dissolving air lowers the exponent")
+def undissolved_air(x: Line, s: Any, u: Any, p: Any) -> Line:
+    """Free air in the oil gives way, most of all where the pressure is low.
+
+    The air is that of the chamber under pressure. Isothermal, its volume goes with 1/p and its compliance -dV/dp with
+    1/p^2; the compliance is that of the pressure at the start of the step, the pressure is implicit in itself.
+    """
+    g = p.undissolved_air
+    share = ATMOSPHERE / (abs(s.pressure) + g.preload + ATMOSPHERE)
+    stored = g.volume / ATMOSPHERE * exp(g.exponent * log(share))  # m3/Pa
+    step = u.h * p.jack.area
+    new = step / (step + stored * x.slope)
+    return Line((1.0 - new) * s.pressure + new * x.offset, x.slope * new, x.limit, x.drive * new)
 
 
 class OrificeRoot(NamedTuple):

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 def add_model_options(parser: argparse.ArgumentParser) -> None:
     """Add --model, --set, --effects and --seed, which choose the plant."""
     add = parser.add_argument
-    add("--model", metavar="FILE|NAME", help="model file, or a shipped plant: eha (default), ehs (pump-driven servo)")
+    add("--model", metavar="FILE|NAME",
+        help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)")
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
         help="change a parameter of the model or of an effect, SI units (repeatable)")
     add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")

@@ -1,0 +1,46 @@
+"""The law of a position controller, identified from what it was told, what it sensed and what it answered."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from places import SHARED
+
+from fdi.comparison.controller_law import fit_directional_gains
+
+DATA = SHARED / "data" / "electrohydrostatic_rig_raw"
+real = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_it_finds_gains_and_delay_exactly(delay: int) -> None:
+    rng = np.random.default_rng(1)
+    error = rng.integers(-100, 100, 5000).astype(float)
+    side = np.roll(np.sign(error), delay)
+    answer = np.where(side > 0.0, 10.0, 7.0) * np.roll(error, delay)
+    error, answer, side = error[:-delay or None], answer[:-delay or None], side[:-delay or None]
+    found = fit_directional_gains(error[delay:], answer[delay:], side[delay:])
+    assert (found.out, found.back, found.delay) == pytest.approx((10.0, 7.0, delay))
+    assert found.residual == pytest.approx(0.0, abs=1e-9) and found.exact == 1.0
+    assert found.asymmetry == pytest.approx(-0.3) and found.limit <= 1000.0
+
+
+def test_rounding_of_the_answer_is_what_it_leaves() -> None:
+    error = np.random.default_rng(2).uniform(-50.0, 50.0, 20000)
+    found = fit_directional_gains(error, np.round(3.3 * error), np.sign(error))
+    assert found.residual == pytest.approx(12**-0.5, rel=0.05) and found.out == pytest.approx(3.3, rel=1e-3)
+
+
+def test_it_refuses_a_side_without_rows() -> None:
+    with pytest.raises(ValueError, match="driven back"):
+        fit_directional_gains(np.ones(50), np.ones(50), np.ones(50))
+
+
+@real
+@pytest.mark.parametrize("run", ["1_1", "2_2"])
+def test_the_servos_firmware(run: str) -> None:
+    """10 out and 7 back, without delay, and nearly without anything left."""
+    columns = np.loadtxt(DATA / f"exp_data_{run}.csv.gz", delimiter=";", skiprows=61, usecols=(9, 13, 14, 16))
+    answer, demand, position, valve = columns.T
+    found = fit_directional_gains(demand - position, answer, valve)
+    assert (found.out, found.back) == pytest.approx((10.0, 7.0), abs=0.05)
+    assert found.delay == 0 and found.residual < 0.01 * found.answer

@@ -1,0 +1,226 @@
+"""The effects of pump-driven actuators, and the flow under measured pressures, against closed forms."""
+from __future__ import annotations
+
+from math import exp, factorial
+
+import numpy as np
+import pytest
+
+from plant import load_model, simulate
+from plant.controller import compute_answers
+from plant.effects import CATALOGUE
+from plant.effects.current import Cascade, Switched, flow_delay, valve_switching
+from plant.effects.valve import ATMOSPHERE, undissolved_air
+from plant.ehs import (
+    COUNT,
+    RAW_PER_TURN,
+    compute_centred_mean,
+    compute_pressure_force,
+    derive_logger_columns,
+    estimate_load_in_motion,
+)
+from plant.lanes import Lanes
+from plant.model import Model, list_offered_effects, list_searched_effects
+from plant.state import Input, Line, State
+
+CYCLE = 1e-3
+SPEED = 800.0  # raw
+GENERAL = ("undissolved_air", "flow_delay", "valve_switching", "asymmetric_gain")
+
+
+def build_model(**changed: float) -> Model:
+    """The bare integrator without the steps of its position sensor, with some parameters changed.
+
+    It has the general effects, so that one kernel serves all.
+    """
+    return load_model("ehs").having(GENERAL).replace({"quantisation.lsb": 0.0}
+                                     | {name.replace("__", "."): value for name, value in changed.items()})
+
+
+def replay(model: Model, drive: np.ndarray, load: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """XJ, m, and P12, Pa, (n,) each, of a run from the middle."""
+    out = Lanes(model, (), 100).replay(np.empty((1, 0)), drive, np.zeros_like(drive) if load is None else load)[0]
+    return out[:, 0], out[:, 1]
+
+
+def compute_speed(model: Model) -> float:
+    """Speed of the ram out at SPEED, m/s, if nothing gives way."""
+    return model["pump.displacement"] * SPEED / model["jack.area"]
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+def test_the_pressure_of_a_blocked_ram_rises_as_the_air_gives_way(exponent: float) -> None:
+    """dp/dt = q/C(p): linear for exponent 0, exponential for 1, Boyle's hyperbola for 2."""
+    volume = 2e-5
+    model = build_model(undissolved_air__volume=volume, undissolved_air__exponent=exponent,
+                        jack__static_friction=1e7, jack__dynamic_friction=1e7)
+    drive = np.full(400, 200.0)
+    xj, p12 = replay(model, drive)
+    moved = model["pump.displacement"] * 200.0 * CYCLE * (np.arange(400.0) - 1.0).clip(0.0) / volume
+    expected = ATMOSPHERE * {0.0: moved, 1.0: np.exp(moved) - 1.0, 2.0: 1.0 / (1.0 - moved) - 1.0}[exponent]
+    assert expected[-1] > 0.09 * ATMOSPHERE and np.abs(xj).max() == 0.0
+    np.testing.assert_allclose(p12, expected, rtol=2e-3, atol=5.0)
+
+
+def test_air_at_exponent_2_keeps_boyles_product() -> None:
+    """The compliance of the line is -dV/dp of V = V0 p0/p, with the preload counted in."""
+    model = build_model(undissolved_air__volume=3e-6, undissolved_air__exponent=2.0, undissolved_air__preload=4e5)
+    p, u, x = model.record()[0], Input(h=1e-3), Line(5e6, 1e12, 1e7, 0.0)
+    s = State(pressure=6e5)
+    line = undissolved_air(x, s, u, p)
+    total = 6e5 + 4e5 + ATMOSPHERE
+    compliance = (3e-6 * ATMOSPHERE / (total - 500.0) - 3e-6 * ATMOSPHERE / (total + 500.0)) / 1000.0
+    for speed in (0.0, 0.01):
+        new = line.offset - line.slope * speed
+        flow = model["jack.area"] / x.slope * (x.offset - x.slope * speed - new)  # what the line leaves for the air
+        assert compliance * (new - s.pressure) / u.h == pytest.approx(flow, rel=1e-5)
+
+
+def test_a_delayed_flow_follows_erlangs_distribution() -> None:
+    """Four lags of tau/4: 1 - exp(-k) (1 + k + k^2/2 + k^3/6), k = 4 t/tau; without delay exactly the step."""
+    h, tau = 1e-5, 0.02
+    p, u, m = build_model(flow_delay__time=tau).record()[0], Input(h=h), Cascade()
+    shown = []
+    for _ in range(6000):
+        y, m = flow_delay(1.0, m, State(), u, p)
+        shown.append(y)
+    k = 4.0 * h * np.arange(1, 6001) / tau
+    expected = 1.0 - np.exp(-k) * sum(k**n / factorial(n) for n in range(4))
+    np.testing.assert_allclose(shown, expected, atol=1e-3)
+    none = build_model(flow_delay__time=0.0).record()[0]
+    assert flow_delay(0.7, Cascade(0.1, 0.2, 0.3, 0.4), State(), u, none)[0] == 0.7
+
+
+def test_a_delayed_flow_costs_its_time_on_the_way() -> None:
+    model = build_model(flow_delay__time=0.02)
+    late, _ = replay(model, np.full(300, SPEED))
+    prompt, _ = replay(build_model(), np.full(300, SPEED))
+    assert prompt[-1] - late[-1] == pytest.approx(0.02 * compute_speed(model), rel=1e-3)
+
+
+def test_a_switching_valve_stops_the_flow_at_each_reversal_and_not_at_the_start() -> None:
+    model = build_model(valve_switching__time=0.05)
+    late, _ = replay(model, np.r_[np.full(200, SPEED), np.full(200, -SPEED)])
+    prompt, _ = replay(build_model(), np.r_[np.full(200, SPEED), np.full(200, -SPEED)])
+    assert late[200] == prompt[200]
+    assert late[-1] - prompt[-1] == pytest.approx(0.05 * compute_speed(model), rel=2e-3)
+
+
+def test_a_pause_on_one_side_does_not_switch_the_valve() -> None:
+    p, u = build_model(valve_switching__time=0.05).record()[0], Input(h=1e-3)
+    m = Switched(1.0, 1.0)
+    for x in (0.0, 0.0, 3.0):
+        y, m = valve_switching(x, m, State(), u, p)
+        assert y == x
+    assert valve_switching(-3.0, m, State(), u, p)[0] == 0.0
+
+
+def test_an_asymmetric_gain_answers_a_negative_error_less() -> None:
+    model = build_model(asymmetric_gain__retraction=-0.3)
+    com, xj = np.array([1e-3, -1e-3, 0.0]), np.array([0.0, 0.0, 0.0])
+    gain = model["controller.proportional_gain"]
+    np.testing.assert_allclose(compute_answers(model, com, xj), [gain * 1e-3, -0.7 * gain * 1e-3, 0.0], rtol=1e-12)
+
+
+def test_a_check_valve_locks_the_ram_while_the_motor_is_slow() -> None:
+    model = build_model(pump__least_speed=100.0)
+    xj, _ = replay(model, np.r_[np.full(100, 99.0), np.full(100, SPEED), np.full(100, 50.0)])
+    assert (xj[:101] == 0.0).all() and xj[200] > 0.0 and (xj[202:] == xj[202]).all()
+    assert xj[201] == pytest.approx(100 * CYCLE * compute_speed(model), rel=1e-3)
+
+
+def test_a_locked_line_goes_to_the_pressure_at_rest_at_its_rate() -> None:
+    """From nothing to (1 - ratio) pR, in a straight line, and no further."""
+    model = build_model(pump__least_speed=10.0, pump__area_ratio=0.7, pump__return_pressure=5e5, pump__settling=1e6,
+                        undissolved_air__volume=1e-6)
+    _, p12 = replay(model, np.zeros(300))
+    t = CYCLE * np.arange(300)
+    np.testing.assert_allclose(p12, np.minimum(1e6 * t, 0.3 * 5e5), atol=200.0)
+
+
+@pytest.mark.parametrize("out", [1.0, -1.0])
+def test_the_flow_under_measured_pressures(out: float) -> None:
+    """XJ' = (q - V/p0 dp/dt - CLK p)/A, both ways, with the area and the pressures of the chamber that is fed."""
+    volume, leakage, ratio = 4e-7, 2e-13, 0.7
+    model = build_model(undissolved_air__volume=volume, undissolved_air__exponent=0.0, jack__leakage=leakage,
+                        pump__area_ratio=ratio, pump__pressure_given=1.0)
+    drive = np.full(300, out * SPEED)
+    pressure = 1e6 + 2e3 * np.arange(300.0)  # of P12
+    xj, p12 = replay(model, drive, out * pressure * model["jack.area"])
+    area = 1.0 if out > 0.0 else ratio
+    flow = model["pump.displacement"] * SPEED / area - volume / ATMOSPHERE * 2e3 / CYCLE
+    leaked = leakage / area**2 * pressure[100:]
+    expected = out * (flow - leaked) / model["jack.area"]
+    np.testing.assert_allclose(np.diff(xj[100:]) / CYCLE, expected[:-1], rtol=1e-3)
+    np.testing.assert_allclose(p12[1:], out * pressure[:-1], rtol=1e-9)
+
+
+def test_the_force_is_that_of_the_chamber_that_is_fed() -> None:
+    values = dict(build_model().values) | {"pressure_sensors.delay_a": 2e-3, "pressure_sensors.delay_b": -1e-3,
+                                           "pump.area_ratio": 0.7}
+    chambers = np.column_stack([np.arange(10.0), 100.0 + np.arange(10.0)])
+    cor = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0, -1.0])
+    force = compute_pressure_force(values, chambers, cor, CYCLE) / values["jack.area"]
+    np.testing.assert_allclose(force, [2, 3, 4, 5, 6, 7, -0.7 * 105, -0.7 * 106, -0.7 * 107, -0.7 * 108])
+
+
+def test_the_loggers_columns() -> None:
+    """An encoder that turns one way over its zero, the valve's sign, and both pressure scales."""
+    n = 60
+    angle = 20.0 - 10.0 * np.arange(n)
+    angle[30] += 3.0  # a count of noise
+    sources = {"time": np.arange(float(n)), "ADC1_Channel_6": angle % 4096, "ADC1_Channel_2": np.full(n, 90.0),
+               "ADC1_Channel_3": np.full(n, 308.0), "ADC1_Channel_16": np.where(np.arange(n) < 40, 1000.0, -1000.0)}
+    columns = derive_logger_columns(sources)
+    speed = 10.0 / 4096 / CYCLE * RAW_PER_TURN
+    np.testing.assert_allclose(columns["cor"][[10, 29, 39, 45]], [speed, speed, speed, -speed], rtol=1e-9)
+    assert columns["cor"][:40].min() >= 0.0 and columns["cor"][30] == pytest.approx(0.7 * speed)
+    np.testing.assert_allclose(columns["pa"], 5e5, rtol=1e-9)
+    np.testing.assert_allclose(columns["pb"], (0.07576 * 308 - 18.333) * 1e5, rtol=1e-9)
+    assert COUNT == 2.5e-5
+
+
+def test_a_centred_mean_keeps_a_straight_line() -> None:
+    x = np.arange(40.0)
+    np.testing.assert_allclose(compute_centred_mean(x, 9)[4:-4], x[4:-4], rtol=1e-12)
+
+
+def test_the_load_of_a_press_is_the_sum_of_both_directions() -> None:
+    """10 bar of load out and none back, friction of 8 bar both ways; the pressure at rest does not count."""
+    way = np.r_[np.zeros(500), np.full(1000, 1.0), np.zeros(500), np.full(1000, -1.0), np.zeros(500)]
+    p12 = np.where(way > 0, 18e5, np.where(way < 0, -8e5, 40e5))
+    load = estimate_load_in_motion({"xj": np.cumsum(way) * 1e-5, "p12": p12})
+    assert load == pytest.approx(np.full(len(way), 10e5 * load_model("ehs")["jack.area"]))
+
+
+@pytest.mark.parametrize("name", GENERAL)
+def test_they_suit_every_plant_and_are_searched_in_this_one(name: str) -> None:
+    """`rig explain` does not test them on the reference plant unasked."""
+    e = CATALOGUE[name]
+    assert e.law and e.symptoms and e.source and e.function.__doc__
+    for plant in ("eha", "ehs"):
+        assert e in list_offered_effects(plant)
+        assert (e in list_searched_effects(plant)) == (plant == "ehs")
+        for start in e.starts:
+            assert load_model(plant).replace(start)[e.fitted[0]] == start[e.fitted[0]]
+
+
+@pytest.mark.parametrize("name", GENERAL)
+@pytest.mark.parametrize("plant", ["eha", "ehs"])
+def test_off_it_changes_no_bit_and_on_it_acts(name: str, plant: str) -> None:
+    """In plain Python: compiled code gives the same bits (test_effects.py)."""
+    model = load_model(plant).replace({"quantisation.lsb": 0.0})
+    command = np.r_[np.full(15, 1e-3), np.full(15, -1e-3)]
+    strong = {parameter: 2.0 * value for parameter, value in CATALOGUE[name].starts[-1].items()}
+    off, on, without = (np.array(simulate(m, command, steps=4, fast=False))
+                        for m in (model.having([name]), model.replace(strong), model))
+    assert (off == without).all() and np.isfinite(on).all() and (on != without).any()
+
+
+def test_exp_is_used_right() -> None:
+    """The softness of exponent 1 at a pressure of e - 1 atmospheres is 1/e of that at none."""
+    model = build_model(undissolved_air__volume=1e-6, undissolved_air__exponent=1.0)
+    p, u, x = model.record()[0], Input(h=1e-3), Line(0.0, 1e12, 1e7, 0.0)
+    soft, stiff = (undissolved_air(x, State(pressure=q), u, p) for q in (0.0, (exp(1.0) - 1.0) * ATMOSPHERE))
+    compliance = [model["jack.area"] * u.h * (1.0 / line.slope - 1.0 / x.slope) for line in (soft, stiff)]
+    assert compliance[1] / compliance[0] == pytest.approx(exp(-1.0), rel=1e-9)
