@@ -9,7 +9,7 @@ from places import SHARED
 from rig_command import rig
 
 from fdi.estimation.preparation import prepare_trace
-from fdi.estimation.replay import compute_residuals, replay_current
+from fdi.estimation.replay import compute_residuals, replay_command, replay_current
 from fdi.trace.trace import Trace, rms
 from plant import load_model
 
@@ -52,10 +52,11 @@ def test_no_signal_is_predicted_from_itself() -> None:
 
 @real
 def test_compare_finds_the_shipped_model_by_its_name() -> None:
-    run = DATA / "exp_data_1_1.csv.gz"
-    bare, servo = (rig("compare", run, "--model", name, "--json").json["signals"] for name in ("ehs", "servo"))
-    assert servo["xj"]["error"] == pytest.approx(measure_errors("servo", "1_1")["xj"], rel=0.03)
-    assert servo["xj"]["closed_loop_error"] < bare["xj"]["closed_loop_error"]
+    """Its error does not depend on the steps of a cycle; that from the command alone falls as well."""
+    found = rig("compare", DATA / "exp_data_1_1.csv.gz", "--model", "servo", "--json").json["signals"]
+    assert found["xj"]["error"] == pytest.approx(measure_errors("servo", "1_1")["xj"], rel=0.03)
+    bare = replay_command(read_run("1_1"), load_model("ehs"), STEPS)
+    assert found["xj"]["closed_loop_error"] < 0.8 * rms(bare["xj"])
 
 
 def test_the_shipped_model_says_where_it_comes_from() -> None:
