@@ -59,7 +59,13 @@ def _import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
         raise InputError(source, "", f"--map for other formats than .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}; "
                                      "--guess writes one")
     if csv:
-        cycles = import_csv(source, out)
+        try:
+            cycles = import_csv(source, out)
+        except InputError as error:
+            if "in the header" not in error.expected:
+                raise
+            raise InputError(error.where, error.field, f"{error.expected}; for other columns: "
+                                                       f"rig import --guess {source}") from error
     else:
         cycles = import_frames(source, out, Path(args.dbc) if args.dbc else dbc.DBC)
     data = {"trace": str(out), "cycles": cycles}

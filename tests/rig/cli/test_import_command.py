@@ -1,6 +1,7 @@
 """`rig import --map` and `--guess`: one run in several formats gives the same answer of `rig compare`."""
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 
@@ -116,6 +117,21 @@ def test_other_can_logs(folder: Path, suffix: str) -> None:
     assert rig("import", folder / f"short{suffix}", "--map", folder / "can.toml", "--dbc", folder / "user.dbc",
                "--out", out).status == 0
     assert np.abs(Trace.read(out).xj - Trace.read(folder / "original.csv").xj[:300]).max() <= 0.5001e-8
+
+
+def test_a_csv_of_other_columns_says_what_to_do(folder: Path) -> None:
+    said = rig("import", folder / "german.csv", "--out", folder / "x.mcap")
+    assert said.status == 2 and said.err.count("\n") == 1 and "rig import --guess" in said.err
+
+
+@pytest.mark.parametrize(("name", "package"), [("x.mf4", "asammdf"), ("x.parquet", "pyarrow")])
+def test_a_missing_package_is_named(name: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (package, f"{package}.parquet"):
+        monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(b"x")
+    said = rig("import", "--guess", tmp_path / name)
+    assert said.status == 2 and said.err.count("\n") == 1
+    assert f"the package {package}" in said.err and "pip install 'eha-rig[measure]'" in said.err
 
 
 MAP = """
