@@ -99,9 +99,12 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     for name in trace.outputs:
         given, seen = model[SIGNALS[name].noise], floor_from_data(trace.measured(name))
         given = simulate_reading_noise(model, trace.xj) if name == "xj" else given
-        given = trace.sensors[name].measure_noise(given) if name in trace.sensors else given
+        share = 1.0
+        if name in trace.sensors:
+            given = trace.sensors[name].measure_noise(given)
+            share = trace.sensors[name].count_independent(trace.period)
         found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
-        out[name] = found._replace(value=max(found.value, FINEST[name]))
+        out[name] = found._replace(value=max(found.value, FINEST[name]), freedom=share)
     return out
 
 

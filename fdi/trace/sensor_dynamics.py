@@ -80,6 +80,10 @@ class SensorDynamics:
         """RMS of the output's noise for white noise of `level` in the logger's samples, with that of rounding."""
         return math.hypot(level / math.sqrt(max(1.0, self.moving_mean)), self.quantum / math.sqrt(12.0))
 
+    def count_independent(self, period: float) -> float:
+        """Independent samples of the output's noise in one row: a mean over r rows leaves 1.5/r, at most 1."""
+        return min(1.0, 1.5 * period / (self.moving_mean * (self.sample_period or period)))
+
     def _make_kernel(self, period: float) -> tuple[Floats, int]:
         """Weights of mean and delay on the rows, and the rows of the first one back from now (negative: ahead).
 

@@ -81,6 +81,14 @@ def test_mean_of_the_loggers_samples() -> None:
     assert whole.undo(whole.apply(ramp, 1e-3), 1e-3)[45:80] == pytest.approx(ramp[45:80], abs=1e-3)
 
 
+def test_averaged_noise_has_fewer_independent_samples() -> None:
+    """The spread of the mean square of averaged white noise is that of so many independent samples."""
+    noise = np.random.default_rng(0).standard_normal((400, 2000))
+    squares = (MEAN.apply(noise, 1e-3)[:, 20:] ** 2).mean(axis=1)
+    independent = 2.0 / (squares.std() / squares.mean()) ** 2 / 1980
+    assert MEAN.count_independent(1e-3) == pytest.approx(independent, rel=0.2)
+
+
 def test_a_log_keeps_the_sensors(tmp_path: Path) -> None:
     sensors = {"p12": replace(MEAN, sample_period=5e-4, lag=1e-3), "xj": SensorDynamics(quantum=2.5e-5)}
     write_mcap(replace(run_nominal(), sensors=sensors), tmp_path / "x.mcap")
