@@ -128,8 +128,8 @@ class Link:
 
     def _poll_socket(self, raw: socket.socket, timeout: float) -> list[Frame]:
         frames: list[Frame] = []
-        if timeout > 0:
-            select.select([raw], [], [], timeout)
+        if timeout > 0 and not select.select([raw], [], [], timeout)[0]:
+            return frames
         epoch = time.time_ns() - self._clock()  # the kernel stamps with the wall clock
         while True:
             try:

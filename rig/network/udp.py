@@ -67,9 +67,9 @@ class LoopbackBus(can.BusABC):
 
         One wait for all of them: python-can waits, and asks the clock, for each. Raises OSError when the bus is gone.
         """
-        if timeout > 0:
-            select.select([self._rx], [], [], timeout)
         messages: list[can.Message] = []
+        if timeout > 0 and not select.select([self._rx], [], [], timeout)[0]:
+            return messages
         while True:
             try:
                 data, ancillary, _, sender = self._rx.recvmsg(4096, socket.CMSG_SPACE(4), socket.MSG_DONTWAIT)
