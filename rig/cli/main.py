@@ -86,8 +86,15 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status. Without `argv` it is the program, which ends right after this."""
     if argv is None:
+        leave_out_reader(sys.argv[1:])
         return leave_quickly()(run_command_line(sys.argv[1:]))
     return run_command_line(argv)
+
+
+def leave_out_reader(words: Sequence[str]) -> None:
+    """Keep python-can from loading asammdf (0.9 s, where it is installed): only `rig import` reads MF4 files."""
+    if words[:1] != ["import"]:
+        sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]  # None: an import of it fails
 
 
 def leave_quickly() -> Callable[[int], int]:
