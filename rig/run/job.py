@@ -1,9 +1,6 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +17,7 @@ from plant.parameters import parse_toml
 from plant.segments import RATE
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
+from rig.run.effect_folder import make_effect_folder
 from rig.sequences import Sequence
 
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
@@ -151,8 +149,7 @@ def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
     """Write user effects to files and run them. The files outlive this call: nodes in other processes read them."""
     if not codes:
         return ()
-    folder = Path(tempfile.mkdtemp(prefix="eha-rig-effects-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = make_effect_folder()
     files = tuple(folder / code.name.removeprefix(_EFFECT_FOLDER) for code in codes)
     for file, code in zip(files, codes, strict=True):
         file.write_bytes(code.content)
