@@ -14,7 +14,7 @@ from rig.network.frame import Frame, Send
 
 _HEAD = struct.Struct("<BHB")
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # client command specifiers
-_TIMEOUT = 30_000_000_000  # ns between two requests of one transfer: a client on a busy machine may stand still
+_TIMEOUT = 5_000_000_000  # ns between two requests of one transfer: a client on a busy machine may stand still
 _LARGEST = 1 << 20  # bytes in one download: a scenario is a few kB
 
 

@@ -9,7 +9,7 @@
 enum { DOWNLOAD_SEGMENT, DOWNLOAD, UPLOAD, UPLOAD_SEGMENT, ABORT, NOTHING_OPEN = 0xFF };
 
 /* between two requests of one transfer: a client on a busy machine may stand still */
-static const int64_t TIMEOUT_NS = 30000000000;
+static const int64_t TIMEOUT_NS = 5000000000;
 
 void sdo_reset(struct sdo_server *sdo)
 {

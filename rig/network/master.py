@@ -119,6 +119,7 @@ class Master:
     def _heard(self, node: int, state: int) -> None:
         if state == NmtState.INITIALISING:
             self._booted.add(node)
+            self._nodes[node].emcy.reset()  # its errors ended with the reset, and no EMCY says so
         if state == NmtState.OPERATIONAL:
             seconds = (self.wire.clock.now() - self._started_ns.get(node, 0)) * 1e-9
             self._operational.setdefault(node, StartTime(seconds, min(seconds, self.wire.blind_ns * 1e-9)))

@@ -182,6 +182,14 @@ def test_emergencies_come_and_go() -> None:
     assert master.errors() == []
 
 
+def test_a_boot_up_ends_the_errors_of_a_node() -> None:
+    """No EMCY says so: the error register of a node that was reset is zero."""
+    master = alone()
+    master.receive(Frame(0, 0x082, bytes.fromhex("3081110000000000")))
+    master.receive(Frame(0, 0x702, bytes(1)))
+    assert master.errors() == []
+
+
 @pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x202, 0x701])
 def test_another_rig_is_noticed_once(cob_id: int) -> None:
     master = alone()
