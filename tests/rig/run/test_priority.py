@@ -1,6 +1,7 @@
 """Real-time rights: taken where they are granted, given back, and taken for all threads of the process."""
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
@@ -119,3 +120,12 @@ def test_collection_comes_back_as_it_was(collecting: bool) -> None:
         assert gc.isenabled() == collecting and sys.getswitchinterval() == before
     finally:
         gc.enable()
+
+
+def test_the_kernel_does_not_move_pages_while_memory_is_locked() -> None:
+    """It would collect them into huge ones, and a loop that touches them waits for milliseconds."""
+    library = ctypes.CDLL(None)
+    before = library.prctl(42, 0, 0, 0, 0)  # PR_GET_THP_DISABLE
+    with lock_memory():
+        assert library.prctl(42, 0, 0, 0, 0) == 1
+    assert library.prctl(42, 0, 0, 0, 0) == before == 0
