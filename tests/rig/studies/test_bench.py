@@ -100,8 +100,6 @@ def test_every_rival_makes_the_same_runs() -> None:
             assert rival.difference < 1e-12
     for name in (many_runs.OURS, "ours, a thread a core", "C, 16 runs, -ffp-contract=off"):
         assert found[name].difference == 0.0
-    slowest = found["C, one run after the other"].ratio
-    assert slowest is not None and slowest > 1.2  # 5 on a quiet machine with AVX-512
 
 
 @needs_gcc
