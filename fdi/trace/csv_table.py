@@ -1,6 +1,7 @@
 """CSV files of traces: SI units, one row per cycle, empty fields for missing samples; or a plant's own columns."""
 from __future__ import annotations
 
+import contextlib
 import csv
 import gzip
 import io
@@ -34,18 +35,27 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
 
     Raises InputError naming the line for anything but numbers, and for t that does not grow.
     """
+    with report_unreadable(path, "UTF-8"), open_text(path) as stream:
+        header = stream.readline()
+        plant = _find_recorder(header)
+        table = _find_table(header, plant) if plant else None
+        rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
+        if table is None:
+            return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
+        sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
+        return CsvColumns(_combine_columns(sources, table), notes, plant)
+
+
+@contextlib.contextmanager
+def report_unreadable(path: Path, encodings: str) -> Iterator[None]:
+    """Errors of reading a table as one line. `encodings`: those that the reader knows, in words.
+
+    Raises InputError.
+    """
     try:
-        with open_text(path) as stream:
-            header = stream.readline()
-            plant = _find_recorder(header)
-            table = _find_table(header, plant) if plant else None
-            rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
-            if table is None:
-                return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
-            sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-            return CsvColumns(_combine_columns(sources, table), notes, plant)
-    except UnicodeDecodeError as error:
-        raise InputError(path, "", "a text file (UTF-8)") from error
+        yield
+    except UnicodeError as error:
+        raise InputError(path, "", f"a text file ({encodings})") from error
     except csv.Error as error:
         raise InputError(path, "", f"a table of numbers ({error})") from error
     except (OSError, EOFError, zlib.error, UnpackingError) as error:

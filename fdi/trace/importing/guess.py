@@ -59,7 +59,9 @@ class Guess:
     @property
     def confidence(self) -> str:
         """In one word."""
-        return "sure" if self.points >= 5.0 else "likely" if self.points >= 3.0 else "unsure"
+        if self.points >= 5.0:
+            return "sure"
+        return "likely" if self.points >= 3.0 else "unsure"
 
 
 class GuessedMap(NamedTuple):

@@ -114,19 +114,22 @@ def _place_each(samples: Samples, rows: Floats, period: float) -> Placed | None:
 def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str) -> Placed:
     """Every so many samples; those of a held signal where its new value is."""
     held = find_hold(samples, ratio)
-    at = rows
     how = f"every {_ordinal(ratio)} sample"
     if held is not None:
         own = (samples.t[0] + held * samples.period - rows[0]) % period
         own = 0.0 if own > period - 0.25 * samples.period else own
-        at = rows + (own if cycle_part == "answer" else own - period if cycle_part == "demand" and own else 0.0)
-        return Placed(_place_nearest(samples, at, 0.6 * samples.period).x,
+        shift = 0.0
+        if cycle_part == "answer":
+            shift = own
+        elif cycle_part == "demand" and own:
+            shift = own - period
+        return Placed(_place_nearest(samples, rows + shift, 0.6 * samples.period).x,
                       f"{how}; the signal is held for {ratio}")
     if low_pass is None:
         low_pass = not cycle_part and _measure_folded_share(samples, ratio) > FOLDED_SHARE
     if low_pass:
         samples, how = _filter(samples, ratio), f"low-pass filtered, {how}"
-    return Placed(_place_nearest(samples, at, 0.6 * samples.period).x, how)
+    return Placed(_place_nearest(samples, rows, 0.6 * samples.period).x, how)
 
 
 def _ordinal(n: int) -> str:

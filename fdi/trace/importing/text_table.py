@@ -2,14 +2,12 @@
 from __future__ import annotations
 
 import codecs
-import contextlib
 import csv
 import gzip
 import io
 import itertools
 import math
 import re
-import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -20,14 +18,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.csv_table import open_text
+from fdi.trace.csv_table import open_text, report_unreadable
 from fdi.trace.importing.measurement import Channel
 from fdi.trace.importing.units import OTHER_UNITS, find_unit
 from plant.errors import InputError
-from plant.unpacking import UnpackingError
 
 Floats = NDArray[np.float64]
 
+ENCODINGS = "UTF-8, UTF-16 or Latin-1"  # that text tables may have
 SEPARATORS = (";", "\t", "|", ",", " ")
 COMMENTS = ("#", "%", "//", "!")
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "nil"}
@@ -79,7 +77,7 @@ class TextTable:
         appends = [(i, name, columns[name].append, _parse_date if name in dates else parse_number)
                    for i, name in places]
         width = len(self.layout.names)
-        with _report_unreadable(self.path), _open(self.path, self.layout.encoding) as stream:
+        with report_unreadable(self.path, ENCODINGS), _open(self.path, self.layout.encoding) as stream:
             for line, fields in _split_rows(stream, self.layout):
                 if len(fields) != width and not _is_padded(fields, width):
                     raise InputError(f"{self.path}: line {line}", "", f"{width} fields, not {len(fields)}")
@@ -101,7 +99,7 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
     Raises:
         InputError: a file that cannot be read or holds no table of numbers.
     """
-    with _report_unreadable(path):
+    with report_unreadable(path, ENCODINGS):
         encoding = _find_encoding(path)
         with _open(path, encoding) as stream:
             lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
@@ -134,19 +132,6 @@ def split_unit(name: str) -> tuple[str, str]:
 
 def _is_unit(text: str) -> bool:
     return find_unit(text) is not None or text in OTHER_UNITS
-
-
-@contextlib.contextmanager
-def _report_unreadable(path: Path) -> Iterator[None]:
-    """Errors of reading as one line."""
-    try:
-        yield
-    except UnicodeError as error:
-        raise InputError(path, "", "a text file (UTF-8, UTF-16 or Latin-1)") from error
-    except csv.Error as error:
-        raise InputError(path, "", f"a table of numbers ({error})") from error
-    except (OSError, EOFError, zlib.error, UnpackingError) as error:
-        raise InputError(path, "", f"a readable file ({getattr(error, 'strerror', None) or error})") from error
 
 
 def _find_encoding(path: Path) -> str:

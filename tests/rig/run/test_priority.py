@@ -1,11 +1,13 @@
 """Real-time rights: taken where they are granted, given back, and taken for all threads of the process."""
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -47,30 +49,11 @@ def test_all_threads_are_raised_and_lowered() -> None:
         helper.join()
 
 
-@pytest.mark.skipif(not allowed(), reason="SCHED_FIFO is not allowed here; as root, or with an rtprio limit, it is")
-def test_a_loop_that_runs_already_keeps_its_priority() -> None:
+@contextlib.contextmanager
+def run_loop(from_last: int = 2) -> Iterator[tuple[threading.Thread, list[int]]]:
+    """A thread that is in `enter_loop_thread` until the end, and the CPUs that it may use."""
+    seen: list[int] = []
     entered, done = threading.Event(), threading.Event()
-
-    def run() -> None:
-        with enter_loop_thread():
-            entered.set()
-            done.wait()
-
-    loop = threading.Thread(target=run)
-    loop.start()
-    try:
-        assert entered.wait(10)
-        with raise_priority(1):
-            assert os.sched_getparam(loop.native_id or 0).sched_priority == LOOP_PRIORITY
-    finally:
-        done.set()
-        loop.join()
-
-
-@pytest.mark.skipif(len(list_cpus()) < 2, reason="one CPU is not divided")
-@pytest.mark.parametrize("from_last", [1, 2])
-def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
-    cpus, seen, entered, done = list_cpus(), [], threading.Event(), threading.Event()
 
     def run() -> None:
         with enter_loop_thread(from_last):
@@ -82,10 +65,24 @@ def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
     loop.start()
     try:
         assert entered.wait(10)
-        assert seen == [cpus[-from_last]] and list_cpus() == [cpu for cpu in cpus if cpu not in seen]
+        yield loop, seen
     finally:
         done.set()
         loop.join()
+
+
+@pytest.mark.skipif(not allowed(), reason="SCHED_FIFO is not allowed here; as root, or with an rtprio limit, it is")
+def test_a_loop_that_runs_already_keeps_its_priority() -> None:
+    with run_loop() as (loop, _), raise_priority(1):
+        assert os.sched_getparam(loop.native_id or 0).sched_priority == LOOP_PRIORITY
+
+
+@pytest.mark.skipif(len(list_cpus()) < 2, reason="one CPU is not divided")
+@pytest.mark.parametrize("from_last", [1, 2])
+def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
+    cpus = list_cpus()
+    with run_loop(from_last) as (_, seen):
+        assert seen == [cpus[-from_last]] and list_cpus() == [cpu for cpu in cpus if cpu not in seen]
     assert list_cpus() == cpus
 
 
