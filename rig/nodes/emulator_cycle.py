@@ -28,6 +28,7 @@ from rig.network.raw_bus import (
     FRAME,
     NEVER,
     SENT,
+    WOKEN,
     Port,
     await_frame,
     join_halves,
@@ -590,9 +591,15 @@ def _send_late_feedback(port: Port, m: Memory, k: int, is_fed: bool) -> None:
 
 @keep_apart
 def _await_drive(port: Port, m: Memory) -> None:
-    """Take the next drive frame; another frame ends the wait and comes up again in the loop."""
+    """Take the next drive frame; another frame ends the wait and comes up again in the loop.
+
+    A wake-up does not end it: the one that stopped the loop before this run may still be waiting.
+    """
     words = m.words
-    status, t_ns, cob_id, length, data = receive_frame(port, read_clock(port) + _ANSWER_LIMIT)
+    limit = read_clock(port) + _ANSWER_LIMIT
+    status, t_ns, cob_id, length, data = receive_frame(port, limit)
+    while status == WOKEN and not words[STOP]:
+        status, t_ns, cob_id, length, data = receive_frame(port, limit)
     if status < 0:
         words[FAILURE] = status
     elif status == FRAME and cob_id == words[DRIVE_ID]:

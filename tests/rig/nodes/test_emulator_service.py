@@ -279,3 +279,21 @@ class TestServices:
             desk.link.send(0x192, codec.pack_drive(0.0, 15, k))
         assert flags == [0] * 6
         assert sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard) == 3
+
+
+def test_a_wake_up_does_not_end_the_wait_for_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The services wake the loop to stop it for a new scenario; the loop seldom takes that wake-up before its run."""
+    monkeypatch.setattr(ec, "_ANSWER_LIMIT", 10_000_000_000)
+    memory = ec.make_memory(Model(), [], Schedule(Plan(stop=0)))
+    words = memory.words
+    words[ec.STATE], words[ec.DRIVE_ID], words[ec.DRIVE_TYPE] = ec.OPERATIONAL, codec.DRIVE, 1
+    where = spec("udp_multicast")
+    with open_raw_bus(where, [codec.DRIVE]) as raw:
+        link = Link(open_can(where), lambda: 0)
+        raw.wake()
+        timer = threading.Timer(0.05, link.send, (codec.DRIVE, codec.pack_drive(0.0, 15, 7)))
+        timer.start()
+        ec._await_drive(raw.port, memory)
+        timer.join()
+        link.close()
+    assert words[ec.WAITING] == 1
