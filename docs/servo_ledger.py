@@ -25,7 +25,7 @@ from fdi.estimation.preparation import prepare_trace
 from fdi.estimation.replay import compute_residuals, replay_current, replay_lanes
 from fdi.estimation.unknowns import WITHOUT_NOISE
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, GREEN, shorten_svg, start_figure, to_svg
-from fdi.sources import software
+from fdi.sources import name_software
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace, rms
 from plant.lanes import Lanes
@@ -134,7 +134,7 @@ def fit_values(model: Model, trace: Trace, free: Mapping[str, Bounds], signal: s
     scale = np.array([abs(bounds.first) for bounds in free.values()])
     low, high = (np.array([bounds[i] for bounds in free.values()]) / scale for i in (1, 2))
     lanes = Lanes(model.replace(WITHOUT_NOISE), names, CYCLE_STEPS)
-    measured, column = trace.measured(signal), OUTPUTS.index(signal)
+    measured, column = trace.mask_unusable(signal), OUTPUTS.index(signal)
 
     def compute_rows(x: Floats) -> Floats:
         given = [tie_values(dict(zip(free, row * scale, strict=True))) for row in x]
@@ -179,8 +179,8 @@ def write_model(rows: Sequence[LedgerRow], trace: Path, out: Path) -> None:
     model = replace(rows[-1].model, name="servo")
     ledger = tuple(Row(row.step.effect if row.step else None, select_signals(row.errors[FITTED]), {}) for row in rows)
     source = read_source(str(trace))._replace(file=trace.name)
-    known = Provenance(software(), ("python docs/servo_ledger.py FOLDER",), (), signals=("xj", "p12"), trace=source,
-                       ledger=ledger)
+    known = Provenance(name_software(), ("python docs/servo_ledger.py FOLDER",), (), signals=("xj", "p12"),
+                       trace=source, ledger=ledger)
     out.write_text(HEAD + format_model_file(model, {}, known), encoding="utf-8")
 
 

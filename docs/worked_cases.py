@@ -45,14 +45,14 @@ def format_minima(name: str, drive: str, trace: Trace) -> str:
 def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
     """Mean and standard deviation of the errors under 1.5 % scatter of every base parameter, as a row of the table."""
     nominal, found = Model(), []
-    tolerances = [name for name in nominal.names() if nominal.kind.groups[name.split(".")[0]].__name__ not in (
+    tolerances = [name for name in nominal.list_names() if nominal.kind.groups[name.split(".")[0]].__name__ not in (
         "Controller", "Sensors") and name not in ("filter.clogging", "filter.law") and "friction" not in name]
     for seed in range(SCATTERED):
         rng = np.random.default_rng(seed)
         unit = nominal.replace({name: nominal[name] * (1 + TOLERANCE * rng.standard_normal()) for name in tolerances})
         unit = unit.replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
-        g = search_grid(Trace.of(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
+        g = search_grid(Trace.from_columns(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
         found.append([*g.merged[:2], *g.joint.minimum[:2], *g.best[:2]])
     off = np.array(found) - [kintas, fss, kintas, fss, kintas, fss]
     mean, sd = off.mean(0), off.std(0, ddof=1)

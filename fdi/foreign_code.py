@@ -95,7 +95,7 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
 
 def _is_loaded(path: Path) -> bool:
     """Whether the effects of the catalogue include some of this file, as it is now or was before."""
-    return any(effect.file == path.absolute() for effect in CATALOGUE.whole().values())
+    return any(effect.file == path.absolute() for effect in CATALOGUE.list_all().values())
 
 
 def _read(path: Path) -> bytes:

@@ -6,7 +6,7 @@ from pathlib import Path
 from plant.errors import InputError
 
 
-def writable(out: str | Path, field: str, *, source: str | Path | None = None) -> Path:
+def require_writable(out: str | Path, field: str, *, source: str | Path | None = None) -> Path:
     """`out`, if a file can be written there; what lies there stays as it is until the result comes.
 
     Folders are not made. Raises InputError for a place that cannot be written, and for the `source` itself.

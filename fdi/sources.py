@@ -15,7 +15,7 @@ from plant.errors import InputError
 SUFFIXES = (".py", ".toml", ".c", ".json", ".npz")  # what a number can depend on; no pages, no caches
 
 
-def software() -> str:
+def name_software() -> str:
     """Name and version of this software."""
     return f"eha-rig {version('eha-rig')}"
 

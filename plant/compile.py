@@ -319,18 +319,18 @@ def compute_fingerprint(function: Function) -> str:
     """
     seen: dict[Function, str] = {}
 
-    def text(f: Function) -> str:
+    def describe_calls(f: Function) -> str:
         if f not in seen:
             seen[f] = ""
             calls = _find_calls(f)
-            below = [f"{name}={text(g)}" for name, g in calls.items()]
+            below = [f"{name}={describe_calls(g)}" for name, g in calls.items()]
             constants = [f"{name}={_describe_constant(value)}"
                          for name, value in _find_globals(f).items() if name not in calls]
             whole = "\n".join([_describe_code(f), *below, *constants])
             seen[f] = hashlib.sha256(whole.encode()).hexdigest()
         return seen[f]
 
-    return hashlib.sha256((_THIS_FILE + text(function)).encode()).hexdigest()[:20]
+    return hashlib.sha256((_THIS_FILE + describe_calls(function)).encode()).hexdigest()[:20]
 
 
 _THIS_FILE = "".join(Path(str(file)).read_text(encoding="utf-8") for file in (__file__, functions.__file__))

@@ -70,5 +70,5 @@ def compute_answers(model: Model, com: Array, xj: Array) -> Array:
     """Cor, (n,) A, that the model's controller answers to demands `com` and sensed positions `xj`, (n,) m each."""
     out = np.empty(len(com))
     memory = combine_laws("command", model.effects)[1]
-    build_kernel(run_controller, model.effects)(memory, com, xj, model.record(), out)
+    build_kernel(run_controller, model.effects)(memory, com, xj, model.build_record(), out)
     return out

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from plant.effects import base
+from plant.effects import register_base
 from plant.effects.sensors import Quantisation
 from plant.effects.valve import Compressibility
 from plant.friction import clip
@@ -147,14 +147,17 @@ def compute_centred_mean(x: Array, rows: int) -> Array:
     return mean
 
 
-base("check_valve", "pump.least_speed", groups={"pump": Pump}, plant="ehs", starts=(10.0, 40.0),
-     law="XJ' = 0 while the motor is slower than that", symptoms="at rest the pressure falls and the ram stays",
-     source="a pilot-operated check valve between pump and cylinder")
-base("return_pressure", "pump.return_pressure", groups={"pump": Pump}, plant="ehs", starts=(1e5, 5e5),
-     law="Q = AJ XJ' + CLK (P12 - (1 - ratio) pR)", symptoms="at rest P12 falls to the same pressure from both sides",
-     source="a return line under pressure and unequal areas")
-base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs", law="AJ times the ratio, backwards",
-     symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
+register_base("check_valve", "pump.least_speed", groups={"pump": Pump}, plant="ehs", starts=(10.0, 40.0),
+              law="XJ' = 0 while the motor is slower than that",
+              symptoms="at rest the pressure falls and the ram stays",
+              source="a pilot-operated check valve between pump and cylinder")
+register_base("return_pressure", "pump.return_pressure", groups={"pump": Pump}, plant="ehs", starts=(1e5, 5e5),
+              law="Q = AJ XJ' + CLK (P12 - (1 - ratio) pR)",
+              symptoms="at rest P12 falls to the same pressure from both sides",
+              source="a return line under pressure and unequal areas")
+register_base("unequal_areas", "pump.area_ratio", groups={"pump": Pump}, plant="ehs",
+              law="AJ times the ratio, backwards",
+              symptoms="another speed backwards for the same drive", starts=(0.9, 0.7, 0.5), source="a rod on one side")
 
 PARAMETER_GROUPS: dict[str, type[Any]] = {
     "controller": convert_group_unit(GROUPS["controller"], "A", "raw", 1e6),

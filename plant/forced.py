@@ -31,7 +31,7 @@ def compute_flow_balance(model: Model, spool: Array, pressure: Array, position: 
     out = np.empty((len(spool), 2))
     columns = np.ascontiguousarray(np.column_stack([spool, pressure]), float)
     run = build_kernel(run_flow_balance, model.effects)
-    run(model.state(), columns, float(position), model.record(), _choose_steps(model), out)
+    run(model.build_state(), columns, float(position), model.build_record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy()
 
 
@@ -46,7 +46,7 @@ def compute_force_balance(model: Model, position: Array, speed: Array, pressure:
     rate = np.gradient(speed, model["controller.period"])
     columns = np.ascontiguousarray(np.column_stack([position, speed, rate, pressure, load]), float)
     run = build_kernel(run_force_balance, model.effects)
-    run(model.state(), columns, model.record(), _choose_steps(model), out)
+    run(model.build_state(), columns, model.build_record(), _choose_steps(model), out)
     return out[:, 0].copy(), out[:, 1].copy(), out[:, 2].copy()
 
 

@@ -49,7 +49,7 @@ class Lanes:
     def __init__(self, model: Model, names: Sequence[str], steps: int = STEPS, workers: int | None = None) -> None:
         self.model, self.names, self.steps = model, tuple(names), steps
         self.workers = workers or count_threads()
-        known = model.names()
+        known = model.list_names()
         for name in self.names:
             if name not in known or name == "controller.period":
                 raise InputError("lanes", name, f"a parameter of the model {model.name} other than the period")
@@ -100,8 +100,8 @@ class Lanes:
                              f"{driven.shape}, {load.shape} and {position.shape}")
         out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
         inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
-        work = [(run, buffer, rows) for rung, members in self._shared_out(values)
-                for run, buffer, rows in rung.blocks(self.names, values, members)]
+        work = [(run, buffer, rows) for rung, members in self._assign_runs(values)
+                for run, buffer, rows in rung.build_blocks(self.names, values, members)]
 
         def do(task: tuple[Function, Array, NDArray[np.uint64]]) -> None:
             run, buffer, rows = task
@@ -110,12 +110,12 @@ class Lanes:
         map_in_threads(do, work, self.workers)
         return out[:-1].transpose(0, 2, 1)
 
-    def _shared_out(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
+    def _assign_runs(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones."""
         effects = self.model.effects
         if len(self._rungs) == 1:
             return [(self._rungs[0], np.arange(len(values)))]
-        at_work = np.column_stack([self._at_work(CATALOGUE[name], values) for name in effects])
+        at_work = np.column_stack([self._find_active_runs(CATALOGUE[name], values) for name in effects])
         left, shared = np.ones(len(values), bool), []
         for rung in self._rungs:
             others = [name not in rung.model.effects for name in effects]
@@ -125,7 +125,7 @@ class Lanes:
                 shared.append((rung, np.flatnonzero(fits)))
         return shared
 
-    def _at_work(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
+    def _find_active_runs(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
         """The runs in which the effect is active: one of its parameters differs from its off value."""
         changed = np.zeros(len(values), bool)
         for name, off in effect.off.items():
@@ -138,13 +138,13 @@ class KernelVariant:
     """The kernel of a model with some of its effects, for the runs in which the others are off."""
 
     def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
-        own = set(build_bare_model(model.plant).having(effects).values)
+        own = set(build_bare_model(model.plant).with_effects(effects).values)
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
-        self._names, self._laws = self.model.names(), list_laws(effects)
+        self._names, self._laws = self.model.list_names(), list_laws(effects)
         self._state: Array | None = None
-        self._parameters = self.model.record().view(np.float64)[:, None]
+        self._parameters = self.model.build_record().view(np.float64)[:, None]
 
-    def blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
+    def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
                ) -> Iterator[tuple[Function, Array, NDArray[np.uint64]]]:
         """The runs `members` in blocks: the kernel, the buffer at the start, and the row of the output for each lane.
 
@@ -154,7 +154,7 @@ class KernelVariant:
         width = WIDE if len(members) >= 2 * WIDE and not model.effects else NARROW
         plan, run = _compile_layout(model.effects, self._laws, model.plant, width)
         if self._state is None:  # not sooner: it asks laws, which may be wrong
-            self._state = np.array(list_state_values(model.state()))
+            self._state = np.array(list_state_values(model.build_state()))
         start = np.zeros((plan.numbers, width))
         start[:len(self._state)] = self._state[:, None]
         start[plan.parameters:] = self._parameters
@@ -191,7 +191,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     rungs = list_kernel_variants(model)
     for done, rung in enumerate(rungs):
         progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
-        for run, buffer, rows in rung.blocks((), np.zeros((1, 0)), np.arange(1)):
+        for run, buffer, rows in rung.build_blocks((), np.zeros((1, 0)), np.arange(1)):
             none = np.empty(0)
             run(buffer, none, none, none, 0.0, False, 1.0, 1, rows, np.empty((2, 3, 0)))
     progress("", 1.0)
@@ -243,7 +243,7 @@ keep_state = keep_coefficients = keep_loop = keep_drive = _raise_unbound
 
 def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> Layout:
     """The layout for a plant with `effects`, `width` lanes."""
-    record = build_bare_model(plant).having(effects).record()
+    record = build_bare_model(plant).with_effects(effects).build_record()
     shapes = {"state": build_initial_state(effects), "loop": Loop(), "drive": Drive(),
               "coefficients": find_plant(plant).coefficients(record[0], 1.0)}
     made, place = collect_bindings(effects, plant), 0

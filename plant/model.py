@@ -36,7 +36,7 @@ def find_parameter_groups(effects: Iterable[str] | None = None, plant: str = "eh
 def list_offered_effects(plant: str = "eha") -> list[Effect]:
     """The effects of the catalogue that suit a plant."""
     kind = plants.find_plant(plant)
-    return [e for e in CATALOGUE.whole().values() if kind.offers(e)]
+    return [e for e in CATALOGUE.list_all().values() if kind.offers(e)]
 
 
 def list_searched_effects(plant: str = "eha") -> list[Effect]:
@@ -76,16 +76,16 @@ class Model:
         known = find_parameter_groups(plant=self.plant)
         values = {name: parse_value(where, name, find_field(where, name, known), value)
                   for name, value in changes.items()}
-        model = self.having(name.partition(".")[0] for name in changes)
+        model = self.with_effects(name.partition(".")[0] for name in changes)
         merged = {**model.values, **values}
         check_combinations(where, merged)
         check_exclusions(where, model.effects, merged)
         return replace(model, values=merged)
 
-    def having(self, groups: Iterable[str]) -> Model:
+    def with_effects(self, groups: Iterable[str]) -> Model:
         """The model with the effects among `groups` added at their off values."""
         wanted = set(groups) | set(self.effects)
-        effects = tuple(e.name for e in CATALOGUE.whole().values() if e.name in wanted and not e.base)
+        effects = tuple(e.name for e in CATALOGUE.list_all().values() if e.name in wanted and not e.base)
         usual = self.kind.nominal
         off = {name: usual.get(name, value) for e in effects if e not in self.effects
                for name, value in CATALOGUE[e].off.items()}
@@ -94,7 +94,7 @@ class Model:
     def __getitem__(self, name: str) -> float:
         return self.values[name]
 
-    def differences(self) -> dict[str, float]:
+    def list_changes(self) -> dict[str, float]:
         """The parameters that are not nominal, and all parameters of its effects."""
         base = self.kind.nominal
         return {name: value for name, value in self.values.items() if base.get(name) != value}
@@ -106,7 +106,7 @@ class Model:
         plant = [] if self.plant == "eha" else [f'plant = "{self.plant}"']
         lines = [f"name = {name}", *plant, f"effects = [{effects}]"]
         group = ""
-        for name, value in self.differences().items():
+        for name, value in self.list_changes().items():
             head, _, tail = name.partition(".")
             if head != group:
                 group = head
@@ -116,28 +116,28 @@ class Model:
             lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
         return "\n".join(lines) + "\n"
 
-    def names(self) -> list[str]:
-        """The parameters "group.field", in the order of `record`."""
-        return [f"{group}.{f}" for group, cls in self._groups().items() for f in cls._fields]
+    def list_names(self) -> list[str]:
+        """The parameters "group.field", in the order of `build_record`."""
+        return [f"{group}.{f}" for group, cls in self._find_groups().items() for f in cls._fields]
 
-    def _groups(self) -> dict[str, type[Any]]:
+    def _find_groups(self) -> dict[str, type[Any]]:
         return find_parameter_groups(self.effects, self.plant)
 
-    def record(self) -> NDArray[Any]:
+    def build_record(self) -> NDArray[Any]:
         """The values as a record array of one row, fields group.field; compiled code reads it in each step."""
-        groups = self._groups()
+        groups = self._find_groups()
         inner = {group: np.dtype((np.record, [(f, float) for f in cls._fields])) for group, cls in groups.items()}
         row = tuple(tuple(self.values[f"{group}.{f}"] for f in cls._fields) for group, cls in groups.items())
         return np.array([row], np.dtype((np.record, list(inner.items()))))
 
-    def state(self) -> State:
+    def build_state(self) -> State:
         """The actuator at rest in the middle, with the memories of its effects, as its transducer shows it."""
         s = build_initial_state(self.effects)
         if not any(CATALOGUE[e].port == "position" for e in self.effects):
             return s
         # once in plain Python, because the first sample is read before the first step
         law = combine_laws("position", self.effects)[0]
-        return s._replace(sensed=float(law(s.jack_position, s.memory.position, s, Input(), self.record()[0])[0]))
+        return s._replace(sensed=float(law(s.jack_position, s.memory.position, s, Input(), self.build_record()[0])[0]))
 
 
 def load_model(source: str | Path = "eha") -> Model:
@@ -149,7 +149,7 @@ def load_model(source: str | Path = "eha") -> Model:
         InputError: no such file, or an unknown group, field, effect or impossible value in it.
     """
     if str(source) in plants.list_plants():
-        return build_bare_model(str(source)).having(plants.find_plant(str(source)).has)
+        return build_bare_model(str(source)).with_effects(plants.find_plant(str(source)).has)
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
         names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
@@ -185,7 +185,7 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
         hint = suggest_name(str(unknown[0]), known)
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
     values = flatten_tables(where, tables, find_parameter_groups(plant=plant))
-    return build_bare_model(plant, name).having(effects).replace(values, where)
+    return build_bare_model(plant, name).with_effects(effects).replace(values, where)
 
 
 def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:
@@ -194,7 +194,7 @@ def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str,
     Raises:
         InputError: the names of both.
     """
-    working = {e for e in effects if CATALOGUE[e].acts(values)}
+    working = {e for e in effects if CATALOGUE[e].is_active(values)}
     for e in sorted(working):
         for other in working.intersection(CATALOGUE[e].excludes):
             raise InputError(where, e, f"{e} or {other}, not both at work")

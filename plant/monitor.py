@@ -274,9 +274,9 @@ class Monitor:
             run(block[1], *inputs, out)
             return reduced(out[:, :, :block[0]].transpose(2, 0, 1))
 
-        return np.concatenate(map_in_threads(do, self._blocks(values, period / steps), self.workers))
+        return np.concatenate(map_in_threads(do, self._build_blocks(values, period / steps), self.workers))
 
-    def _blocks(self, values: Array, h: float) -> Iterator[tuple[int, Array]]:
+    def _build_blocks(self, values: Array, h: float) -> Iterator[tuple[int, Array]]:
         """The runs WIDTH at a time: how many they are, and the buffer at the start; idle lanes repeat the last run."""
         fixed = [values[:, self.names.index(name)] if name in self.names else np.full(len(values), self.model[name])
                  for name in (f"controller.{field}" for field in Controller._fields)]

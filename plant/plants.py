@@ -79,7 +79,7 @@ class Plant:
         zero = {f"{group}.{name}": 0.0 for group, cls in self.groups.items() for name in cls._fields}
         return {**zero, **self.given}
 
-    def tolerance(self, name: str, q: Quantity) -> float:
+    def find_tolerance(self, name: str, q: Quantity) -> float:
         """Scatter of a parameter from unit to unit, as a fraction; 0 where the nominal value is zero."""
         if self.nominal.get(name) == 0.0:
             return 0.0

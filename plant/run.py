@@ -70,10 +70,10 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     if com.ndim != 1 or not len(com) or force.shape != com.shape:
         raise InputError("command", "com", f"one demand and one load a cycle, not shapes {com.shape} and {force.shape}")
     out = np.empty((len(com), 4))
-    record = model.record()
+    record = model.build_record()
     with report_law_errors(model):
         run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
-        run(model.state(), com, force, draw_noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
+        run(model.build_state(), com, force, draw_noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)
@@ -99,7 +99,7 @@ def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     files = {law.__code__.co_filename for law in laws if law is not None}
     try:
         step = build_kernel(step_cycle, model.effects, False, model.plant)
-        step(model.state(), 0.0, 0.0, 0.0, 0.0, model.record(), 1)
+        step(model.build_state(), 0.0, 0.0, 0.0, 0.0, model.build_record(), 1)
     except Exception as error:
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in files]
         return (f"{frames[-1].filename}:{frames[-1].lineno}", error) if frames else None
@@ -113,7 +113,7 @@ class Demand:
         is_changed = any(CATALOGUE[effect].port == "command" for effect in model.effects)
         self._law = build_kernel(apply_command_effects, model.effects, fast=False) if is_changed else None
         self._first = build_initial_state(model.effects).memory.command
-        self._record = model.record()[0]
+        self._record = model.build_record()[0]
         self._period = model["controller.period"]
         self.restart()
 
@@ -137,12 +137,12 @@ class Actuator:
         self.model, self.steps = model, steps
         self.cycle = 0
         with report_law_errors(model):
-            state = model.state()
+            state = model.build_state()
         self._flat = np.array(list_state_values(state))
         self._unpack = make_packers(state)[1]
-        self._record = model.record()
+        self._record = model.build_record()
         self._live = self._record.view(np.float64)  # the same numbers, in the order of their names
-        self._index = {name: i for i, name in enumerate(model.names())}
+        self._index = {name: i for i, name in enumerate(model.list_names())}
         self._levels = [self._index[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
         self._draws = iterate_noise(seed)
         self._noise = [0.0] * NOISES

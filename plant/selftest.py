@@ -58,7 +58,7 @@ def check_effect(name: str, command: Array, load: Array | None = None) -> Report
 
 def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array,
                  load: Array | None) -> list[str]:
-    bare, off = Model(), Model().having([effect.name])
+    bare, off = Model(), Model().with_effects([effect.name])
     faults = []
     if not _are_equal(simulate(bare, command, load), simulate(off, command, load)):
         faults.append("at its off value it changes the plant")

@@ -83,7 +83,7 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
     bare = Model().replace(NOISE)
     force = np.zeros_like(command) if load is None else load
     run = simulate(bare, command, force)
-    model = bare if effect.base else bare.having([effect.name])
+    model = bare if effect.base else bare.with_effects([effect.name])
     if effect.firmware:
         return _compute_firmware_changes(model, values, run.com, run.xj)
     names = list(dict.fromkeys(name for row in values for name in row))
@@ -118,25 +118,25 @@ def _find_sizes(effect: Effect, name: str, command: Array, load: Array | None) -
     """Values of one parameter that can be seen with the others as usual; both signs where it may be negative."""
     quantity, off = effect.parameters[name], effect.off[name]
 
-    def seen(values: Array) -> Array:
+    def find_highest_level(values: Array) -> Array:
         change = compute_changes(effect, [{name: float(x)} for x in values], command, load)
         highest: Array = compute_levels(change).max(axis=1)
         return highest
 
     if hints := parse_hint(quantity):
-        return hints if seen(np.array(hints)).max() > 0.0 else []
+        return hints if find_highest_level(np.array(hints)).max() > 0.0 else []
     found: list[float] = []
     for sign in (1.0, -1.0):
         decades = off + sign * np.logspace(*DECADES, DECADES[1] - DECADES[0] + 1)
         decades = decades[[not quantity.refuses(x) for x in decades]]
-        shown = seen(decades) if len(decades) else decades
+        shown = find_highest_level(decades) if len(decades) else decades
         for level in VISIBLE:
             above = np.flatnonzero(shown >= level)
             if not len(above):
                 break
             i = above[0]
             finer = off + sign * np.geomspace(abs(decades[max(i - 1, 0)] - off), abs(decades[i] - off), 9)
-            distance = np.abs(np.log(np.clip(seen(finer), 1e-9, 1e9) / level))
+            distance = np.abs(np.log(np.clip(find_highest_level(finer), 1e-9, 1e9) / level))
             found.append(float(finer[distance.argmin()]))
     return list(dict.fromkeys(found))
 

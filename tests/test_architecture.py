@@ -76,7 +76,7 @@ CLOCK_FILES = (
 # Public names of each package: what `from package import *` gives.
 PUBLIC = {
     "plant": {"Actuator", "Columns", "InputError", "Model", "RigError", "load_model", "simulate"},
-    "plant.effects": {"CATALOGUE", "Effect", "Law", "base", "combine_laws", "effect", "load_effects"},
+    "plant.effects": {"CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"},
     "fdi": {"Trace", "add_effect", "compare", "diagnose", "explain", "read_trace"},
     "fdi.discovery": {"Explanation", "explain"},
     "rig.device": {

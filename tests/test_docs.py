@@ -182,7 +182,8 @@ SYMBOLS = re.findall(r"^\|\s*(\S*?)\s*\| `([a-z_]+\.[a-z_]+)`[^|]*\| ([^|]+) \|"
 
 
 def test_the_table_of_symbols_has_every_parameter_and_its_symbol() -> None:
-    known = {name: list_quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol for name in Model().names()}
+    known = {name: list_quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol
+             for name in Model().list_names()}
     assert {name: symbol for symbol, name, _ in SYMBOLS} == known
 
 

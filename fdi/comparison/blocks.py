@@ -252,7 +252,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
     if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
         return None
-    noisy = floor_from_data(trace.measured("xj")).value > NOISY_SENSOR_RATIO * level["xj"] if "xj" in level else False
+    noisy = ("xj" in level
+             and floor_from_data(trace.mask_unusable("xj")).value > NOISY_SENSOR_RATIO * level["xj"])
     flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
     most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses

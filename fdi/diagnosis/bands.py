@@ -56,14 +56,14 @@ class StepBand(NamedTuple):
     middle: Floats  # (K,) what Table 2's lesser clogging adds
     most: Floats  # (K,) what the greater clogging adds
 
-    def centre(self, friction: float, known: Floats) -> tuple[Floats, Floats]:
+    def compute_centre(self, friction: float, known: Floats) -> tuple[Floats, Floats]:
         """Mean and standard deviation, (K,) each, with `friction` N, between the amounts `known` (F,) N."""
         weights = _interpolation_weights(friction, known)
         return self.healthy + weights @ self.shift, weights @ self.spread
 
 
 class Width(NamedTuple):
-    """How far a signal may be from `centre`, either way."""
+    """How far a signal may be from `compute_centre`, either way."""
 
     centre: float
     healthy: float
@@ -81,7 +81,7 @@ class RampBand(NamedTuple):
     slip: float  # 1/s, fastest slip over that half range where FDS is FSS/1.5
     ease: float  # s, how much of the range is lost where the spool slips faster: range ~ FSS (1 - ease slip)
 
-    def scale(self, half: float, fastest: float) -> float:
+    def compute_scale(self, half: float, fastest: float) -> float:
         """Factor on the error that makes it the error with FDS = FSS/1.5.
 
         Args:
@@ -96,7 +96,7 @@ class RampBand(NamedTuple):
         """1.5 FDS over FSS: the speed of a slip goes with FSS - FDS, which is FSS/3 where it is `slip`."""
         if self.slip <= 0.0:
             return 1.0
-        own = fastest / (self.scale(half, fastest) * half) if half > 0.0 else self.slip
+        own = fastest / (self.compute_scale(half, fastest) * half) if half > 0.0 else self.slip
         return float(np.clip(STATIC_OVER_DYNAMIC * (1 - own / (3 * self.slip)), 0.0, STATIC_OVER_DYNAMIC))
 
 
@@ -117,10 +117,10 @@ class Bands:
     @property
     def judges(self) -> tuple[bool, bool]:
         """Whether this command shows clogging, and whether it shows friction."""
-        return (any(self.margins(s, s.spread[0])[2].any() for s in self.steps),
+        return (any(self.compute_margins(s, s.spread[0])[2].any() for s in self.steps),
                 any(np.isfinite(r.position.middle) for r in self.ramps))
 
-    def margins(self, step: StepBand, spread: Floats) -> tuple[Floats, Floats, Flags]:
+    def compute_margins(self, step: StepBand, spread: Floats) -> tuple[Floats, Floats, Flags]:
         """Distances of the limits MidBand and MaxBand from the centre, m, and where the step is judged; (K,) each."""
         judged = np.abs(step.middle) > BAND_FAULT_CLEARANCE_SD * spread
         middle = np.maximum(self.middle_share * np.abs(step.middle), BAND_NEAREST_LIMIT_SD * spread)
@@ -256,7 +256,7 @@ def is_loaded(load: Floats) -> bool:
 
 def is_nominal_plant(model: Model) -> bool:
     """Whether a healthy unit of the model is a nominal one; its two faults and its noise do not count."""
-    apart = set(model.differences()) - {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
+    apart = set(model.list_changes()) - {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
     return model.plant == "eha" and not any(not name.startswith("sensors.") for name in apart)
 
 
@@ -316,7 +316,7 @@ def judge_trace(source: Trace, bands: Bands | None = None, model: Model | None =
 
 def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
     """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
-    return hold_last(source.com), source.measured("xj"), source.load, source.period, float(source.t[0])
+    return hold_last(source.com), source.mask_unusable("xj"), source.load, source.period, float(source.t[0])
 
 
 def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,
@@ -410,7 +410,7 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
         beyond = np.sign(s.rate) * velocity[rows] - abs(s.rate)
         half = float(compute_half_range(error))
         fastest = float(find_lasting_peak(beyond))
-        scale = ramp.scale(half, fastest)
+        scale = ramp.compute_scale(half, fastest)
         amount = float(np.interp(scale * half, ramp.half_range, bands.friction))
         shown.append((amount, amount * ramp.estimate_friction_ratio(half, fastest)))
         departure = scale * (error - ramp.position.centre)
@@ -457,8 +457,8 @@ def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand
     rows = np.arange(first, min(stop, s.stop - s.start))
     at = rows * period
     towards = np.sign(np.interp(at, step.t, step.middle))
-    centres, spreads = zip(*(step.centre(amount, bands.friction) for amount in amounts), strict=True)
-    middle, most, judged = bands.margins(step, np.max(spreads, axis=0))
+    centres, spreads = zip(*(step.compute_centre(amount, bands.friction) for amount in amounts), strict=True)
+    middle, most, judged = bands.compute_margins(step, np.max(spreads, axis=0))
     x = np.min([towards * (xj[s.start + rows] - np.interp(at, step.t, centre)) for centre in centres], axis=0)
     x = np.where(np.interp(at, step.t, judged.astype(float)) > 0.99, x, np.nan)
     return Excursion("position", s, s.start + first, x, np.interp(at, step.t, middle), np.interp(at, step.t, most),

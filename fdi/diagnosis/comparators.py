@@ -74,7 +74,7 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
         InputError: a command or a trace that shows no precursors.
     """
     com, parts = hold_last(trace.com), find_sections(trace.com, trace.period)
-    xj, rows = trace.measured("xj"), np.arange(len(trace))
+    xj, rows = trace.mask_unusable("xj"), np.arange(len(trace))
     there = ~np.isnan(xj)
     own = compute_features(com, np.interp(rows, rows[there], xj[there])[None], trace.period, parts)
     if not own:

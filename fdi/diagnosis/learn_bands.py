@@ -32,9 +32,9 @@ from fdi.diagnosis.bands_file import KNOT_CYCLES, save_bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Level
 from fdi.diagnosis.precursors import compute_features, is_slow_ramp
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
-from fdi.output import writable
+from fdi.output import require_writable
 from fdi.progress import Progress, ignore_progress
-from fdi.sources import software
+from fdi.sources import name_software
 from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_NEAREST_LIMIT_SD,
@@ -64,7 +64,7 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
     Raises:
         InputError: traces that cannot be learned from, or a place that cannot be written.
     """
-    place = writable(out, "--out")
+    place = require_writable(out, "--out")
     if sources:
         traces = []
         for done, source in enumerate(sources):
@@ -227,7 +227,7 @@ def _average_known(values: Floats) -> float:
 
 def _describe_origin(parts: Sequence[Section], period: float) -> dict[str, str]:
     text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
-    return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": software()}
+    return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -57,17 +57,17 @@ class Objective:
 
     def __call__(self, points: Floats) -> Floats:
         """Misfits, (m,), of points (m, 3)."""
-        cost: Floats = compute_misfit(self._white(points))
+        cost: Floats = compute_misfit(self._compute_white_residuals(points))
         return cost
 
     def report(self, method: str, point: Sequence[float]) -> Attempt:
         """The answer at a point; evaluating it once more does not count as a simulation."""
         spent = sum(self.problem.counts)
-        white = self._white(np.asarray(point, float)[None])
+        white = self._compute_white_residuals(np.asarray(point, float)[None])
         left = float(np.sqrt(np.mean(white**2)))
         return Attempt(method, float(point[0]), math.exp(float(point[1])), left, spent, False)
 
-    def _white(self, points: Floats) -> Floats:
+    def _compute_white_residuals(self, points: Floats) -> Floats:
         x = np.array([make_start(self.free, k, math.exp(f)) for k, f, _ in points])
         sliding = self.free[self._sliding]
         x[:, self._sliding] = (points[:, 1] + np.log(points[:, 2]) - sliding.centre) / sliding.scale

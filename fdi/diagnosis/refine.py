@@ -215,7 +215,7 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
                  ) -> CountedProblem:
     """The model with the suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI."""
     level = {name: floor[name] if floor else model[SIGNALS[name].noise] for name in trace.outputs}
-    ready = silence_readings(model).having(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
+    ready = silence_readings(model).with_effects(s.effect for s in SUSPECTS if not CATALOGUE[s.effect].base)
     noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
     return CountedProblem(ready, trace, noise, workers=workers)
 
@@ -370,7 +370,7 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
     per_speed = p["jack.area"] / p["valve.flow_gain"] * p["feedback_spring.stiffness"] / p["torque_motor.gain"]
     found = {"null_bias.current": per_speed * speed - float(trace.cor.mean())}
     if "p12" in trace.outputs:
-        pressure = trace.measured("p12")
+        pressure = trace.mask_unusable("p12")
         found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(trace.load.mean())
     return found
 

@@ -130,7 +130,7 @@ def _select_rows(trace: Trace, parts: list[Section], kind: str) -> Flags:
     chosen = np.zeros(len(trace), bool)
     for s in parts:
         chosen[s.start:s.stop] |= s.kind == kind
-    return chosen & ~np.isnan(trace.measured("xj"))
+    return chosen & ~np.isnan(trace.mask_unusable("xj"))
 
 
 def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]

@@ -70,7 +70,7 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float) -
     parameter = entry.fitted[0]
     usual = [abs(s[parameter]) for s in entry.starts]
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
-    unit, ready = measure_firmware_resolution(model), model.having([name])
+    unit, ready = measure_firmware_resolution(model), model.with_effects([name])
 
     def measure_error(size: float) -> float:
         return _measure_rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit

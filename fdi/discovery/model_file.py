@@ -29,7 +29,7 @@ class Row(NamedTuple):
     holdout: By
     removed: bool = False
 
-    def plain(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """The row as JSON values (docs/json.md)."""
         row: dict[str, Any] = {"effect": self.effect, "error": dict(self.error), "holdout": dict(self.holdout)}
         return row | {"removed": True} if self.removed else row
@@ -90,7 +90,7 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
     found = read_provenance(path)
     tables = read_toml(path)
     named = tables.get("effects", [])
-    gone = [e for e in named if e not in CATALOGUE.whole()] if isinstance(named, list) else []
+    gone = [e for e in named if e not in CATALOGUE.list_all()] if isinstance(named, list) else []
     if gone and found.effect_files:
         files = " ".join(f"--effects {file}" for file in found.effect_files)
         raise InputError(path, "effects", f"{files} with it, where {gone[0]} is defined")

@@ -147,7 +147,7 @@ def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
 
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
-    every, own = complete_model(model), silence_readings(model.having(effects))
+    every, own = complete_model(model), silence_readings(model.with_effects(effects))
     quick = {e for rung in list_kernel_variants(every)[:-1] for e in rung.model.effects}
     return every if set(own.effects) <= quick else own
 

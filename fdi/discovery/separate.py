@@ -109,7 +109,7 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
     lanes = Lanes(problem.model, names, problem.steps, 1)
     out = lanes.closed_loop(np.array([[h.fit.values[n] for n in names]]), com, load)[0]
     columns = dict(zip(("xj", "cor", "p12", "xs"), out.T, strict=True))
-    return hold_inputs(Trace.of({"com": com, "load": load, **columns}, period, {}), signals)
+    return hold_inputs(Trace.from_columns({"com": com, "load": load, **columns}, period, {}), signals)
 
 
 def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:

@@ -14,7 +14,7 @@ from fdi.discovery.runs import Runs, read_runs, read_source
 from fdi.estimation.likelihood import limit_friction_values
 from fdi.output import write_text
 from fdi.progress import Progress, ignore_progress
-from fdi.sources import software
+from fdi.sources import name_software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, INTERVAL_95_SD
 from plant.errors import InputError
 from plant.model import Model, find_effect, find_quantity
@@ -48,7 +48,7 @@ class ModelUpdate:
             return self.provenance.floor or {}
         return self.refit.floor
 
-    def intervals(self) -> dict[str, Value]:
+    def compute_intervals(self) -> dict[str, Value]:
         """95 % intervals of everything that was fitted, SI."""
         if self.refit is None:
             return {}
@@ -156,8 +156,9 @@ def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str]
     if len(rows) > len(r.steps):  # a model that lacks an effect overestimates the noise: the lowest floor is the noise
         floor = {s: min(x, known_floor.get(s, x)) for s, x in r.floor.items()}
     provenance = replace(
-        known, software=software(), history=(*known.history, *([command] if command else [])), effects=tuple(effects),
-        signals=runs.est.outputs, trace=runs.sources[0], repeats=runs.sources[1:1 + len(runs.repeats)],
+        known, software=name_software(), history=(*known.history, *([command] if command else [])),
+        effects=tuple(effects), signals=runs.est.outputs, trace=runs.sources[0],
+        repeats=runs.sources[1:1 + len(runs.repeats)],
         holdout=runs.sources[-1] if runs.holdout is not None else None, floor=floor,
         before={**(known.before or {}), **before}, ledger=tuple(rows))
     return ModelUpdate(model, provenance, added, removed, r, parameters, list_suspicious(fit, model.plant), notes)
@@ -170,7 +171,7 @@ def write_model_file(update: ModelUpdate, path: str | Path) -> Path | None:
         InputError: a file that cannot be written.
     """
     path = Path(path)
-    text = model_file.format_model_file(update.model, update.intervals(), update.provenance)
+    text = model_file.format_model_file(update.model, update.compute_intervals(), update.provenance)
     backup = None
     if path.exists() and path.read_bytes():
         backup = path.with_name(path.name + ".bak")

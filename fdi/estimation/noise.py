@@ -97,7 +97,7 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
     """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given."""
     out = {}
     for name in trace.outputs:
-        given, seen = model[SIGNALS[name].noise], floor_from_data(trace.measured(name))
+        given, seen = model[SIGNALS[name].noise], floor_from_data(trace.mask_unusable(name))
         given = simulate_reading_noise(model, trace.xj) if name == "xj" else given
         share = 1.0
         if name in trace.sensors:
@@ -119,7 +119,7 @@ def simulate_reading_noise(model: Model, xj: Floats) -> float:
         return level
     noise = level * np.random.default_rng(0).standard_normal(SWEEP)
     true = np.linspace(float(np.nanmin(xj)), float(np.nanmax(xj)), SWEEP)
-    s, p, out = model.state(), model.record()[0], np.empty(SWEEP)
+    s, p, out = model.build_state(), model.build_record()[0], np.empty(SWEEP)
     for k, x in enumerate((true + noise).tolist()):
         u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
         out[k], memory = law(x, memory, s, u, p)

@@ -100,7 +100,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
         if name in floor:
             moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
             large = _windows_above(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
-            undecided |= large & ~np.isnan(trace.measured(name))
+            undecided |= large & ~np.isnan(trace.mask_unusable(name))
     coarse, steps = runs[0], REPLAY_STEPS
     while True:
         finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
@@ -136,7 +136,7 @@ def guess_current(trace: Trace) -> list[Floats]:
 
 def compute_residuals(trace: Trace, model: Columns) -> Columns:
     """Measured less model, of the chosen signals."""
-    return {name: trace.measured(name) - model[name] for name in trace.outputs}
+    return {name: trace.mask_unusable(name) - model[name] for name in trace.outputs}
 
 
 def list_frictions(model: Model) -> tuple[str, ...]:
@@ -165,7 +165,7 @@ def _windows_above(moved: Floats, floor: float) -> Flags:
 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of XJ, m, and the speed at which it departs, m/s."""
-    free = trace.measured("xj") - replay_current(trace, model, steps, 0.0)["xj"]
+    free = trace.mask_unusable("xj") - replay_current(trace, model, steps, 0.0)["xj"]
     there = ~np.isnan(free)
     t = trace.t[there] - trace.t[there].mean()
     return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
@@ -181,8 +181,8 @@ def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Col
     out = lanes.closed_loop(np.empty((1, 0)), com, load)[0]
     shown = trace.pass_sensors(out[:, [0, 2, 3]])[before:]
     whole = {"cor": out[before:, 1]} | {name: shown[:, i] for i, name in enumerate(OUTPUTS)}
-    left = {name: trace.measured(name) - whole[name] for name in trace.outputs}
-    return left | {"cor": trace.measured("cor") - whole["cor"]}
+    left = {name: trace.mask_unusable(name) - whole[name] for name in trace.outputs}
+    return left | {"cor": trace.mask_unusable("cor") - whole["cor"]}
 
 
 def differentiate(x: Floats, size: int, order: int) -> Floats:

@@ -19,13 +19,13 @@ WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "
 
 def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
     """Of the named parameters those that differ from one healthy unit to the next, with one tolerance as a fraction."""
-    found = {name: model.kind.tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
+    found = {name: model.kind.find_tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
     return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
 
 
 def tolerance_sizes(model: Model) -> dict[str, float]:
     """The parameters that differ from one healthy unit to the next, with one tolerance in SI units."""
-    found = relative_tolerances(model, model.names())
+    found = relative_tolerances(model, model.list_names())
     sizes = {name: tolerance * abs(model[name]) for name, tolerance in found.items()}
     return {name: size for name, size in sizes.items() if size > 0.0}
 
@@ -63,7 +63,7 @@ def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tupl
 def active_effects(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
     return tuple(e.name for e in list_offered_effects(model.plant)
-                 if (_off_nominal(e, model) if e.base else e.name in model.effects and e.acts(model.values)))
+                 if (_off_nominal(e, model) if e.base else e.name in model.effects and e.is_active(model.values)))
 
 
 def own_unknowns(model: Model) -> tuple[Free, ...]:
@@ -81,14 +81,14 @@ def all_unknowns(model: Model) -> tuple[Free, ...]:
 
 def _off_nominal(e: Effect, model: Model) -> bool:
     usual = model.kind.nominal
-    tolerance = model.kind.tolerance
+    tolerance = model.kind.find_tolerance
     return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])
                for name, q in e.parameters.items())
 
 
 def complete_model(model: Model) -> Model:
     """The model without sensor noise and with all effects that are searched in its plant, at their off values."""
-    return silence_readings(model.having(e.name for e in list_searched_effects(model.plant) if not e.disturbance))
+    return silence_readings(model.with_effects(e.name for e in list_searched_effects(model.plant) if not e.disturbance))
 
 
 def silence_readings(model: Model) -> Model:

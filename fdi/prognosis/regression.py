@@ -72,7 +72,7 @@ class Posterior(NamedTuple):
         """Log probability of the data."""
         return float(np.logaddexp.reduce([part.evidence for part in self.parts], axis=None))
 
-    def laws(self) -> dict[str, float]:
+    def compute_law_probabilities(self) -> dict[str, float]:
         """Probability of each law."""
         found: dict[str, float] = {}
         for shape, weight in zip(self.shapes, self.weights.sum(axis=0), strict=True):

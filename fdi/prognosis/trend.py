@@ -35,7 +35,7 @@ class Remaining(NamedTuple):
     high: float
     draws: Floats  # equally probable times
 
-    def within(self, t: float) -> float:
+    def compute_probability_within(self, t: float) -> float:
         """Probability that the limit is reached within t."""
         return float((self.draws <= t).mean())
 
@@ -86,7 +86,7 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
         return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
     span = float(t[-1] - t[found.first])
     posterior = fit_growth(found.data)
-    paths, laws = _draw_paths(found, posterior, _fit_unit_error(data, used)), posterior.laws()
+    paths, laws = _draw_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
     remaining = {level: _summarise_remaining(getattr(fault, field), fault, unit, paths, span)
                  for level, field in LIMITS.items()}
     middle = np.linspace(0.0, 1.0, 60)

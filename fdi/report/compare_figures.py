@@ -49,7 +49,7 @@ def draw_overview(c: Comparison) -> str:
 def _draw_replay(ax: Axes, c: Comparison, name: str) -> None:
     label, (unit, scale) = SIGNAL_NAMES[name], DRAWN_UNITS[name]
     t = c.trace.t
-    ax.plot(*thin_line(t, c.trace.measured(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
+    ax.plot(*thin_line(t, c.trace.mask_unusable(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
     ax.plot(*thin_line(t, c.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
     ax.set_ylabel(f"{label} [{unit}]")
     ax.legend(loc="upper right", ncols=2, frameon=False)

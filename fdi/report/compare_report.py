@@ -296,7 +296,7 @@ def _list_parameters(c: Comparison) -> list[Section]:
             [Column("parameter"), Column("change, in tolerances")], rows,
             "How far each parameter moves when the model is refitted within the tolerances of a healthy unit.",
             is_list=True)], medium=Medium.PAGE))
-    changes = sorted(c.model.differences().items())
+    changes = sorted(c.model.list_changes().items())
     if changes:
         rows = [[name, f"{value:g}"] for name, value in changes]
         sections.append(Section("Changes of the model", [Table(

@@ -47,7 +47,7 @@ def draw_overview(trace: Trace, judged: BandVerdict) -> str:
         figure = Figure(figsize=(11, 2.4), layout="constrained")
         ax = figure.subplots()
         ax.plot(*thin_line(trace.t, trace.com * MM), color=COMMAND, lw=2.2, label="Com, command")
-        ax.plot(*thin_line(trace.t, trace.measured("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
+        ax.plot(*thin_line(trace.t, trace.mask_unusable("xj") * MM), color=BLUE, lw=1.0, label="XJ, ram")
         ax.set_xlim(float(trace.t[0]), float(trace.t[-1]) + trace.period)
         _shade_events(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
@@ -75,9 +75,9 @@ def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
 
 
 def _draw_step(ax: Axes, trace: Trace, bands: Bands, step: StepBand, s: Section, judged: BandVerdict) -> None:
-    xj, t = trace.measured("xj"), step.t * MS
-    centre, spread = step.centre(judged.friction, bands.friction)
-    middle, most, there = bands.margins(step, spread)
+    xj, t = trace.mask_unusable("xj"), step.t * MS
+    centre, spread = step.compute_centre(judged.friction, bands.friction)
+    middle, most, there = bands.compute_margins(step, spread)
     rows = s.start + np.rint(step.t / trace.period).astype(int)
     rows = np.minimum(rows, s.stop - 1)
     healthy = BAND_NEAREST_LIMIT_SD * spread * UM
@@ -110,10 +110,10 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
 
 
 def _draw_ramp(axes: Sequence[Axes], trace: Trace, ramp: RampBand, s: Section, judged: BandVerdict) -> None:
-    rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.measured("xj")
+    rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.mask_unusable("xj")
     error = way * (trace.com[rows] - xj[rows])
     fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
-    scale = ramp.scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
+    scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     signals = ((error, ramp.position, UM, 1 / scale, "position"), (fast, ramp.speed, MM, 1.0, "speed"))
     for ax, (values, width, unit, nearer, name) in zip(axes, signals, strict=True):
         _draw_limits(ax, width, unit, nearer)

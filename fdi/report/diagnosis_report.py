@@ -23,7 +23,7 @@ from fdi.report.report import (
     Section,
     Table,
 )
-from fdi.sources import software
+from fdi.sources import name_software
 
 FAULT_NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
 SIZE_SYMBOLS = {CLOGGING.name: "Kintas", FRICTION.name: "FSS"}
@@ -156,10 +156,10 @@ def describe_deviation(parameter: str, size: Estimate) -> str:
 
 def _list_facts(d: Diagnosis) -> list[tuple[str, str]]:
     c = d.trace
-    changes = [f"{name}={value:g}" for name, value in sorted(d.model.differences().items())]
+    changes = [f"{name}={value:g}" for name, value in sorted(d.model.list_changes().items())]
     return [("trace", f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"),
             ("signals", ", ".join(SIGNAL_NAMES[name] for name in c.outputs)),
-            ("model", " ".join([d.model.name, *changes])), ("software", software())]
+            ("model", " ".join([d.model.name, *changes])), ("software", name_software())]
 
 
 def _show_faults(d: Diagnosis) -> list[Item]:

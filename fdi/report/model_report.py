@@ -167,7 +167,7 @@ def collect_data(update: ModelUpdate, path: Path | None, page: Path | None) -> d
     """The answer of `rig add --json` and `rig remove --json`; SI units."""
     is_fitted = update.refit is not None
     return {"model": None if path is None else str(path),
-            "ledger": [row.plain() for row in update.provenance.ledger],
+            "ledger": [row.to_json() for row in update.provenance.ledger],
             "floor": dict(update.provenance.floor or {}),
             "parameters": {name: v._asdict() for name, v in update.parameters.items()},
             "effects": list(update.provenance.effects), "helps": update.helps,

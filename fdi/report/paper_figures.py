@@ -99,7 +99,7 @@ def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace
         for ax, e in zip(axes, chosen, strict=True):
             if kind == "step":
                 band = _find_step_band(bands, trace, e)
-                _draw_step_in_band(ax, trace, e, band, band.centre(friction, bands.friction)[0])
+                _draw_step_in_band(ax, trace, e, band, band.compute_centre(friction, bands.friction)[0])
             else:
                 _draw_ramp_in_band(ax, trace, e)
             size = (e.section.last - e.section.first) * 1e3

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.output import writable
+from fdi.output import require_writable
 from fdi.report.html import write_html
 from fdi.report.report import (
     Cell,
@@ -37,7 +37,7 @@ def write_run_page(source: str | Path, out: str | Path) -> None:
         InputError: a trace that cannot be read, or a file that cannot be written.
     """
     trace = Trace.read(source, all=True)
-    write_html(build_run_report(trace), writable(out, "--out", source=source))
+    write_html(build_run_report(trace), require_writable(out, "--out", source=source))
 
 
 def build_run_report(trace: Trace) -> Report:

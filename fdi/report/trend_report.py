@@ -88,7 +88,7 @@ def _tabulate_remaining(trend: Trend, unit: UnitTrend) -> Table:
     for level, remaining in trend.remaining.items():
         times = (remaining.low, remaining.value, remaining.high)
         dates = ["–"] * 3 if remaining.high == 0.0 else [format_date(t, unit) for t in times]
-        soon = f"{100 * remaining.within(trend.t[-1] - trend.t[0]):.0f} %"
+        soon = f"{100 * remaining.compute_probability_within(trend.t[-1] - trend.t[0]):.0f} %"
         left = Cell(describe_time_left(remaining, trend, unit), is_strong=True)
         rows.append([LIMIT_NAMES[level], left, *dates, soon])
     return Table(columns, rows, "Probability: that the limit is reached within a time as long as the traces cover.",
@@ -220,7 +220,7 @@ def _collect_trend(trend: Trend, unit: UnitTrend) -> dict[str, Any]:
 def _collect_remaining(left: Remaining, end: float, axis: str) -> dict[str, Any]:
     span = {"value": left.value, "low": left.low, "high": left.high}
     at = {f"{name}_at": _collect_place(end + t, axis) if math.isfinite(t) else None for name, t in span.items()}
-    return {"limit": left.limit, **span, **at, "ever": left.within(1e300)}
+    return {"limit": left.limit, **span, **at, "ever": left.compute_probability_within(1e300)}
 
 
 def _collect_place(t: float, axis: str) -> str | float:

@@ -49,7 +49,7 @@ class Log:
     metadata: Mapping[str, Mapping[str, str]]
     _chunks: tuple[ChunkIndex, ...]
 
-    def messages(self, *topics: str, most: int | None = None) -> Iterator[tuple[str, int, Any]]:
+    def read_messages(self, *topics: str, most: int | None = None) -> Iterator[tuple[str, int, Any]]:
         """(topic, time in ns, protobuf message) of the topics, by time; equal times in the order of the file.
 
         `most`: no more than so many, the first ones in time.
@@ -85,7 +85,7 @@ class Log:
             columns = self._read_rows(topic)
             if columns is not None:
                 return columns
-            messages = [(time_ns, message) for _, time_ns, message in self.messages(topic)]
+            messages = [(time_ns, message) for _, time_ns, message in self.read_messages(topic)]
             if not messages:
                 return {"time_ns": np.empty(0, np.int64)}
             names = [field.name for field in messages[0][1].DESCRIPTOR.fields]
@@ -130,7 +130,7 @@ class Log:
                 for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
                     yield channel, time_ns, data
 
-    def units(self, topic: str) -> dict[str, str]:
+    def read_units(self, topic: str) -> dict[str, str]:
         """Field -> unit, from the channel's metadata."""
         return {key.removeprefix("unit."): value for channel in self.channels.values() if channel.topic == topic
                 for key, value in channel.metadata.items() if key.startswith("unit.")}

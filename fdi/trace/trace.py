@@ -164,7 +164,7 @@ class Trace:
         raise InputError(path, "", "a trace: .mcap, .csv, .csv.gz or the folder of a run")
 
     @classmethod
-    def of(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
+    def from_columns(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
         """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
         grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
         return _make_trace(grid, period, [], provenance=dict(provenance))
@@ -181,14 +181,14 @@ class Trace:
         values: Floats = getattr(self, name)
         return values
 
-    def measured(self, name: str) -> Floats:
+    def mask_unusable(self, name: str) -> Floats:
         """A column, NaN where it is missing or its row cannot be used."""
         return np.where(self.usable, self.column(name), np.nan)
 
     @cached_property
     def measurements(self) -> Floats:
         """The outputs as rows (s, n), NaN where they are missing or cannot be used."""
-        return np.array([self.measured(name) for name in self.outputs])
+        return np.array([self.mask_unusable(name) for name in self.outputs])
 
     @property
     def output_columns(self) -> list[int]:
@@ -317,7 +317,7 @@ def _from_log(log: Log, everything: bool) -> Trace:
     numbers = grid.pop("phase")
     filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
     return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
-                       units=dict(UNITS) | log.units("/signals"), attachments=log.attachments, notes=tuple(notes),
+                       units=dict(UNITS) | log.read_units("/signals"), attachments=log.attachments, notes=tuple(notes),
                        sensors=read_sensors(log.path, run),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
@@ -360,7 +360,7 @@ def _read_messages(log: Log) -> dict[str, Messages]:
     """Events, NMT states and checks: the topics with few messages; of each the first MOST_MESSAGES."""
     found: dict[str, Messages] = {}
     for name in ("/events", "/nmt", "/checks"):
-        found[name] = [(time_ns, message) for _, time_ns, message in log.messages(name, most=MOST_MESSAGES)]
+        found[name] = [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
     return found
 
 
@@ -394,12 +394,12 @@ def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float],
     """
     logged = np.maximum.accumulate(time_ns - zero_ns) / 1e9
 
-    def seconds(at_ns: float) -> float:
+    def convert_to_seconds(at_ns: float) -> float:
         at = (at_ns - zero_ns) / 1e9
         beyond = min(at - logged[0], 0.0) + max(at - logged[-1], 0.0)
         return round(float(np.interp(at, logged, t) + beyond), 9)
 
-    return seconds
+    return convert_to_seconds
 
 
 def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:

@@ -30,7 +30,7 @@ from plant.ports import chain_laws
 from plant.quantity import Quantity, list_quantities
 from plant.state import Memory, Ports
 
-__all__ = ["CATALOGUE", "Effect", "Law", "base", "combine_laws", "effect", "load_effects"]
+__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"]
 
 Law = Function
 
@@ -67,7 +67,7 @@ class Effect:
         """True when it acts in the controller: seen in Cor against Com and XJ alone."""
         return self.port == "command"
 
-    def acts(self, values: Mapping[str, float]) -> bool:
+    def is_active(self, values: Mapping[str, float]) -> bool:
         """Whether parameters "group.field" leave it anything to do. (Not for `base` effects: they always do.)"""
         return any(values.get(name, self.off.get(name)) != self.off.get(name) for name in self.fitted)
 
@@ -87,11 +87,11 @@ class Catalogue(dict[str, Effect]):
     def __missing__(self, name: str) -> Effect:
         return self.special[name]
 
-    def enter(self, e: Effect) -> None:
+    def add_effect(self, e: Effect) -> None:
         """Put an effect in its place."""
         (self.special if e.plant or e.searched_in else self)[e.name] = e
 
-    def whole(self) -> dict[str, Effect]:
+    def list_all(self) -> dict[str, Effect]:
         """All of them."""
         return {**self, **self.special}
 
@@ -131,7 +131,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
 
     def register(function: Law) -> Law:
         function = getattr(function, "py_func", function)  # an @njit function is welcome too
-        known = CATALOGUE.whole().get(name := function.__name__)
+        known = CATALOGUE.list_all().get(name := function.__name__)
         if name in GROUPS or (known and known.file != Path(function.__code__.co_filename)):
             raise ValueError(f"{name}: the name is taken")
         if set(group._fields) - set(group._field_defaults):
@@ -139,8 +139,8 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         meaning = {f"{name}.{field}": q for field, q in list_quantities(group).items()}
         off = {f"{name}.{field}": float(x) for field, x in group._field_defaults.items()}
         names = tuple(f"{name}.{field}" for field in free)
-        CATALOGUE.enter(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
-                               names, _name_starts(names, starts), **more))
+        CATALOGUE.add_effect(Effect(name, port, law, symptoms, meaning, off, group, function, memory, disturbance,
+                                    names, _name_starts(names, starts), **more))
         return function
 
     return register
@@ -150,12 +150,12 @@ def _name_starts(names: tuple[str, ...], values: Sequence[Start]) -> tuple[Mappi
     return tuple(dict(zip(names, start if isinstance(start, tuple) else (start,), strict=True)) for start in values)
 
 
-def base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start],
+def register_base(name: str, *fields: str, law: str, symptoms: str, starts: Sequence[Start],
          groups: Mapping[str, type[Any]] = GROUPS, **more: Any) -> None:
     """Register an effect that a plant has already, by the parameters of `groups` that carry it; a fit frees all."""
     meaning = {field: list_quantities(groups[field.partition(".")[0]])[field.partition(".")[2]] for field in fields}
-    CATALOGUE.enter(Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts),
-                           **more))
+    CATALOGUE.add_effect(Effect(name, "", law, symptoms, meaning, {}, fitted=fields,
+                                starts=_name_starts(fields, starts), **more))
 
 
 def load_effects(path: Path, source: bytes | None = None) -> list[str]:

@@ -32,7 +32,7 @@ def choose_file(out: str | None, suffixes: Sequence[str], source: str | Path | N
     Raises:
         InputError: a place that cannot be written, the `source` itself, or a suffix that is not one of `suffixes`.
     """
-    from fdi.output import writable
+    from fdi.output import require_writable
     from plant import InputError
 
     if out is None:
@@ -40,7 +40,7 @@ def choose_file(out: str | None, suffixes: Sequence[str], source: str | Path | N
     path = Path(out)
     if path.suffix not in suffixes:
         raise InputError(option, out, expected or " or ".join(f"FILE{suffix}" for suffix in suffixes))
-    return writable(path, option, source=source)
+    return require_writable(path, option, source=source)
 
 
 def choose_places(args: argparse.Namespace, page_name: str, source: str) -> Places:

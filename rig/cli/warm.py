@@ -10,7 +10,7 @@ from rig.cli.progress_bar import show_progress
 def main() -> None:
     """Compile the kernels of the reference plant with the whole catalogue into the user's cache."""
     with show_progress(is_silent=False) as progress:
-        compile_kernels(Model().having(effect.name for effect in list_searched_effects()), progress)
+        compile_kernels(Model().with_effects(effect.name for effect in list_searched_effects()), progress)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class Device:
         self.heartbeat = HeartbeatProducer(node_id, send)
         self.consumer = HeartbeatConsumer(self._heartbeat_lost, self._heartbeat_back)
         self.sync = SyncConsumer(self.emcy, self._cycle, lambda: self.on_sync_lost())
-        self.sdo = SdoServer(0x580 + node_id, send, self._upload, self.od.size, self._download)
+        self.sdo = SdoServer(0x580 + node_id, send, self._upload, self.od.find_size, self._download)
         self.pdo = Pdos(self.od, self.emcy, send, lambda n: self.on_rpdo(n))
         self._handlers: dict[int, Handler] = {}
 
@@ -101,7 +101,7 @@ class Device:
         self.pdo.configure()
         self.heartbeat.send_boot_up()
         self._enter(NmtState.PRE_OPERATIONAL)
-        self.heartbeat.configure(self.od.number(0x1017, 0), self.t_ns)
+        self.heartbeat.configure(self.od.read_number(0x1017, 0), self.t_ns)
 
     def _restart(self, node: bool) -> None:
         """Reset node (all objects) or reset communication (0x1000..0x1FFF): defaults, then boot-up."""
@@ -135,7 +135,7 @@ class Device:
         if state in _COMMUNICATING:
             self._handlers[0x600 + self.node_id] = self.sdo.receive
         if state is NmtState.OPERATIONAL:
-            self._handlers[self.od.number(0x1005, 0, 0x80) & 0x7FF] = self.sync.receive
+            self._handlers[self.od.read_number(0x1005, 0, 0x80) & 0x7FF] = self.sync.receive
             for pdo in self.pdo.rpdos.values():
                 if pdo.cob_id is not None:
                     self._handlers[pdo.cob_id] = pdo.receive
@@ -149,7 +149,7 @@ class Device:
                 tpdo.on_sync()
 
     def _upload(self, index: int, sub: int) -> bytes:
-        if index == HISTORY and sub > self.od.number(HISTORY, 0):
+        if index == HISTORY and sub > self.od.read_number(HISTORY, 0):
             self.od.find(index, sub)
             raise SdoAbort(Abort.NO_DATA)
         return self.od.encode(index, sub)
@@ -174,29 +174,29 @@ class Device:
         if index == 0x1005:
             check_sync(value)
         elif index == 0x1014:
-            check_switchable(self.od.number(0x1014, 0), value)
+            check_switchable(self.od.read_number(0x1014, 0), value)
         elif index == 0x1016:
-            others = [other for other in self.od.subs(0x1016) if other != sub]
-            check_consumer_entry(value, [self.od.number(0x1016, other) for other in others])
+            others = [other for other in self.od.list_subs(0x1016) if other != sub]
+            check_consumer_entry(value, [self.od.read_number(0x1016, other) for other in others])
 
     def _configure(self, index: int) -> None:
         """Pass a changed communication object to the service that uses it."""
         if index == 0x1005:
             self._gate()
         elif index == 0x1006:
-            self.sync.configure(self.od.number(0x1006, 0))
+            self.sync.configure(self.od.read_number(0x1006, 0))
         elif index == 0x1016:
-            self.consumer.configure([self.od.number(0x1016, sub) for sub in self.od.subs(0x1016)])
+            self.consumer.configure([self.od.read_number(0x1016, sub) for sub in self.od.list_subs(0x1016)])
             self._gate()
         elif index == 0x1017:
-            self.heartbeat.configure(self.od.number(0x1017, 0), self.t_ns)
+            self.heartbeat.configure(self.od.read_number(0x1017, 0), self.t_ns)
         elif 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
             self.pdo.configure()
             self._gate()
 
     def _heartbeat_lost(self, node: int) -> None:
         self.emcy.raise_error(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))
-        self.nmt.communication_error(self.od.number(0x1029, 1))
+        self.nmt.communication_error(self.od.read_number(0x1029, 1))
         self.on_heartbeat_lost(node)
 
     def _heartbeat_back(self, node: int) -> None:

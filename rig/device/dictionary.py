@@ -58,11 +58,11 @@ class Dictionary:
     def __contains__(self, key: tuple[int, int]) -> bool:
         return key in self.entries
 
-    def subs(self, index: int) -> list[int]:
+    def list_subs(self, index: int) -> list[int]:
         """The sub-indices of an object above 0, in order; empty if there is no such object."""
         return sorted(sub for i, sub in self.entries if i == index and sub)
 
-    def number(self, index: int, sub: int, absent: int = 0) -> int:
+    def read_number(self, index: int, sub: int, absent: int = 0) -> int:
         """An integer object's value, or `absent` where the device has no such object."""
         return cast(int, self.values.get((index, sub), absent))
 
@@ -81,7 +81,7 @@ class Dictionary:
         value = self.values[index, sub]
         return value if isinstance(value, bytes) else struct.pack("<" + entry.code, value)
 
-    def size(self, index: int, sub: int) -> int:
+    def find_size(self, index: int, sub: int) -> int:
         """Bytes an SDO download must bring, 0 for any number. Raises SdoAbort: absent, read-only."""
         entry = self.find(index, sub)
         if not entry.writable:
@@ -90,7 +90,7 @@ class Dictionary:
 
     def decode(self, index: int, sub: int, data: bytes) -> Value:
         """The value an SDO download would store. Raises SdoAbort: absent, read-only, length, range."""
-        size, entry = self.size(index, sub), self.find(index, sub)
+        size, entry = self.find_size(index, sub), self.find(index, sub)
         if not entry.code:
             return data
         excess = len(data) - size

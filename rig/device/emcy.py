@@ -77,23 +77,23 @@ class Emcy:
 
     def erase_history(self) -> None:
         """Master wrote 0 to 0x1003 sub 0."""
-        for sub in (0, *self._od.subs(HISTORY)):
+        for sub in (0, *self._od.list_subs(HISTORY)):
             self._od.values[HISTORY, sub] = 0
 
     def _record(self, code: int, info: bytes) -> None:
-        subs = self._od.subs(HISTORY)
+        subs = self._od.list_subs(HISTORY)
         values = self._od.values
         for sub in reversed(subs[1:]):  # newest first: sub 1
             values[HISTORY, sub] = values[HISTORY, sub - 1]
         if subs:
             values[HISTORY, 1] = code | int.from_bytes(info[:2], "little") << 16
-            values[HISTORY, 0] = min(self._od.number(HISTORY, 0) + 1, len(subs))
+            values[HISTORY, 0] = min(self._od.read_number(HISTORY, 0) + 1, len(subs))
 
     def _transmit(self, code: int, info: bytes) -> None:
         register = 0
         for bits in self._active.values():
             register |= bits
         self._od.values[REGISTER, 0] = register
-        cob_id = self._od.number(COB_ID, 0, INVALID)
+        cob_id = self._od.read_number(COB_ID, 0, INVALID)
         if self._permitted() and not cob_id & INVALID:
             self._send(cob_id & 0x7FF, _FRAME.pack(code, register, info[:5]))

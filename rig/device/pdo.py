@@ -27,14 +27,14 @@ class Mapping:
     """
 
     def __init__(self, od: Dictionary, index: int) -> None:
-        writable = [sub for sub in (0, *od.subs(index)) if (index, sub) in od and od.entries[index, sub].writable]
+        writable = [sub for sub in (0, *od.list_subs(index)) if (index, sub) in od and od.entries[index, sub].writable]
         if writable:
             where = f"{index:04X}sub{writable[0]:X}.AccessType"
             raise InputError(od.path, where, "const: the mapping cannot be changed")
         self.keys: list[tuple[int, int]] = []
         codes = "<"
-        for sub in range(1, od.number(index, 0) + 1):
-            word = od.number(index, sub)
+        for sub in range(1, od.read_number(index, 0) + 1):
+            word = od.read_number(index, sub)
             key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
             entry = od.entries.get(key)
             if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
@@ -63,7 +63,7 @@ class Rpdo:
 
     def configure(self) -> None:
         self.cob_id = _cob_id(self._od, RPDO, self.n)
-        self.synchronous = self._od.number(RPDO + self.n - 1, 2) <= _LAST_SYNCHRONOUS
+        self.synchronous = self._od.read_number(RPDO + self.n - 1, 2) <= _LAST_SYNCHRONOUS
         if self.cob_id is None:
             self.forget()
 
@@ -114,7 +114,7 @@ class Tpdo:
 
     def configure(self) -> None:
         self.cob_id = _cob_id(self._od, TPDO, self.n)
-        self._type = self._od.number(TPDO + self.n - 1, 2)
+        self._type = self._od.read_number(TPDO + self.n - 1, 2)
         self.synchronous = self._type <= _LAST_SYNCHRONOUS
         self.forget()
 
@@ -175,8 +175,8 @@ class Pdos:
         if not isinstance(value, int) or not (RPDO <= index < RPDO + 0x200 or TPDO <= index < TPDO + 0x200):
             return
         if sub == 1:
-            check_switchable(self._od.number(index, 1), value)
-            if not value & INVALID and value & 0x7FF == self._od.number(0x1005, 0, 0x80) & 0x7FF:
+            check_switchable(self._od.read_number(index, 1), value)
+            if not value & INVALID and value & 0x7FF == self._od.read_number(0x1005, 0, 0x80) & 0x7FF:
                 raise SdoAbort(Abort.VALUE)  # the device consumes SYNC under that identifier
         if sub == 2 and _LAST_SYNCHRONOUS < value < _EVENT_DRIVEN[0]:  # reserved, or by remote frame
             raise SdoAbort(Abort.VALUE)
@@ -188,5 +188,5 @@ def _numbers(od: Dictionary, base: int) -> list[int]:
 
 def _cob_id(od: Dictionary, base: int, n: int) -> int | None:
     """COB-ID in use, None while the PDO is switched off (bit 31)."""
-    word = od.number(base + n - 1, 1)
+    word = od.read_number(base + n - 1, 1)
     return None if word & INVALID else word & 0x7FF

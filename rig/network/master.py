@@ -113,10 +113,10 @@ class Master:
         remote = _Node(node, str(EDS[node]))
         self.network.add_node(remote)
         remote.emcy.add_callback(lambda error: self.on_emcy(node, error))
-        remote.nmt.add_heartbeat_callback(lambda state: self._heard(node, state))
+        remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(node, state))
         return remote
 
-    def _heard(self, node: int, state: int) -> None:
+    def _take_heartbeat(self, node: int, state: int) -> None:
         if state == NmtState.INITIALISING:
             self._booted.add(node)
             self._nodes[node].emcy.reset()  # its errors ended with the reset, and no EMCY says so
@@ -355,7 +355,7 @@ class Master:
         except (SdoAbortedError, SdoCommunicationError, KeyError):
             return None
 
-    def errors(self) -> list[int]:
+    def list_errors(self) -> list[int]:
         """Nodes whose last EMCY has an error register."""
         return [number for number, node in self._nodes.items() if node.emcy.log and node.emcy.log[-1].register]
 

@@ -91,7 +91,7 @@ class Emulator:
     def receive(self, frame: Frame) -> None:
         """A frame of another node arrived: a fault may delay or drop it."""
         if frame.cob_id == codec.DRIVE:
-            action = self._faults.frame("drive", self._cycle - 1)
+            action = self._faults.find_action("drive", self._cycle - 1)
             if isinstance(action, Delay):
                 heapq.heappush(self._late, (frame.t_ns + action.ns, len(self._late), frame))
                 return
@@ -137,7 +137,8 @@ class Emulator:
 
     def _is_second_sync(self) -> bool:
         """Whether this SYNC is the duplicate of the last one, by a fault."""
-        is_second = (self._synced == self._cycle - 1 and isinstance(self._faults.frame("sync", self._synced), Double))
+        is_second = (self._synced == self._cycle - 1
+                     and isinstance(self._faults.find_action("sync", self._synced), Double))
         self._synced = -1 if is_second else self._cycle
         return is_second
 
@@ -160,7 +161,7 @@ class Emulator:
         """Send a frame unless a fault drops or delays it."""
         name = _NAMES.get(cob_id)
         if name is not None:
-            action = self._faults.frame(name, self._cycle)
+            action = self._faults.find_action(name, self._cycle)
             if isinstance(action, Delay):
                 heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
                 return
@@ -191,9 +192,9 @@ class Emulator:
         self._change_parameters(k)
         xj, p12, xs = self._plant.sample()
         if not isfinite(xj + p12 + xs):
-            self._diverged()
+            self._stop_after_divergence()
             return
-        faulty = self._faults.signal
+        faulty = self._faults.change_signal
         od[0x2200, 0] = codec.raw_position(faulty("xj", xj, k))
         od[0x2201, 0] = codec.raw_pressure(faulty("p12", p12, k))
         od[0x2202, 0] = codec.raw_spool(faulty("xs", xs, k))
@@ -233,7 +234,7 @@ class Emulator:
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
         return True
 
-    def _diverged(self) -> None:
+    def _stop_after_divergence(self) -> None:
         """The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value."""
         self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
         self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more

@@ -691,7 +691,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     `advance`, `read`: addresses of the compiled `plant.solve.advance_flat_state` and, for a model with effects on its
     readings, `read_flat_sensors`.
     """
-    names = {name: i for i, name in enumerate(model.names())}
+    names = {name: i for i, name in enumerate(model.list_names())}
     parameters = [((names[change.name], change.first, change.last, number), (change.base, change.value, change.ramp))
                   for number, changes in enumerate(schedule.list_parameter_changes()) for change in changes]
     signals: list[tuple[int, ...]] = []
@@ -708,8 +708,8 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
             stuck.append((getattr(change, "value", None) or 0.0, 0.0))
     off = schedule.list_bus_off_cycles("plant")
     hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
-    record = model.record()
-    state = list_state_values(model.state())
+    record = model.build_record()
+    state = list_state_values(model.build_state())
     words, places = _join_tables(_TABLES_AT, np.int64, [row for row, _ in parameters], signals, *hits)
     reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, [values for _, values in parameters], stuck, added,
                                       load, state, record.view(np.float64))

@@ -205,20 +205,20 @@ class EmulatorService:
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the loop's own error."""
         shared, od, pdo = self._memory.words, self.device.od, self.device.pdo
-        shared[ec.PERIOD] = od.number(0x1006, 0)
+        shared[ec.PERIOD] = od.read_number(0x1006, 0)
         self._bus.use_kernel_times(bool(shared[ec.PERIOD]))
-        emcy = od.number(0x1014, 0, 1 << 31)
+        emcy = od.read_number(0x1014, 0, 1 << 31)
         shared[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
         others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
         communication = any(code != EmcyCode.SOFTWARE for code in others)
         shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
         sent = (0x1800, ec.FEEDBACK_TYPE, ec.FEEDBACK_COUNT), (0x1801, ec.VALVE_TYPE, ec.VALVE_COUNT)
         for index, kind, count in sent:
-            if shared[kind] != od.number(index, 2):
-                shared[kind] = shared[count] = od.number(index, 2)
-        shared[ec.DRIVE_TYPE] = od.number(0x1400, 2)
+            if shared[kind] != od.read_number(index, 2):
+                shared[kind] = shared[count] = od.read_number(index, 2)
+        shared[ec.DRIVE_TYPE] = od.read_number(0x1400, 2)
         heard = shared[ec.SYNC_ID], shared[ec.DRIVE_ID]
-        shared[ec.SYNC_ID] = od.number(0x1005, 0, 0x80) & 0x7FF
+        shared[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
         shared[ec.DRIVE_ID], shared[ec.FEEDBACK_ID], shared[ec.VALVE_ID] = (
             -1 if each.cob_id is None else each.cob_id for each in (pdo.rpdos[1], pdo.tpdos[1], pdo.tpdos[2]))
         if heard != (shared[ec.SYNC_ID], shared[ec.DRIVE_ID]):
@@ -295,7 +295,7 @@ def compile_plant(model: Model) -> tuple[int, int]:
         InputError: an effect's law that cannot be compiled.
     """
     with report_law_errors(model):
-        flat, record = np.array(list_state_values(model.state())), model.record()
+        flat, record = np.array(list_state_values(model.build_state())), model.build_record()
         code = load_stored_advance(model.effects, model.plant)
         code.warm(flat, record)
         read = 0

@@ -28,7 +28,7 @@ class Scenario(NamedTuple):
     seed: int = 0
 
     @classmethod
-    def of(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
+    def build(cls, model: Model, plan: Plan, load: Array, seed: int) -> Scenario:
         """With `load` in N over main, shape (cycles of main,); set-up and clean-up are without load.
 
         Raises:
@@ -37,7 +37,7 @@ class Scenario(NamedTuple):
         require_servovalve(model)
         require_sensible(plan, model)
         counts = [0] * plan.start + np.rint(load / FORCE_RESOLUTION).astype(int).tolist()
-        return cls(model.having(_find_changed_groups(plan)), plan, tuple(counts), seed)
+        return cls(model.with_effects(_find_changed_groups(plan)), plan, tuple(counts), seed)
 
     def load(self) -> list[float]:
         """Load on the ram in N, one a cycle; none after the last."""
@@ -51,7 +51,7 @@ class Scenario(NamedTuple):
         """
         changes = np.diff(np.array(self.force, np.int64), n=2, prepend=[0, 0]).tolist()
         data = zlib.compress(json.dumps({
-            "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.differences()},
+            "model": {"name": self.model.name, "effects": self.model.effects, "values": self.model.list_changes()},
             "plan": self.plan.to_json(), "load": changes, "seed": self.seed}).encode(), 9)
         if len(data) > LARGEST_DOWNLOAD:
             raise InputError("load", "", f"a load (and faults) of at most {LARGEST_DOWNLOAD >> 10} KiB compressed, not "
@@ -68,7 +68,7 @@ class Scenario(NamedTuple):
         try:
             table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, LARGEST_JSON))
             named = table["model"]
-            model = Model(str(named["name"])).having(named["effects"]).replace(named["values"], WHERE)
+            model = Model(str(named["name"])).with_effects(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
             plan, seed = Plan.from_json(table["plan"]), int(table["seed"])
             if min(seed, plan.seed) < 0 or not 0 <= plan.start <= plan.stop <= LONGEST_PLAN:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from fdi.output import writable
+from fdi.output import require_writable
 from fdi.trace.importing.import_map import ImportMap
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
@@ -39,7 +39,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     """
     if out.name.endswith((".csv", ".csv.gz")):
         trace = Trace.read(source, all=everything)
-        trace.write_csv(writable(out, "--out", source=source))
+        trace.write_csv(require_writable(out, "--out", source=source))
         return len(trace)
     if out.suffix not in RAW_SUFFIXES:
         raise InputError(out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
@@ -52,7 +52,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     if not raw:
         raise InputError(path, "/can", "at least one raw frame")
     try:
-        with can.Logger(writable(out, "--out")) as writer:
+        with can.Logger(require_writable(out, "--out")) as writer:
             for frame in raw:
                 writer(can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.cob_id, data=frame.data,
                                    is_extended_id=False, channel="can0" if out.suffix == ".log" else 0))
@@ -63,7 +63,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
 
 def read_raw_frames(path: Path) -> Iterator[Frame]:
     """The raw frames of a log."""
-    for _, t_ns, message in open_log(path).messages("/can"):
+    for _, t_ns, message in open_log(path).read_messages("/can"):
         yield Frame(t_ns, message.cob_id, message.data)
 
 
@@ -243,7 +243,7 @@ def _load_decoder(dbc: Path) -> dict[int, Any]:
 def _require_mcap(out: Path) -> Path:
     if out.suffix != ".mcap":
         raise InputError(out, "--out", "a name that ends in .mcap")
-    return writable(out, "--out")
+    return require_writable(out, "--out")
 
 
 def _wait_for_writer(recorder: Recorder, item: int) -> None:

@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
-from fdi.output import writable
+from fdi.output import require_writable
 from fdi.trace.chunk import BoundedFile, unpack_chunk
 from fdi.trace.mcap_log import read_declarations, scan_messages
 from plant.errors import InputError
@@ -61,7 +61,7 @@ def recover_log(path: Path, out: Path) -> Salvage:
             reason = reading.reason or "it is empty"
             raise InputError(path, "", f"an MCAP log with at least one intact record ({reason})")
         try:
-            return _write_salvage(chain([first], records), reading, writable(out, "--out", source=path))
+            return _write_salvage(chain([first], records), reading, require_writable(out, "--out", source=path))
         except OSError as error:
             raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 

@@ -426,7 +426,7 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
     for fault in plan.faults:
         if isinstance(fault, Parameter | Offset | Stuck):
             continue
-        first, last = plan.cycles(fault)
+        first, last = plan.find_cycles(fault)
         frame = getattr(fault, "frame", "")
         if not frame:
             anything[first:last + heartbeat_limit] = True
@@ -436,7 +436,7 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
                 plant[first:last + 1] = True
             continue
         for k in range(first, min(last, cycles)):
-            action = schedule.frame(frame, k)
+            action = schedule.find_action(frame, k)
             if action is not None:
                 delay = -(-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else 0
                 span = slice(k, k + delay + watchdog_limit)

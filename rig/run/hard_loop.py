@@ -204,7 +204,7 @@ class HardLoop:
 
     def _push(self, step: CycleInput) -> None:
         k = self.queued
-        command, sync = self._faults.frame("command", k), self._faults.frame("sync", k)
+        command, sync = self._faults.find_action("command", k), self._faults.find_action("sync", k)
         if not self._realtime and isinstance(sync, Delay):
             sync = None  # a cycle has no fixed length
         position = int(self._words[hc.TAIL])
@@ -221,9 +221,10 @@ class HardLoop:
         Zeros where none is doubled. Lockstep waits for all of them, for feedback of the cycle before would count as
         that of the next one.
         """
-        is_second = isinstance(self._faults.frame("sync", k), Double)
+        is_second = isinstance(self._faults.find_action("sync", k), Double)
         cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
-        actions = {name: [self._faults.frame(name, each) for each in cycles] for name in ("feedback", "valve_state")}
+        actions = {name: [self._faults.find_action(name, each) for each in cycles]
+                   for name in ("feedback", "valve_state")}
         if self._realtime or not (is_second or any(isinstance(each[0], Double) for each in actions.values())):
             return 0, 0
         sent = {name: [0 if isinstance(action, Drop | Delay) else 2 if isinstance(action, Double) else 1
@@ -235,8 +236,8 @@ class HardLoop:
     def _await_short_drive(self) -> None:
         """Lockstep: a fault cuts a drive frame; the plant's services report it, beside its cycle."""
         k = self._k
-        is_first = isinstance(self._faults.frame("drive", k), Cut) and not isinstance(
-            self._faults.frame("drive", k - 1), Cut)
+        is_first = isinstance(self._faults.find_action("drive", k), Cut) and not isinstance(
+            self._faults.find_action("drive", k - 1), Cut)
         if is_first:
             self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
 

@@ -52,16 +52,16 @@ class Job:
     def scenario(self) -> Scenario:
         """The plant's scenario; computed once, because a long test has many cycles."""
         sequence = self.sequence
-        return Scenario.of(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
+        return Scenario.build(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
 
-    def attachments(self) -> dict[str, tuple[str, bytes]]:
+    def build_attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""
         found = {"model.toml": ("application/toml", self.model.to_toml().encode())}
         found |= {_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()}
         found |= {_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects}
         return found | {path.name: ("text/plain", path.read_bytes()) for path in (dbc.DBC, *dbc.EDS.values())}
 
-    def settings(self) -> dict[str, object]:
+    def list_settings(self) -> dict[str, object]:
         """The settings of the run, for the log's metadata."""
         return {"seed": self.seed, "bus": self.bus, "pace": self.pace, "controller": self.controller,
                 "plant": self.plant, "model": self.model.name, "sequence": self.sequence.title,

@@ -186,7 +186,7 @@ class CycleLoop:
 
     def _send_sync(self) -> int | None:
         """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
-        action = self._faults.frame("sync", self.k)
+        action = self._faults.find_action("sync", self.k)
         delay = action.ns if isinstance(action, Delay) else 0
         if delay and self._realtime:
             self._wire.run_until(self._t_ns + delay)
@@ -203,7 +203,7 @@ class CycleLoop:
             self._wire.wait_for_answers(self._t_ns + delay, lambda: self._seen == _ALL)
 
     def _command(self, data: bytes) -> None:
-        action = self._faults.frame("command", self.k)
+        action = self._faults.find_action("command", self.k)
         if isinstance(action, Delay):
             heapq.heappush(self._held, (self._t_ns + action.ns, self.k, data))
             return
@@ -220,7 +220,7 @@ class CycleLoop:
             row = self._open[1]
             row.xj, row.p12 = codec.unpack_feedback(frame.data)
             self._open[2].feedback_response = self._since_sync(frame)
-            self._answered(_XJ, frame)
+            self._note_answer(_XJ, frame)
 
     def _valve(self, frame: Frame) -> None:
         if self._open is not None and len(frame.data) == 8:
@@ -230,7 +230,7 @@ class CycleLoop:
                 if not self._seen & _XS:
                     timing.valve_response = self._since_sync(frame)
                 row.xs, row.flags = state.spool, state.flags
-                self._answered(_XS, frame)
+                self._note_answer(_XS, frame)
 
     def _drive(self, frame: Frame) -> None:
         if self._open is not None and len(frame.data) == 8:  # of several the last: the plant latches that one
@@ -240,9 +240,9 @@ class CycleLoop:
                 row.cor, row.status = drive.current, drive.status
                 if not self._seen & _COR:
                     timing.response = self._since_sync(frame)
-                self._answered(_COR, frame)
+                self._note_answer(_COR, frame)
 
-    def _answered(self, what: int, frame: Frame) -> None:
+    def _note_answer(self, what: int, frame: Frame) -> None:
         complete, self._seen = self._seen == _ALL, self._seen | what
         if self._seen == _ALL and not complete and self._open is not None:
             self._open[2].work = self._since_sync(frame)

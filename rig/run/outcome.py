@@ -162,7 +162,7 @@ class Outcome:
                 **self._attribution_to_json(),
                 "nodes": {str(node): self._node_to_json(node) for node in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
-                "run": self.job.settings(), "fdi": self.fdi}
+                "run": self.job.list_settings(), "fdi": self.fdi}
 
     def _attribution_to_json(self) -> dict[str, Any]:
         found = self.attribution

@@ -108,7 +108,7 @@ def require_firmware_bus(bus: str) -> None:
 def find_firmware_parameters(model: Model) -> dict[str, float]:
     """The parameters of the effects at work in a model's firmware."""
     acting = [CATALOGUE[name] for name in model.effects if CATALOGUE[name].firmware]
-    return {name: model[name] for effect in acting if effect.acts(model.values) for name in effect.parameters}
+    return {name: model[name] for effect in acting if effect.is_active(model.values) for name in effect.parameters}
 
 
 def _make_command(job: Job, node: int) -> list[str]:

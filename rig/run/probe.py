@@ -68,7 +68,7 @@ def make_probe_scenario(scenario: Scenario) -> Scenario:
 def has_firmware_effects(model: Model) -> bool:
     """Whether effects act inside the reference firmware, which then does not follow its gains."""
     acting = (CATALOGUE[name] for name in model.effects)
-    return any(effect.firmware and effect.acts(model.values) for effect in acting)
+    return any(effect.firmware and effect.is_active(model.values) for effect in acting)
 
 
 def has_no_answers(probe: History) -> bool:

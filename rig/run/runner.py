@@ -163,7 +163,7 @@ def open_recorder(job: Job, folder: Path) -> Iterator[Recorder]:
     """Replace the results of an earlier run by the log of this one; it is closed whatever happens."""
     for name in ("verdict.json", "report.html"):  # of the run before
         (folder / name).unlink(missing_ok=True)
-    recorder = Recorder(folder / "trace.mcap", job.attachments(), collect_provenance(**job.settings()))
+    recorder = Recorder(folder / "trace.mcap", job.build_attachments(), collect_provenance(**job.list_settings()))
     try:
         yield recorder
     finally:

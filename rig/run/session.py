@@ -406,13 +406,13 @@ class Session:
             for failure in self._master.configure_again():
                 self.log_event("WARN", "restore", failure)
             self._master.start()
-        return not self.safe or not self._master.errors()
+        return not self.safe or not self._master.list_errors()
 
     def _try_again(self) -> None:
         """Some cycles into clean-up: a node that had to be started again may have no errors any more by now."""
         assert self.loop is not None
         self.loop.wait_until_played(lambda: False)
-        self._powered = self._may_power and not self.gone and not self._master.errors()
+        self._powered = self._may_power and not self.gone and not self._master.list_errors()
         self._reset_at = _SETTLING
 
     def _choose_control_word(self, phase: int, i: int) -> int:

@@ -83,7 +83,7 @@ class Check(ABC):
         """Measure the number and compare it with the limits."""
         value, t0, t1, detail = nan, nan, nan, ""
         try:
-            span = run.span(self.window, self.skip)
+            span = run.find_rows(self.window, self.skip)
             t0, t1 = span.start / RATE, span.stop / RATE
             missing = run.count_missing(self.about, span)
             measured = self.measure(run, span) / find_scale(self.shown_unit, self.si_unit)

@@ -50,7 +50,7 @@ class Overshoot(_OfPosition):
     kind, si = "overshoot", "%"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_overshoot(*run.step(span))
+        return measures.measure_overshoot(*run.read_step(span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class SettlingTime(_OfPosition):
         require_check(0 < self.band <= 100, "band", f"above 0 and at most 100 % of the step, not {self.band:g}")
 
     def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_settling_time(*run.step(span), self.band)
+        return measures.measure_settling_time(*run.read_step(span), self.band)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class RiseTime(_OfPosition):
     kind, si = "rise_time", "s"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_rise_time(*run.step(span))
+        return measures.measure_rise_time(*run.read_step(span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ class SteadyError(_OfPosition):
     kind = "steady_error"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return abs(float(run.signal("error", span).mean()))
+        return abs(float(run.read_signal("error", span).mean()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class RampError(_OfPosition):
     kind = "ramp_error"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_ramp_error(run.signal("error", span), run.signal("com", span))
+        return measures.measure_ramp_error(run.read_signal("error", span), run.read_signal("com", span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,7 @@ class BreakAway(_OfPosition):
     kind = "break_away"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_break_away(run.signal("error", span))
+        return measures.measure_break_away(run.read_signal("error", span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class MaxError(_OfPosition):
     kind = "max_error"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return float(np.abs(measures.filter_median(run.signal("error", span))).max())
+        return float(np.abs(measures.filter_median(run.read_signal("error", span))).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ class RmsError(_OfPosition):
     kind = "rms_error"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return float(np.sqrt(np.mean(run.signal("error", span) ** 2)))
+        return float(np.sqrt(np.mean(run.read_signal("error", span) ** 2)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ class NeverExceeds(_OfSignal):
     kind = "never_exceeds"
 
     def measure(self, run: RunData, span: slice) -> float:
-        return float(np.abs(run.signal(self.signal, span)).max())
+        return float(np.abs(run.read_signal(self.signal, span)).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +150,7 @@ class AmplitudeRatio(_OfPosition):
         require_frequency("frequency", self.frequency)
 
     def measure(self, run: RunData, span: slice) -> float:
-        return abs(measures.measure_response(run.signal("xj", span), run.signal("com", span), self.frequency))
+        return abs(measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), self.frequency))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +160,7 @@ class PhaseLag(AmplitudeRatio):
     kind, si = "phase_lag", "deg"
 
     def measure(self, run: RunData, span: slice) -> float:
-        response = measures.measure_response(run.signal("xj", span), run.signal("com", span), self.frequency)
+        response = measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), self.frequency)
         return -degrees(phase(response))
 
 
@@ -192,8 +192,8 @@ class ResponseWithin(Check):
     def measure(self, run: RunData, span: slice) -> float:
         after = run.find_start(self.after)
         if self.signal:
-            rest = run.span((after, span.stop / RATE))
-            return measures.find_crossing(run.signal(self.signal, rest), self.above, self.below)
+            rest = run.find_rows((after, span.stop / RATE))
+            return measures.find_crossing(run.read_signal(self.signal, rest), self.above, self.below)
         events = run.find_events(self.event, after)
         if not events:
             raise NotMeasurable(f"no event {self.event!r} after {after:g} s")
@@ -220,7 +220,7 @@ class ShutOff(Check):
 
     def measure(self, run: RunData, span: slice) -> float:
         after = run.find_start(self.after)
-        drives = run.drives.between(after, span.stop / RATE)
+        drives = run.drives.select_between(after, span.stop / RATE)
         is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
         if self.status is not None:
             is_off &= drives.status & 0xF == self.status
@@ -242,7 +242,7 @@ class Recovers(Check):
 
     def measure(self, run: RunData, span: slice) -> float:
         start = len(run.trace.t) / RATE
-        drives = run.drives.between(start, np.inf)
+        drives = run.drives.select_between(start, np.inf)
         idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
         first = int(idle[-1]) + 1 if len(idle) else 0
         if first >= len(drives.t):

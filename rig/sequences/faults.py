@@ -67,7 +67,7 @@ class _Ramped(Fault):
         super().__post_init__()
         _require(self.ramp >= 0, "ramp", f"0 s or more, not {self.ramp:g}")
 
-    def growth(self, t: float) -> float:
+    def compute_growth(self, t: float) -> float:
         """Share of the full size at `t` s after the start, 0..1."""
         return 1.0 if t >= self.ramp else t / self.ramp
 
@@ -88,7 +88,7 @@ class Parameter(_Ramped):
                  f"a parameter of the plant, not {self.parameter!r}: the controller is the thing under test, "
                  "no fault reaches into it")
 
-    def target(self, quantity: Quantity) -> float:
+    def find_target(self, quantity: Quantity) -> float:
         """The number that `value` stands for; raises InputError at the key that cannot be for such a parameter."""
         value = parse_value("fault", "value", quantity, self.value)
         _require(not (quantity.words and self.ramp), "ramp",
@@ -331,7 +331,7 @@ class Plan:
     stop: int
     seed: int = 0
 
-    def cycles(self, fault: Fault) -> tuple[int, int]:
+    def find_cycles(self, fault: Fault) -> tuple[int, int]:
         """First cycle in which a fault acts and the one in which it no longer does."""
         last = self.stop if fault.end is None else min(self.stop, self.start + round(fault.end * RATE))
         return min(last, self.start + round(fault.start * RATE)), last
@@ -377,7 +377,7 @@ class Schedule:
         self._resets: list[tuple[int, str]] = []
         self.edges: tuple[Edge, ...] = ()
         for index, fault in enumerate(plan.faults):
-            first, last = plan.cycles(fault)
+            first, last = plan.find_cycles(fault)
             last = self._add(fault, first, last, np.random.default_rng((plan.seed, index)))
             self.edges += (Edge(first, fault.label, True), Edge(last, fault.label, False))
 
@@ -388,10 +388,10 @@ class Schedule:
                 if fault.parameter not in self._base:
                     raise InputError("faults", fault.parameter, tables.list_choices(fault.parameter, self._base))
                 self._parameters.setdefault(fault.parameter, []).append(
-                    (first, last, fault.target(find_quantity(fault.parameter, "faults")), fault))
+                    (first, last, fault.find_target(find_quantity(fault.parameter, "faults")), fault))
             case Offset():  # or noise
                 shape = rng.standard_normal(last - first) if isinstance(fault, Noise) else np.ones(last - first)
-                values = [fault.value * fault.growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
+                values = [fault.value * fault.compute_growth(k / RATE) * float(unit) for k, unit in enumerate(shape)]
                 self._signals.setdefault(fault.signal, []).append(AddedSignal(first, values))
             case Stuck():
                 self._signals.setdefault(fault.signal, []).append(StuckSignal(range(first, last), fault.value))
@@ -428,14 +428,14 @@ class Schedule:
         base = self._base[name]
         for first, last, value, fault in self._parameters[name]:
             if first <= cycle < last:
-                return base + (value - base) * fault.growth((cycle - first) / RATE)
+                return base + (value - base) * fault.compute_growth((cycle - first) / RATE)
         return base
 
-    def parameters(self, cycle: int) -> dict[str, float]:
+    def list_parameters(self, cycle: int) -> dict[str, float]:
         """All parameters of the model, with what faults have made of them in this cycle."""
         return {**self._base, **{name: self._parameter(name, cycle) for name in self._parameters}}
 
-    def signal(self, name: str, value: float, cycle: int) -> float:
+    def change_signal(self, name: str, value: float, cycle: int) -> float:
         """What the sensor `name` (xj, p12, xs; SI) says in place of `value`; faults act in the order of the plan."""
         for change in self._signals.get(name, ()):
             value = change(cycle, value)
@@ -444,7 +444,7 @@ class Schedule:
     def _put(self, name: str, first: int, actions: list[Action | None] | list[Delay] | list[Drop]) -> None:
         self._frames.setdefault(name, []).append((first, list(actions)))
 
-    def frame(self, name: str, cycle: int) -> Action | None:
+    def find_action(self, name: str, cycle: int) -> Action | None:
         """What happens to the frame `name` of this cycle; None: it is sent normally. Of several faults the first acts.
 
         The name is that of a PDO or `sync`.
@@ -455,7 +455,9 @@ class Schedule:
         return None
 
     def frame_actions(self, name: str, cycles: int) -> NDArray[np.int64]:
-        """`frame` of the first `cycles` as a table for compiled loops, (cycles, 2): code (ACTION_CODES) and argument.
+        """`find_action` of the first `cycles` as a table for compiled loops, (cycles, 2).
+
+        The columns are code (ACTION_CODES) and argument.
 
         The argument of a delay is in ns, that of a corrupted frame the mask as a signed 64-bit word, that of a short
         one its length in bytes; else 0.
@@ -493,7 +495,7 @@ class Schedule:
     def count_lost_syncs(self, cycle: int) -> int:
         """How many SYNCs in a row are lost from this cycle on."""
         count = 0
-        while isinstance(self.frame("sync", cycle + count), Drop):
+        while isinstance(self.find_action("sync", cycle + count), Drop):
             count += 1
         return count
 

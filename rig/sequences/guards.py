@@ -22,13 +22,13 @@ class Guard:
     cycles: int = 3  # one noisy sample is no excursion
 
     def __post_init__(self) -> None:
-        low, high = self.limits()
+        low, high = self.compute_limits()
         if low >= high or (low, high) == (-inf, inf):
             raise InputError("guard", "", "a low, a high, or both with low below high")
         if self.cycles < 1:
             raise InputError("guard", "cycles", f"1 or more cycles, not {self.cycles}")
 
-    def limits(self) -> tuple[float, float]:
+    def compute_limits(self) -> tuple[float, float]:
         """Low and high in SI; infinite where there is none."""
         si = UNIT_OF_SIGNAL[self.signal]
         size = find_scale(self.unit or si, si)
@@ -39,7 +39,7 @@ class GuardWatch:
     """Monitors the guards of a run, cycle by cycle."""
 
     def __init__(self, guards: Iterable[Guard]) -> None:
-        self._watched = [(guard, *guard.limits()) for guard in guards]
+        self._watched = [(guard, *guard.compute_limits()) for guard in guards]
         self._outside = [0] * len(self._watched)
 
     def __bool__(self) -> bool:

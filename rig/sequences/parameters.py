@@ -41,7 +41,7 @@ def check_faults(plan: Plan, place: Place, known: Known) -> bool:
             whole &= quantity is not None
             if quantity is not None:
                 try:
-                    fault.target(quantity)
+                    fault.find_target(quantity)
                 except InputError as error:
                     raise place.at(i, error.field).refuse(error.expected) from error
     return whole
@@ -73,18 +73,18 @@ def require_sensible(plan: Plan, model: Model) -> None:
     changing = [(i, fault) for i, fault in enumerate(plan.faults) if isinstance(fault, Parameter)]
     if not changing:
         return
-    schedule = Schedule(plan, model.having(fault.parameter.partition(".")[0] for _, fault in changing).values)
+    schedule = Schedule(plan, model.with_effects(fault.parameter.partition(".")[0] for _, fault in changing).values)
     for i, fault in changing:
         for cycle in _list_extreme_cycles(plan, fault):
             try:
-                check_combinations("faults", schedule.parameters(cycle))
+                check_combinations("faults", schedule.list_parameters(cycle))
             except InputError as error:
                 raise Contradiction(i, fault.label, (cycle - plan.start) / RATE, error) from error
 
 
 def _list_extreme_cycles(plan: Plan, fault: Parameter) -> tuple[int, ...]:
     """The cycles in which a ramped parameter may be extreme: first, end of the ramp, last, and the one after."""
-    first, last = plan.cycles(fault)
+    first, last = plan.find_cycles(fault)
     end = max(first, last - 1)
     return first, min(first + ceil(min(fault.ramp, LATEST_START) * RATE), end), end, last
 

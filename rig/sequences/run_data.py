@@ -45,7 +45,7 @@ class DriveFrames(NamedTuple):
     current: Array  # A
     status: NDArray[np.int64]  # status word
 
-    def between(self, t0: float, t1: float) -> DriveFrames:
+    def select_between(self, t0: float, t1: float) -> DriveFrames:
         """Those with t0 <= t < t1."""
         chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
         return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen])
@@ -75,7 +75,7 @@ class RunData:
             raise NotMeasurable(f"there was no fault {after!r}")
         return t
 
-    def span(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
+    def find_rows(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
         """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""
         rows = len(self.trace.t)
         if isinstance(window, tuple):
@@ -93,12 +93,12 @@ class RunData:
             raise NotMeasurable("the window is empty")
         return slice(first, last)
 
-    def signal(self, name: str, span: slice) -> Array:
+    def read_signal(self, name: str, span: slice) -> Array:
         """A signal's samples in a span, few missing ones bridged; NotMeasurable without it."""
         if name == "error":
-            return self.signal("com", span) - self.signal("xj", span)
+            return self.read_signal("com", span) - self.read_signal("xj", span)
         if name == "speed":
-            return measures.compute_speed(self.signal("xj", span))
+            return measures.compute_speed(self.read_signal("xj", span))
         column = getattr(self.trace, name, None)
         if column is None:
             raise NotMeasurable(f"{name} was not measured")
@@ -109,10 +109,11 @@ class RunData:
         column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), None)
         return 0 if column is None else int(np.isnan(np.asarray(column, float)[span]).sum())
 
-    def step(self, span: slice) -> tuple[Array, Array, float]:
+    def read_step(self, span: slice) -> tuple[Array, Array, float]:
         """Position and demand in a span, and the demand before it (at the very start: where the ram is)."""
-        position = self.signal("xj", span)
-        return position, self.signal("com", span), float(self.trace.com[span.start - 1] if span.start else position[0])
+        position = self.read_signal("xj", span)
+        before = float(self.trace.com[span.start - 1] if span.start else position[0])
+        return position, self.read_signal("com", span), before
 
     def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""

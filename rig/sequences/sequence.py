@@ -250,7 +250,7 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
         if fault.start >= sequence.duration:
             raise place.at(i, "start").refuse(f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
         if isinstance(fault, Parameter):
-            first, last = plan.cycles(fault)
+            first, last = plan.find_cycles(fault)
             others = taken.setdefault(fault.parameter, [])
             if any(first < b and a < last for a, b in others):
                 raise place.at(i, "start").refuse(f"a time when no other fault changes {fault.parameter}")

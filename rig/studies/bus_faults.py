@@ -156,8 +156,8 @@ def find_first_difference(sound: Path, faulty: Path) -> float | None:
 def _list_frames(folder: Path) -> list[tuple[float, int, bytes]]:
     """Time, s of main, COB-ID and data of the frames from the first cycle of main on."""
     log = open_log(folder / "trace.mcap")
-    begin = next(t_ns for _, t_ns, row in log.messages("/signals") if row.phase == 1)
-    return [((t_ns - begin) * 1e-9, frame.cob_id, frame.data) for _, t_ns, frame in log.messages("/can")
+    begin = next(t_ns for _, t_ns, row in log.read_messages("/signals") if row.phase == 1)
+    return [((t_ns - begin) * 1e-9, frame.cob_id, frame.data) for _, t_ns, frame in log.read_messages("/can")
             if t_ns >= begin]
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.output import writable
+from fdi.output import require_writable
 from fdi.report.run_verdict import read_verdict
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Trace
@@ -83,7 +83,7 @@ def write_rrd(trace: Trace, path: Path) -> None:
     Raises ViewerError without rerun; InputError for a place that cannot be written.
     """
     rr = import_rerun()
-    writable(path, "the recording")
+    require_writable(path, "the recording")
     with rr.RecordingStream("eha-rig", recording_id=str(path.stem)) as stream:
         stream.save(path, default_blueprint=_build_blueprint(rr, trace))
         stream.send_recording_name(trace.provenance.get("sequence", trace.provenance.get("source", "trace")))

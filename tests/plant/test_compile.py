@@ -39,7 +39,7 @@ print(json.dumps(run.xj.tolist()))
 def by_actuator(model: Model, seed: int, fast: bool = True, steps: int = 100, cycles: int = 300) -> np.ndarray:
     """Rows XJ, Cor, P12, XS, as the emulator and the firmware would make them."""
     plant = Actuator(model, seed, steps, fast)
-    p = model.record()[0].controller
+    p = model.build_record()[0].controller
     loop, current, out = Loop(), 0.0, np.empty((cycles, 4))
     for k in range(cycles):
         xj, p12, xs = plant.sample()

@@ -88,7 +88,7 @@ def coil(x, m, s, u, p):
 
 def in_the_coil(changes: dict[str, float], cycles: int, sent: float = 1e-3, seed: int = 3) -> np.ndarray:
     """Current in the coil at the last step of each cycle, A, when the firmware sends `sent`."""
-    plant, out = Actuator(Model().replace(changes).having(["coil"]), seed), np.empty(cycles)
+    plant, out = Actuator(Model().replace(changes).with_effects(["coil"]), seed), np.empty(cycles)
     for k in range(cycles):
         plant.sample()
         plant.advance(sent)

@@ -73,7 +73,7 @@ def test_its_starts_are_values_that_it_allows(name: str) -> None:
         assert tuple(start) == e.fitted
         assert not any(e.parameters[parameter].refuses(value) for parameter, value in start.items())
         assert start != {parameter: usual[parameter] for parameter in start}
-        assert e.acts(start) or e.base
+        assert e.is_active(start) or e.base
     for parameter, quantity in e.parameters.items():  # what is said to be typical is what a fit tries
         for value in parse_hint(quantity) if parameter == e.fitted[0] and len(e.fitted) == 1 else ():
             sizes = [abs(start[parameter]) for start in e.starts]
@@ -83,21 +83,21 @@ def test_its_starts_are_values_that_it_allows(name: str) -> None:
 @pytest.mark.parametrize("steps", [FEW, 50, 100])
 def test_the_whole_catalogue_at_its_off_values_changes_no_bit(steps: int) -> None:
     load = np.linspace(0.0, 8e3, len(COMMAND))
-    bare, off = (columns(m, load=load, seed=1, steps=steps) for m in (Model(), Model().having(LAWS)))
+    bare, off = (columns(m, load=load, seed=1, steps=steps) for m in (Model(), Model().with_effects(LAWS)))
     assert (bare == off).all()
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_absent_at_its_off_value(name: str) -> None:
     """Alone, in plain Python: bit for bit the plant without it."""
-    alone, bare = (columns(m, SHORT, seed=2, steps=FEW, fast=False) for m in (Model().having([name]), Model()))
+    alone, bare = (columns(m, SHORT, seed=2, steps=FEW, fast=False) for m in (Model().with_effects([name]), Model()))
     assert (alone == bare).all()
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compiled_equals_interpreted_alone_or_with_the_others(name: str) -> None:
     """Compiled with the whole catalogue and interpreted by itself: the same numbers."""
-    fast = columns(Model().having(LAWS).replace(largest(name)), SHORT, seed=3, steps=FEW)
+    fast = columns(Model().with_effects(LAWS).replace(largest(name)), SHORT, seed=3, steps=FEW)
     slow = columns(Model().replace(largest(name)), SHORT, seed=3, steps=FEW, fast=False)
     assert (fast == slow).all()
 
@@ -105,13 +105,13 @@ def test_compiled_equals_interpreted_alone_or_with_the_others(name: str) -> None
 def test_the_reference_model_compiled_equals_interpreted() -> None:
     everything = {k: v for name in BASES for k, v in largest(name).items()}
     gains = {"controller.integral_gain": 20.0, "controller.derivative_gain": 1e-3}
-    assert same_interpreted(Model().having(LAWS).replace(everything | gains))
+    assert same_interpreted(Model().with_effects(LAWS).replace(everything | gains))
 
 
 def test_all_at_once() -> None:
     """Each at its smallest start, but for the one that another excludes; finite, and the same in plain Python."""
     together = {k: v for name in CANONICAL if name != "spool_underlap" for k, v in CATALOGUE[name].starts[0].items()}
-    model = Model().having(LAWS).replace(together | NOISY)
+    model = Model().with_effects(LAWS).replace(together | NOISY)
     assert np.isfinite(columns(model)).all()
     assert same_interpreted(model)
 
@@ -171,7 +171,7 @@ def test_it_converges_with_the_step(name: str) -> None:
 
 
 def test_the_actuator_with_the_whole_catalogue_is_the_simulation() -> None:
-    model = Model().having(LAWS).replace({"quantisation.lsb": 5e-6, "rod_backlash.width": 5e-5,
+    model = Model().with_effects(LAWS).replace({"quantisation.lsb": 5e-6, "rod_backlash.width": 5e-5,
                                           "transport_delay.cycles": 1.5, "presliding.deflection": 2e-5})
     run, plant = simulate(model, COMMAND, seed=5), Actuator(model, seed=5)
     for k, current in enumerate([0.0, *run.cor[:-1].tolist()]):
@@ -187,7 +187,7 @@ def test_the_order_in_which_effects_are_named_does_not_matter() -> None:
 
 
 def test_what_excludes_each_other_may_stand_side_by_side_but_not_act() -> None:
-    both = Model().having(["spool_overlap", "spool_underlap"])
+    both = Model().with_effects(["spool_overlap", "spool_underlap"])
     assert both.replace({"spool_overlap.overlap": 1e-5}).effects == ("spool_overlap", "spool_underlap")
     with pytest.raises(InputError, match="not both at work"):
         both.replace({"spool_overlap.overlap": 1e-5, "spool_underlap.underlap": 1e-5})
@@ -203,4 +203,4 @@ def test_the_hint_of_a_range_is_read_with_its_unit() -> None:
 
 def test_a_silent_plant_is_not_woken_by_its_effects() -> None:
     """At rest, without load or command, the catalogue at its off values leaves everything zero."""
-    assert not columns(SILENT.having(LAWS), np.zeros(50))[1:].any()
+    assert not columns(SILENT.with_effects(LAWS), np.zeros(50))[1:].any()

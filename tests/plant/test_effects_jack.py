@@ -135,7 +135,7 @@ def test_constant_load_equals_the_load_of_the_command() -> None:
 @pytest.mark.parametrize("signal", ["step", "ramp", "sine"])
 def test_sensor_lag_is_a_first_order_lag(tau: float, signal: str) -> None:
     h = H
-    p = WHOLE.replace({"sensor_lag.time": tau}).record()[0]
+    p = WHOLE.replace({"sensor_lag.time": tau}).build_record()[0]
     t, w = np.arange(1, 4001) * h, 2 * np.pi * 40
     x, expected = {
         "step": (np.full_like(t, 1e-3), 1e-3 * (1 - np.exp(-(t - h / 2) / tau))),  # it rises within the first step
@@ -216,9 +216,9 @@ def test_the_firmware_alone_answers_as_in_the_loop() -> None:
 def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmetry: float, deflection: float) -> None:
     """A ram on a closed valve: kinetic energy and that of the bristles never grow."""
     names = ("stribeck", "friction_asymmetry", "presliding")
-    p = WHOLE.having(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
+    p = WHOLE.with_effects(names).replace({"stribeck.rise": abs(rise), "stribeck.speed": speed,
                                      "friction_asymmetry.asymmetry": 0.0 if deflection else asymmetry,
-                                     "presliding.deflection": deflection}).record()[0]
+                                     "presliding.deflection": deflection}).build_record()[0]
     k, u, s = compute_coefficients(p, H), Input(h=H), build_initial_state(names)._replace(jack_speed=v)
     moved = interpret_function(step_plant, collect_bindings(names))
     stiffness = 800.0 / deflection if deflection else 0.0

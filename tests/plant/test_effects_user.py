@@ -54,7 +54,7 @@ def test_a_position_law_that_cannot_run_is_refused(file: Path) -> None:
     file.write_text(COGGING.replace('"load"', '"position"').replace("p.cogging.force", "p.cogging.farce"))
     load_effects(file)
     with pytest.raises(InputError, match="cogging"):
-        Actuator(Model().having(["cogging"]))
+        Actuator(Model().with_effects(["cogging"]))
 
 
 def test_the_users_effect_is_found_and_acts(file: Path) -> None:
@@ -64,7 +64,7 @@ def test_the_users_effect_is_found_and_acts(file: Path) -> None:
     ours = columns(SILENT.replace({"aero_stiffness.stiffness": 5e5}))
     assert np.abs(columns(model)[2] - ours[2]).max() < 5e-6  # the same physics, at the start of the step not its middle
     assert same_interpreted(model)
-    assert (columns(Model().having(["spring"])) == columns(Model())).all()
+    assert (columns(Model().with_effects(["spring"])) == columns(Model())).all()
 
 
 def test_the_users_effect_with_memory(file: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_law_that_cannot_run_is_refused(file: Path, body: str) -> None:
     file.write_text(COGGING[:start] + f"    {body}\n")
     load_effects(file)
     with pytest.raises(InputError, match="cogging"):
-        simulate(Model().having(["cogging"]), COMMAND)
+        simulate(Model().with_effects(["cogging"]), COMMAND)
 
 
 @pytest.mark.parametrize(("text", "name", "sized"), [

@@ -40,7 +40,7 @@ def test_hysteresis_is_a_loop_of_its_width_at_any_rate() -> None:
 
 @pytest.mark.parametrize("tau", [0.3e-3, 3e-3])
 def test_coil_lag_is_3_dB_down_where_it_should(tau: float) -> None:
-    p = EASY.replace({"coil_lag.time": tau}).record()[0]
+    p = EASY.replace({"coil_lag.time": tau}).build_record()[0]
     w, m = 1.0 / tau, Behind()
     t = np.arange(round(40 * tau / H)) * H
     out = np.empty_like(t)
@@ -131,7 +131,7 @@ def test_droop_is_as_large_as_the_flow_and_comes_with_the_lines_lag() -> None:
     ratio = 1.0 - 2e10 * model["jack.area"] * v / model["supply.pressure"]
     assert ratio < 0.8
     assert v == pytest.approx(measure_speed(model, xs) * np.sqrt(ratio), rel=3e-3)
-    p, m, s = model.record()[0], Drawn(), State(jack_speed=0.1)
+    p, m, s = model.build_record()[0], Drawn(), State(jack_speed=0.1)
     for _ in range(200):  # 2 ms
         r, m = supply_droop(1.0, m, s, Input(h=H), p)
     assert 1.0 - r == pytest.approx((1 - np.exp(-1)) * 2e10 * 0.1 * 1.5e-3 / model["supply.pressure"], rel=1e-3)
@@ -183,7 +183,7 @@ IMPLICIT = ("compressibility", "orifice_root", "presliding")
 def test_implicit_effects_against_an_explicit_integration(changes: dict[str, float], h: float, um: float,
                                                           bar: float) -> None:
     """Each alone and all together, at pressures up to 150 of 201 bar; RMS over 0.4 s, speeds to 90 mm/s."""
-    model, fine = SILENT.having(IMPLICIT).replace(changes), 5e-7
+    model, fine = SILENT.with_effects(IMPLICIT).replace(changes), 5e-7
     paths = {}
     for step in (h, fine):
         t = np.arange(1, round(0.4 / step) + 1) * step
@@ -192,7 +192,7 @@ def test_implicit_effects_against_an_explicit_integration(changes: dict[str, flo
     every = round(h / fine)
     ours = np.empty((2, len(paths[h][0])))
     run = compile_function(_moved, collect_bindings(model.effects))
-    run(build_initial_state(model.effects), *paths[h], model.record(), h, ours)
+    run(build_initial_state(model.effects), *paths[h], model.build_record(), h, ours)
     error = ours - simulate_jack(model.values, *paths[fine], fine)[:, every - 1::every]
     assert np.sqrt((error[0] ** 2).mean()) * 1e6 < um
     assert np.sqrt((error[1] ** 2).mean()) * 1e-5 < bar
@@ -206,7 +206,7 @@ def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h:
     out = np.empty((2, round(0.05 / h)))
     start = build_initial_state(model.effects)._replace(jack_speed=0.01)
     run = compile_function(_moved, collect_bindings(model.effects))
-    run(start, *np.zeros((2, out.shape[1])), model.record(), h, out)
+    run(start, *np.zeros((2, out.shape[1])), model.build_record(), h, out)
     matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
                        [-v["jack.area"] / stored, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
                                                     + v["jack.leakage"]) / stored]])

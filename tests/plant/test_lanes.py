@@ -65,7 +65,8 @@ def one_run(model: Model, current: np.ndarray, load: np.ndarray, position: np.nd
     """The same in plain Python, one run, (n, 3)."""
     out = np.empty((len(current), 3))
     run = interpret_function(replay_current, collect_bindings(model.effects))
-    run(model.state(), current, load, np.empty(0) if position is None else position, anchor, model.record(), steps, out)
+    position = np.empty(0) if position is None else position
+    run(model.build_state(), current, load, position, anchor, model.build_record(), steps, out)
     return out
 
 
@@ -92,7 +93,7 @@ def test_replay_is_that_of_the_actuator() -> None:
 @pytest.fixture(scope="module")
 def catalogue() -> Lanes:
     """The whole catalogue, all parameters of all effects free."""
-    model = QUIET.having(EFFECTS)
+    model = QUIET.with_effects(EFFECTS)
     return Lanes(model, [name for e in EFFECTS for name in CATALOGUE[e].off], steps=10)
 
 
@@ -120,7 +121,7 @@ def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeyp
     """And get the bits that the kernel with all effects would give them."""
     none, cheap, every = (len(rung.model.effects) for rung in list_kernel_variants(catalogue.model))
     assert none == 0 and 10 < cheap < 20 and every == len(EFFECTS)
-    assert len(list_kernel_variants(QUIET.having(EFFECTS[:3]))) == 1
+    assert len(list_kernel_variants(QUIET.with_effects(EFFECTS[:3]))) == 1
     at_work = [{}, *(start(effect, 0) for effect in ("null_bias", "stribeck", "rod_backlash", "orifice_root")), {}]
     values = np.vstack([with_effects(catalogue, changes) for changes in at_work])
     shared = catalogue.replay(values, CURRENT, FORCE)
@@ -185,7 +186,7 @@ def test_threads_do_not_matter() -> None:
 
 def test_warming_tells_how_far_it_is() -> None:
     calls: list[tuple[str, float]] = []
-    compile_kernels(QUIET.having(EFFECTS), lambda *call: calls.append(call))
+    compile_kernels(QUIET.with_effects(EFFECTS), lambda *call: calls.append(call))
     assert [share for _, share in calls] == [0, 1 / 3, 2 / 3, 1] and "0 effects" in calls[0][0]
 
 

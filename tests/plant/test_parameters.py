@@ -132,13 +132,13 @@ def test_the_shipped_servo_file_is_read_as_it_stands() -> None:
     model = load_model("ehs")
     assert {name: value for name, value in model.values.items() if value} == {
         name: value for name, value in listed.items() if name in model.values}
-    assert model.having(["compressibility"])["compressibility.volume"] == listed["compressibility.volume"] == 6e-3
+    assert model.with_effects(["compressibility"])["compressibility.volume"] == listed["compressibility.volume"] == 6e-3
 
 
 def test_naming_an_effects_parameter_gives_the_model_that_effect() -> None:
     model = Model().replace({"sensor_lag.time": 1e-3})
     assert model.effects == ("sensor_lag",)
-    assert model.differences() == {"sensor_lag.time": 1e-3}
+    assert model.list_changes() == {"sensor_lag.time": 1e-3}
     assert Model().effects == ()
 
 

@@ -144,5 +144,5 @@ REST = State()
 @pytest.mark.parametrize(("clogging", "percent"), [(0.0, 2.4), (0.1, 3.5), (0.25, 5.5), (0.35, 7.2)])
 def test_overshoot_of_the_continuous_loop(clogging: float, percent: float) -> None:
     model = SILENT.replace({"filter.clogging": clogging, "controller.proportional_gain": GAP * 100 / KPOS})
-    top = compile_function(overshoot)(model.record(), model["controller.proportional_gain"], 1e-3, 100_000, 2e-6)
+    top = compile_function(overshoot)(model.build_record(), model["controller.proportional_gain"], 1e-3, 100_000, 2e-6)
     assert (top / 1e-3 - 1) * 100 == pytest.approx(percent, abs=0.1)

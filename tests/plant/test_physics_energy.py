@@ -79,7 +79,7 @@ def test_soften_and_clip_share_the_whole(x: float, band: float) -> None:
 def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, stiffness: float) -> None:
     """Spool centred, air stiffness as spring: kinetic and elastic energy together never grow over a millisecond."""
     model = (SILENT if dry else SMOOTH).replace({"aero_stiffness.stiffness": stiffness})
-    p = model.record()[0]
+    p = model.build_record()[0]
     k = compute_coefficients(p, H)
     s, u = State(jack_position=x, jack_speed=v), Input(h=H)
 
@@ -96,7 +96,7 @@ def test_a_ram_on_a_closed_valve_loses_energy(x: float, v: float, dry: bool, sti
 @given(st.floats(-3e-5, 3e-5), st.floats(-0.2, 0.2))
 @settings(max_examples=30, deadline=None)
 def test_a_flapper_left_alone_loses_energy(x: float, v: float) -> None:
-    p = SILENT.record()[0]
+    p = SILENT.build_record()[0]
     k, s, f = compute_coefficients(p, H), State(flapper_position=x, flapper_speed=v), p.flapper
     last = np.inf
     for _ in range(50):

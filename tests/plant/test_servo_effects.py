@@ -33,7 +33,7 @@ def build_model(**changed: float) -> Model:
 
     It has the general effects, so that one kernel serves all.
     """
-    return load_model("ehs").having(GENERAL).replace({"quantisation.lsb": 0.0}
+    return load_model("ehs").with_effects(GENERAL).replace({"quantisation.lsb": 0.0}
                                      | {name.replace("__", "."): value for name, value in changed.items()})
 
 
@@ -65,7 +65,7 @@ def test_the_pressure_of_a_blocked_ram_rises_as_the_air_gives_way(exponent: floa
 def test_air_at_exponent_2_keeps_boyles_product() -> None:
     """The compliance of the line is -dV/dp of V = V0 p0/p, with the preload counted in."""
     model = build_model(undissolved_air__volume=3e-6, undissolved_air__exponent=2.0, undissolved_air__preload=4e5)
-    p, u, x = model.record()[0], Input(h=1e-3), Line(5e6, 1e12, 1e7, 0.0)
+    p, u, x = model.build_record()[0], Input(h=1e-3), Line(5e6, 1e12, 1e7, 0.0)
     s = State(pressure=6e5)
     line = undissolved_air(x, s, u, p)
     total = 6e5 + 4e5 + ATMOSPHERE
@@ -79,7 +79,7 @@ def test_air_at_exponent_2_keeps_boyles_product() -> None:
 def test_a_delayed_flow_follows_erlangs_distribution() -> None:
     """Four lags of tau/4: 1 - exp(-k) (1 + k + k^2/2 + k^3/6), k = 4 t/tau; without delay exactly the step."""
     h, tau = 1e-5, 0.02
-    p, u, m = build_model(flow_delay__time=tau).record()[0], Input(h=h), Cascade()
+    p, u, m = build_model(flow_delay__time=tau).build_record()[0], Input(h=h), Cascade()
     shown = []
     for _ in range(6000):
         y, m = flow_delay(1.0, m, State(), u, p)
@@ -87,7 +87,7 @@ def test_a_delayed_flow_follows_erlangs_distribution() -> None:
     k = 4.0 * h * np.arange(1, 6001) / tau
     expected = 1.0 - np.exp(-k) * sum(k**n / factorial(n) for n in range(4))
     np.testing.assert_allclose(shown, expected, atol=1e-3)
-    none = build_model(flow_delay__time=0.0).record()[0]
+    none = build_model(flow_delay__time=0.0).build_record()[0]
     assert flow_delay(0.7, Cascade(0.1, 0.2, 0.3, 0.4), State(), u, none)[0] == 0.7
 
 
@@ -107,7 +107,7 @@ def test_a_switching_valve_stops_the_flow_at_each_reversal_and_not_at_the_start(
 
 
 def test_a_pause_on_one_side_does_not_switch_the_valve() -> None:
-    p, u = build_model(valve_switching__time=0.05).record()[0], Input(h=1e-3)
+    p, u = build_model(valve_switching__time=0.05).build_record()[0], Input(h=1e-3)
     m = Switched(1.0, 1.0)
     for x in (0.0, 0.0, 3.0):
         y, m = valve_switching(x, m, State(), u, p)
@@ -213,14 +213,14 @@ def test_off_it_changes_no_bit_and_on_it_acts(name: str, plant: str) -> None:
     command = np.r_[np.full(15, 1e-3), np.full(15, -1e-3)]
     strong = {parameter: 2.0 * value for parameter, value in CATALOGUE[name].starts[-1].items()}
     off, on, without = (np.array(simulate(m, command, steps=4, fast=False))
-                        for m in (model.having([name]), model.replace(strong), model))
+                        for m in (model.with_effects([name]), model.replace(strong), model))
     assert (off == without).all() and np.isfinite(on).all() and (on != without).any()
 
 
 def test_exp_is_used_right() -> None:
     """The softness of exponent 1 at a pressure of e - 1 atmospheres is 1/e of that at none."""
     model = build_model(undissolved_air__volume=1e-6, undissolved_air__exponent=1.0)
-    p, u, x = model.record()[0], Input(h=1e-3), Line(0.0, 1e12, 1e7, 0.0)
+    p, u, x = model.build_record()[0], Input(h=1e-3), Line(0.0, 1e12, 1e7, 0.0)
     soft, stiff = (undissolved_air(x, State(pressure=q), u, p) for q in (0.0, (exp(1.0) - 1.0) * ATMOSPHERE))
     compliance = [model["jack.area"] * u.h * (1.0 / line.slope - 1.0 / x.slope) for line in (soft, stiff)]
     assert compliance[1] / compliance[0] == pytest.approx(exp(-1.0), rel=1e-9)

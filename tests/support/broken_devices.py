@@ -99,7 +99,7 @@ def skip_checks(*indices: int) -> Break:
 def accept_restricted(device: Any) -> None:
     """Only a restricted identifier is let through; that of a valid PDO is still fixed."""
     def check(old: Any, index: int, sub: int, value: int) -> None:
-        if index in (0x1400, 0x1800, 0x1801) and sub == 1 and device.od.number(index, 1) & INVALID:
+        if index in (0x1400, 0x1800, 0x1801) and sub == 1 and device.od.read_number(index, 1) & INVALID:
             return
         old(index, sub, value)
     _wrap(device, device, "_check", check)
@@ -108,7 +108,7 @@ def accept_restricted(device: Any) -> None:
 def change_while_valid(device: Any) -> None:
     """Any permitted identifier is accepted at any time."""
     def check(old: Any, index: int, sub: int, value: int) -> None:
-        word = device.od.number(index, sub)
+        word = device.od.read_number(index, sub)
         if sub == 1 and index in (0x1400, 0x1800, 0x1801) and not word & INVALID:
             device.od.values[index, sub] = word | INVALID
             try:
@@ -148,10 +148,10 @@ def write_anything(device: Any) -> None:
 def accept_any_length(device: Any) -> None:
     """A wrong length is cut or filled up."""
     def decode(old: Any, index: int, sub: int, data: bytes) -> Any:
-        size = device.od.size(index, sub)
+        size = device.od.find_size(index, sub)
         return old(index, sub, data[:size].ljust(size, b"\0") if size else data)
     _wrap(device, device.od, "decode", decode)
-    device.sdo._size = lambda index, sub: device.od.size(index, sub) * 0
+    device.sdo._size = lambda index, sub: device.od.find_size(index, sub) * 0
 
 
 def ignore_limits(device: Any) -> None:
@@ -297,7 +297,7 @@ def lose_disable(device: Any) -> None:
     for pdo in (*device.pdo.rpdos.values(), *device.pdo.tpdos.values()):
         def configure(old: Any, pdo: Any = pdo, base: int = 0) -> None:
             old()
-            pdo.cob_id = device.od.number(base, 1) & 0x7FF
+            pdo.cob_id = device.od.read_number(base, 1) & 0x7FF
         base = (0x1800 if pdo in device.pdo.tpdos.values() else 0x1400) + pdo.n - 1
         _wrap(device, pdo, "configure", partial(configure, base=base))
 

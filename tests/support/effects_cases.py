@@ -8,9 +8,9 @@ from plant import Actuator, Model
 from plant.effects import CATALOGUE
 
 LAWS = [name for name, entry in CATALOGUE.items() if not entry.base]
-WHOLE = SILENT.having(LAWS)  # nominal, no noise
+WHOLE = SILENT.with_effects(LAWS)  # nominal, no noise
 QUIET_SPOOL = WHOLE.replace({"spool.static_friction": 0.0, "spool.dynamic_friction": 0.0})
-EASY = SMOOTH.having(LAWS)  # nor dry friction
+EASY = SMOOTH.with_effects(LAWS)  # nor dry friction
 H = 1e-5
 
 

@@ -66,7 +66,7 @@ unit = "um"
 def simulate_run(rows: int = 1500) -> Trace:
     """A run with a null bias, which compare finds."""
     columns = simulate(Model().replace(HIDDEN), build_command()[:rows], None, 1, STEPS)
-    return Trace.of(columns._asdict(), 1e-3, {})
+    return Trace.from_columns(columns._asdict(), 1e-3, {})
 
 
 def write_german_csv(trace: Trace, path: Path) -> None:

@@ -47,7 +47,7 @@ def record_plant(changes: dict[str, float] | None = None, com: np.ndarray = PREF
         current = answer
     xj, cor, p12, xs = out.T
     columns = {"com": com, "xj": xj, "cor": cor, "p12": p12, "xs": xs, "load": np.full(len(com), load)}
-    return Trace.of(columns, 1e-3, {"source": f"seed {seed}"})
+    return Trace.from_columns(columns, 1e-3, {"source": f"seed {seed}"})
 
 
 @cache

@@ -35,7 +35,7 @@ def write_measured_runs(folder: Path, changes: Mapping[str, float]) -> dict[str,
         demand = build_other_command() if name == "holdout" else build_command()
         columns = simulate(Model().replace(changes), demand, None, seed, STEPS)
         files[name] = folder / f"{name}.csv"
-        Trace.of(columns._asdict(), 1e-3, {}).write_csv(files[name])
+        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(files[name])
     return files
 
 

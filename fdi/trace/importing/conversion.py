@@ -79,7 +79,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
                                    float(np.nanmin(placed.x)), float(np.nanmax(placed.x)), samples[name].gaps,
                                    int(np.isnan(placed.x).sum()), how))
     origin = {**describe_origin(measurement, chosen), "imported.start": repr(float(rows[0]))}
-    trace = replace(Trace.of(columns, period, origin),
+    trace = replace(Trace.from_columns(columns, period, origin),
                     sensors={name: sensor for name, sensor in sensors.items() if not sensor.is_ideal})
     return Imported(trace, tuple(done), max(len(s.t) for s in samples.values()))
 
@@ -97,7 +97,7 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _terms(signal: SignalMap) -> list[SourceTerm]:
+def _list_terms(signal: SignalMap) -> list[SourceTerm]:
     return [signal.term, *([signal.minus] if signal.minus else [])]
 
 
@@ -123,7 +123,7 @@ def _require_sources(measurement: Measurement, chosen: ImportMap) -> None:
 def _read_channels(measurement: Measurement, chosen: ImportMap) -> Mapping[str, Channel]:
     """All channels that the map names, read at once."""
     bases = [base for base in (chosen.time, *(s.time for s in chosen.signals.values())) if base and base.source]
-    names = [term.source for signal in chosen.signals.values() for term in _terms(signal)]
+    names = [term.source for signal in chosen.signals.values() for term in _list_terms(signal)]
     dates = [str(base.source) for base in bases if base.unit is None and base.bits is None]
     return measurement.read(list(dict.fromkeys([*names, *(str(base.source) for base in bases)])), dates)
 
@@ -230,7 +230,7 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
 
 
 def _describe_source(signal: SignalMap) -> str:
-    return " - ".join(term.source for term in _terms(signal))
+    return " - ".join(term.source for term in _list_terms(signal))
 
 
 def _describe_unit(signal: SignalMap) -> str:

@@ -114,7 +114,7 @@ def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
     return out
 
 
-def _plain(name: str) -> str:
+def _simplify_name(name: str) -> str:
     """A name in lower case, its accents and unit removed, words separated by blanks."""
     word = re.sub(r"([a-z])([A-Z])", r"\1 \2", split_unit(name)[0]).lower()
     bare = "".join(c for c in unicodedata.normalize("NFD", word) if not unicodedata.combining(c))
@@ -123,7 +123,7 @@ def _plain(name: str) -> str:
 
 def _has_word(name: str, words: str) -> str:
     """The first of the words that a name has, alone or (four letters and more) within another; "" for none."""
-    plain = _plain(name)
+    plain = _simplify_name(name)
     for word in words.split("|"):
         pattern = word if len(word.replace(" ?", "")) >= 4 else rf"(?<=[ 0-9]){word}(?=[ 0-9])"
         found = re.search(pattern, plain)
@@ -205,7 +205,7 @@ def _assign(measurement: Measurement, data: Mapping[str, Floats]) -> dict[str, G
     rated = []
     for column, x in data.items():
         for name in SIGNAL_NAMES if float(np.ptp(x)) > 0.0 else ():
-            guess = _rate(measurement, name, column, x)
+            guess = _rate_column(measurement, name, column, x)
             if guess is not None:
                 rated.append((name, guess))
     rated.sort(key=lambda pair: -pair[1].points)
@@ -218,7 +218,7 @@ def _assign(measurement: Measurement, data: Mapping[str, Floats]) -> dict[str, G
     return {name: found[name] for name in SIGNAL_NAMES if name in found}
 
 
-def _rate(measurement: Measurement, name: str, column: str, x: Floats) -> Guess | None:
+def _rate_column(measurement: Measurement, name: str, column: str, x: Floats) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
     said = measurement.units[column] or split_unit(column)[1]
     unit = find_unit(said)
@@ -274,9 +274,9 @@ def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> No
     if guess is None:
         return
     for first, second in (("a", "b"), ("1", "2")):
-        mine = re.sub(r"[^a-z0-9]", "", _plain(guess.source))
+        mine = re.sub(r"[^a-z0-9]", "", _simplify_name(guess.source))
         for column in data:
-            other = re.sub(r"[^a-z0-9]", "", _plain(column))
+            other = re.sub(r"[^a-z0-9]", "", _simplify_name(column))
             places = [i for i, (x, y) in enumerate(zip(mine, other, strict=False)) if x != y]
             if len(mine) == len(other) and len(places) == 1 and {mine[places[0]], other[places[0]]} == {first, second}:
                 source, minus = (guess.source, column) if mine[places[0]] == first else (column, guess.source)

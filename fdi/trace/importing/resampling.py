@@ -90,10 +90,11 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
     filtered, note = samples, ""
     if ratio > 1.5 and low_pass is not False:
         filtered, note = _filter(samples, ratio), "low-pass filtered, "
-    return Placed(_interpolate(filtered, rows), f"{note}straight lines between samples {_ms(samples.period)} apart")
+    note += f"straight lines between samples {_format_ms(samples.period)} apart"
+    return Placed(_interpolate(filtered, rows), note)
 
 
-def _ms(seconds: float) -> str:
+def _format_ms(seconds: float) -> str:
     return f"{1e3 * seconds:.4g} ms"
 
 
@@ -114,7 +115,7 @@ def _place_each(samples: Samples, rows: Floats, period: float) -> Placed | None:
 def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str) -> Placed:
     """Every so many samples; those of a held signal where its new value is."""
     held = find_hold(samples, ratio)
-    how = f"every {_ordinal(ratio)} sample"
+    how = f"every {_format_ordinal(ratio)} sample"
     if held is not None:
         own = (samples.t[0] + held * samples.period - rows[0]) % period
         own = 0.0 if own > period - 0.25 * samples.period else own
@@ -132,7 +133,7 @@ def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: b
     return Placed(_place_nearest(samples, rows, 0.6 * samples.period).x, how)
 
 
-def _ordinal(n: int) -> str:
+def _format_ordinal(n: int) -> str:
     return f"{n}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(n if n < 20 else n % 10, 'th')}"
 
 
@@ -153,7 +154,7 @@ def _hold(samples: Samples, rows: Floats) -> Placed:
     before = np.searchsorted(samples.t, rows + 1e-9, side="right") - 1
     x = samples.x[np.clip(before, 0, None)]
     late = rows - samples.t[np.clip(before, 0, None)] > 1.5 * samples.period
-    return Placed(np.where((before < 0) | late, math.nan, x), f"last sample, {_ms(samples.period)} apart")
+    return Placed(np.where((before < 0) | late, math.nan, x), f"last sample, {_format_ms(samples.period)} apart")
 
 
 def _interpolate(samples: Samples, rows: Floats) -> Floats:

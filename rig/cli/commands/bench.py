@@ -110,7 +110,7 @@ def _run_trial(args: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
-    from fdi.output import writable, write_text
+    from fdi.output import require_writable, write_text
     from plant.errors import InputError
     from rig.cli.answer import show_answer
     from rig.cli.terminal import open_console
@@ -123,7 +123,7 @@ def _run_trial(args: argparse.Namespace) -> int:
         if count < 1:
             raise InputError(option, str(count), "1 or more")
     if args.out is not None:
-        writable(args.out, "--out")
+        require_writable(args.out, "--out")
     out = open_console()
 
     def report_progress(progress: BatchProgress) -> None:

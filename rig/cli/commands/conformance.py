@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a test failed, 3 if none failed and some times could not be measured."""
-    from fdi.output import writable, write_text
+    from fdi.output import require_writable, write_text
     from plant.errors import InputError
     from rig.cli.answer import choose_file, show_answer
     from rig.cli.progress_bar import show_progress
@@ -68,7 +68,7 @@ def run_command(args: argparse.Namespace) -> int:
         from fdi.report.html import write_html
         from fdi.report.json import to_json
 
-        write_html(report, writable(folder / "conformance.html", "--out"))
+        write_html(report, require_writable(folder / "conformance.html", "--out"))
         write_text(folder / "conformance.json", to_json(report.data) + "\n")
     if junit is not None:
         write_text(junit, write_junit(outcome, subject), "--junit")

@@ -74,7 +74,7 @@ def _import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
 
 
 def _import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
-    from fdi.output import writable
+    from fdi.output import require_writable
     from fdi.report.import_report import build_import_report
     from fdi.trace.importing.conversion import import_measurement
     from fdi.trace.importing.import_map import read_map
@@ -84,7 +84,7 @@ def _import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
 
     if out.suffix != ".mcap":
         raise InputError(out, "--out", "a name that ends in .mcap")
-    writable(out, "--out", source=source)
+    require_writable(out, "--out", source=source)
     chosen = read_map(Path(args.map))
     measurement = _open_source(args, source, chosen)
     imported = import_measurement(measurement, chosen, load_nominal_values()["controller.period"])

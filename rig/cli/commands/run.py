@@ -165,7 +165,7 @@ def build_job(args: argparse.Namespace) -> Job:
     chosen = load_model(args.model or sequence.model.name).replace(sequence.model.overrides, sequence.name)
     model = chosen.replace(options.parse_changes(args.set))
     require_bench_cycle(model, "--set")
-    foreign = [name for name in model.differences() if name.startswith("controller.")]
+    foreign = [name for name in model.list_changes() if name.startswith("controller.")]
     if args.controller == "external" and foreign:
         raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
     job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=effects,

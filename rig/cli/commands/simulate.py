@@ -21,7 +21,7 @@ def run_command(args: argparse.Namespace) -> int:
     """Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv)."""
     from pathlib import Path
 
-    from fdi.output import writable
+    from fdi.output import require_writable
     from fdi.report.numbers import format_amount
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
@@ -36,9 +36,9 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out or "simulation.csv")
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
-    writable(out, "--out", source=args.command_file)
+    require_writable(out, "--out", source=args.command_file)
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
-    trace = Trace.of(columns._asdict(), model["controller.period"], {
+    trace = Trace.from_columns(columns._asdict(), model["controller.period"], {
         "model": model.name, "seed": str(args.seed), "command": name})
     if out.suffix == ".mcap":
         from rig.recorder.convert import write_mcap

@@ -20,7 +20,7 @@ def run_command(args: argparse.Namespace) -> int:
 
     if args.headless and not args.screenshot:
         raise InputError("--headless", "", "--screenshot FILE.png with it")
-    from fdi.output import writable
+    from fdi.output import require_writable
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
     from rig.cli.answer import show_answer
@@ -30,13 +30,13 @@ def run_command(args: argparse.Namespace) -> int:
     trace = Trace.read(source, all=True)
     save = args.save or args.out
     if save is not None:
-        rrd = writable(save, "--save" if args.save else "--out", source=source)
+        rrd = require_writable(save, "--save" if args.save else "--out", source=source)
     elif args.screenshot:
-        rrd = writable(Path(args.screenshot).with_suffix(".rrd"), "--screenshot", source=source)
+        rrd = require_writable(Path(args.screenshot).with_suffix(".rrd"), "--screenshot", source=source)
     else:
         rrd = (source if source.is_dir() else source.parent) / (source.name.split(".")[0] + ".rrd")
     if args.screenshot:
-        writable(args.screenshot, "--screenshot", source=source)
+        require_writable(args.screenshot, "--screenshot", source=source)
     rerun_log.write_rrd(trace, rrd)
     answer: dict[str, object] = {"rrd": str(rrd)}
     if args.screenshot:

@@ -49,10 +49,10 @@ class Task(NamedTuple):
 def make_c_replay(task: Task, function: str, flags: tuple[str, ...], target: Path) -> Replay:
     """A function of lanes.c: "replay_each" or "replay_lanes"."""
     library = build_library("lanes.c", flags, target)
-    records = np.repeat(task.model.record(), len(task.values))
+    records = np.repeat(task.model.build_record(), len(task.values))
     numbers = records.view(np.float64).reshape(len(records), -1)
     for column, name in enumerate(task.names):
-        numbers[:, task.model.names().index(name)] = task.values[:, column]
+        numbers[:, task.model.list_names().index(name)] = task.values[:, column]
     n = len(task.current)
     out = np.empty((len(records), 3, n))
     pointers = [np.ctypeslib.as_ctypes(a.reshape(-1)) for a in (numbers, task.current, task.load, out)]

@@ -71,12 +71,12 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
 
 def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
-    run, state, record = build_kernel(run_closed_loop, model.effects), model.state(), model.record()
+    run, state, record = build_kernel(run_closed_loop, model.effects), model.build_state(), model.build_record()
     return lambda: run(state, command, load, draws, record, steps, out), out
 
 
 def _make_c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
-    record = model.record()
+    record = model.build_record()
     assert library.model_bytes() == record.nbytes, "step.c knows other parameters than plant.parameters"
     out, load = np.empty((len(command), 4)), np.zeros_like(command)
     # the arrays themselves, not their addresses: the closure keeps them alive

@@ -86,7 +86,7 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
         unit = model.replace({name: factor * model[name] for name, factor in random_parts.scatter.items()})
         columns = simulate(add_faults(unit, case.sizes), com, drawn=random_parts.noise)._asdict()
     measured = {"com", "cor", "load", *spec["signals"].split(",")}
-    return Trace.of({name: columns[name] for name in columns if name in measured}, model["controller.period"],
+    return Trace.from_columns({name: columns[name] for name in columns if name in measured}, model["controller.period"],
                     provenance)
 
 
@@ -125,9 +125,9 @@ def add_faults(model: Model, sizes: Mapping[str, float]) -> Model:
 def _simulate_independently(case: Case, model: Model, com: Array, random_parts: RandomParts) -> dict[str, Array]:
     """The same plant by the blind trial's simulator, which shares no physics with `plant`."""
     symbol_of = {name: symbol for symbol, name in truth.SYMBOLS.items()}
-    for name in model.differences().keys() - symbol_of.keys():
+    for name in model.list_changes().keys() - symbol_of.keys():
         raise InputError("--simulator", name, "a parameter of the independent simulator")
-    symbols = {symbol_of[name]: value for name, value in model.differences().items()}
+    symbols = {symbol_of[name]: value for name, value in model.list_changes().items()}
     symbols |= {symbol_of[name]: factor * model[name] for name, factor in random_parts.scatter.items()}
     for name, size in case.sizes.items():
         law = CATALOGUE[name]

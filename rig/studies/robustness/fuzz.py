@@ -85,10 +85,10 @@ def fuzz_node(target: str, frames: int, seed: int, progress: Progress = ignore_p
         if number % 10_000 == 0:
             progress(target, number / frames)
     growth = read_memory() - start
-    return FuzzCount(target, frames, heard, tuple(failures), _answers(target, node, bus, last), growth)
+    return FuzzCount(target, frames, heard, tuple(failures), _is_answering(target, node, bus, last), growth)
 
 
-def _answers(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
+def _is_answering(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
     """Whether a node boots, answers SDO, starts and takes part in a cycle as after power-on."""
     number = 3 if target == "plant" else 2
     heard: list[tuple[int, bytes]] = []

@@ -129,17 +129,17 @@ def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
 def test_a_simulation_without_noise_is_its_own_floor() -> None:
     quiet = MODEL.replace({f"sensors.{name}_noise": 0.0 for name in ("position", "pressure", "spool")})
     run = simulate(quiet, SHORT)
-    assert compare(Trace.of(run._asdict(), 1e-3, {}), quiet).verdict == "WITHIN_FLOOR"
+    assert compare(Trace.from_columns(run._asdict(), 1e-3, {}), quiet).verdict == "WITHIN_FLOOR"
 
 
 def test_every_other_row_lost_is_no_error() -> None:
     """The current between is guessed, and the floor says how little is known then."""
     columns = {name: getattr(record_healthy(2), name)[::2] for name in ("com", "xj", "cor", "p12", "xs", "load")}
-    found = compare(Trace.of(columns, 2e-3, {}), MODEL)
+    found = compare(Trace.from_columns(columns, 2e-3, {}), MODEL)
     assert found.verdict in ("CANNOT_TELL", "WITHIN_FLOOR") and found.trace.period == 1e-3
     slow = MODEL.replace({"controller.period": 0.002})
     run = simulate(slow, SHORT[::2], seed=1)
-    found = compare(Trace.of(run._asdict(), 2e-3, {}), MODEL)
+    found = compare(Trace.from_columns(run._asdict(), 2e-3, {}), MODEL)
     assert at_floor(found) and found.trace.period == 2e-3
 
 
@@ -147,7 +147,7 @@ def test_rows_lost_at_random_are_no_error() -> None:
     keep = np.random.default_rng(0).random(13_500) > 0.05
     trace = record_healthy(2)
     columns = {name: np.where(keep, trace.column(name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
-    found = compare(Trace.of(columns, 1e-3, {}), MODEL)
+    found = compare(Trace.from_columns(columns, 1e-3, {}), MODEL)
     assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
 
 
@@ -155,7 +155,7 @@ def test_rows_lost_at_random_are_no_error() -> None:
 def test_columns_out_of_step_are_moved(name: str, rows: int) -> None:
     columns = {n: getattr(record_healthy(2), n) for n in ("com", "xj", "cor", "p12", "xs")}
     columns[name] = np.roll(columns[name], rows)
-    found = compare(Trace.of(columns, 1e-3, {}), MODEL)
+    found = compare(Trace.from_columns(columns, 1e-3, {}), MODEL)
     assert found.verdict == "WITHIN_FLOOR"
     assert any(f"{name.capitalize()} stands {abs(rows)} cycles {'later' if rows > 0 else 'earlier'}" in note
                for note in found.notes)

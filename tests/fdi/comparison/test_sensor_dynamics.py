@@ -23,7 +23,7 @@ MEAN = SensorDynamics(moving_mean=20.0)
 @cache
 def run_nominal() -> Trace:
     """The nominal plant with its sensors' noise, 2.5 s."""
-    return Trace.of(simulate(Model(), build_command()[:2500], None, 1, STEPS)._asdict(), 1e-3, {})
+    return Trace.from_columns(simulate(Model(), build_command()[:2500], None, 1, STEPS)._asdict(), 1e-3, {})
 
 
 def filter_by_loop(x: np.ndarray, sensor: SensorDynamics) -> np.ndarray:

@@ -202,7 +202,7 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     force = np.full(len(com), 5e3)
     run = simulate(load_model(), com, force, seed=3)
     monkeypatch.setattr(judging, "choose_bands", lambda *a, **k: short_bands(5e3))
-    j = judge_trace(Trace.of(run._asdict(), 1e-3, {}))
+    j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}))
     assert (j.ruling, j.events) == (None, ())
     assert "5000 N" in short_bands(5e3).provenance["load"]
 

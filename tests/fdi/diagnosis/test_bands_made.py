@@ -39,7 +39,7 @@ def healthy() -> np.ndarray:
 
 def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
     com = command() if com is None else com
-    return Trace.of({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})
+    return Trace.from_columns({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})
 
 
 def test_a_fleet_of_its_own() -> None:

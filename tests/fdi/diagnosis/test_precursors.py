@@ -39,7 +39,7 @@ def command() -> np.ndarray:
 def run(clogging: float = 0.0, friction: float = 5.0) -> Trace:
     model = load_model().replace({"filter.clogging": clogging, "spool.static_friction": friction,
                                   "spool.dynamic_friction": friction / 1.5})
-    return Trace.of(simulate(model, command(), seed=11)._asdict(), MS, {})
+    return Trace.from_columns(simulate(model, command(), seed=11)._asdict(), MS, {})
 
 
 def second_order(zeta: float, omega: float, rows: int, size: float) -> np.ndarray:
@@ -124,14 +124,14 @@ def test_spikes_and_holes() -> None:
     clean = run()
     xj = clean.xj.copy()
     xj[[535, 1540, 2528, 4700, 7000]] += 4e-3
-    spiked = measure_precursors(Trace.of({"com": clean.com, "xj": xj, "cor": clean.cor}, MS, {}))
+    spiked = measure_precursors(Trace.from_columns({"com": clean.com, "xj": xj, "cor": clean.cor}, MS, {}))
     for name in ("overshoot_5mm", "overshoot_1mm", "break_away", "settling_time_5mm", "slip_speed"):
         assert spiked[name].value == pytest.approx(measure_precursors(clean)[name].value, rel=0.05)
     few, many = clean.xj.copy(), clean.xj.copy()
     few[2000:2030], many[2000:2500] = np.nan, np.nan
-    holed = measure_precursors(Trace.of({"com": clean.com, "xj": few, "cor": clean.cor}, MS, {}))
+    holed = measure_precursors(Trace.from_columns({"com": clean.com, "xj": few, "cor": clean.cor}, MS, {}))
     assert holed.keys() == measure_precursors(clean).keys()
-    assert measure_precursors(Trace.of({"com": clean.com, "xj": many, "cor": clean.cor}, MS, {})) == {}
+    assert measure_precursors(Trace.from_columns({"com": clean.com, "xj": many, "cor": clean.cor}, MS, {})) == {}
 
 
 def test_what_a_command_does_not_show() -> None:

@@ -57,7 +57,8 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
         pytest.skip("needs gcc")
     case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
     run = cases.measure_case(case, "est").trace
-    trace = record_plant({}).of({name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}, 1e-3, {})
+    columns = {name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}
+    trace = record_plant({}).from_columns(columns, 1e-3, {})
     found = refine_sizes(MODEL, hold_inputs(trace))
     true = case.effects[0].value
     assert found.is_explained and found.fss.low * 0.98 < true < found.fss.high * 1.02

@@ -27,7 +27,8 @@ from plant.segments import Chirp, Hold, Ramp, Step
 from rig.sequences import load_sequence
 
 PREFLIGHT = load_sequence("preflight").main_profile()
-PLANTS = [name for name in Model().names() if name.startswith(("torque", "pilot", "valve.f", "jack.area", "feedback"))]
+PLANTS = [name for name in Model().list_names()
+          if name.startswith(("torque", "pilot", "valve.f", "jack.area", "feedback"))]
 
 
 @cache
@@ -40,7 +41,7 @@ def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0)
 
 
 def of(columns: object) -> Trace:
-    return Trace.of(columns._asdict(), 1e-3, {})  # type: ignore[attr-defined]
+    return Trace.from_columns(columns._asdict(), 1e-3, {})  # type: ignore[attr-defined]
 
 
 def map_of(kintas: float, fss: float) -> Map:
@@ -143,7 +144,7 @@ def test_gaps_are_left_out() -> None:
     holes = {name: whole.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs", "load")}
     holes["xj"][700:760] = np.nan
     holes["cor"][2000:2002] = np.nan
-    grid = search_grid(Trace.of(holes, 1e-3, {}))
+    grid = search_grid(Trace.from_columns(holes, 1e-3, {}))
     assert not np.isnan(grid.joint.rms).any()
     assert grid.joint.minimum.fss == pytest.approx(30.0, abs=9.0)
 

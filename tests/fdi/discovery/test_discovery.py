@@ -106,7 +106,7 @@ def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
     t = np.arange(3000) * 1e-3
     com = 5e-3 * np.sign(np.sin(2 * np.pi * t))
     columns = simulate(Model().replace(changes), com, seed=seed)
-    return Trace.of(columns._asdict(), 1e-3, {})
+    return Trace.from_columns(columns._asdict(), 1e-3, {})
 
 
 def test_the_firmware_leaves_its_mark_without_noise() -> None:
@@ -164,12 +164,13 @@ def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Pa
 
 
 def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
-    short = Trace.of({k: v[:50] for k, v in _recorded({}).__dict__.items() if k in ("com", "xj", "cor")}, 1e-3, {})
+    columns = {k: v[:50] for k, v in _recorded({}).__dict__.items() if k in ("com", "xj", "cor")}
+    short = Trace.from_columns(columns, 1e-3, {})
     with pytest.raises(InputError, match="at least 200 cycles"):
         hold_inputs(short)
     with pytest.raises(InputError, match="measured signal"):
         trace = _recorded({})
-        hold_inputs(Trace.of({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
+        hold_inputs(Trace.from_columns({"com": trace.com, "xj": trace.xj, "cor": trace.cor}, 1e-3, {}), ("xj", "p12"))
 
 
 @pytest.mark.parametrize("hertz", [11.4767, 99.6187])

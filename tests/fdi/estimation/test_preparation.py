@@ -30,14 +30,14 @@ def columns(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def made(period: float = 1e-3, **changes: np.ndarray) -> Trace:
-    return Trace.of(columns(**changes), period, {})
+    return Trace.from_columns(columns(**changes), period, {})
 
 
 def test_a_plain_trace_stays_as_it_is() -> None:
     trace = record_healthy()
     (c,) = read_cycles(trace, MODEL)
     assert c.outputs == ("xj", "p12", "xs") and c.notes == () and c.usable.all() and not c.filled.any()
-    assert (c.cor == trace.cor).all() and (c.measured("xs") == trace.xs).all() and len(c) == len(trace)
+    assert (c.cor == trace.cor).all() and (c.mask_unusable("xs") == trace.xs).all() and len(c) == len(trace)
     (c,) = read_cycles(trace, MODEL, ["xs", "xj"])
     assert c.outputs == ("xj", "xs") and np.isnan(c.p12).all()
 
@@ -61,7 +61,7 @@ def test_what_cannot_be_is_refused_in_a_line(changes: dict[str, np.ndarray], fie
 
 def test_too_short_and_times_in_ms() -> None:
     with pytest.raises(InputError, match=f"at least {FEWEST_ROWS} rows, not 100"):
-        read_cycles(Trace.of({name: x[:100] for name, x in columns().items()}, 1e-3, {}), MODEL)
+        read_cycles(Trace.from_columns({name: x[:100] for name, x in columns().items()}, 1e-3, {}), MODEL)
     with pytest.raises(InputError, match="times in s, one row a cycle; the rows are 1 s apart"):
         read_cycles(made(1.0, t=np.arange(13_500.0)), MODEL)
     with pytest.raises(InputError, match="some of xj,p12,xs"):
@@ -72,12 +72,12 @@ def test_too_short_and_times_in_ms() -> None:
 
 def test_rows_at_2_khz_are_taken_once_a_cycle() -> None:
     twice = {name: np.repeat(x, 2) for name, x in columns().items() if name != "t"}
-    (c,) = read_cycles(Trace.of(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
+    (c,) = read_cycles(Trace.from_columns(twice | {"t": np.arange(27_000) * 5e-4}, 5e-4, {}), MODEL)
     assert c.period == 1e-3 and (c.cor == record_healthy().cor).all() and "one row a cycle" in c.notes[0]
 
 
 def test_rows_at_500_hz_can_be_read_in_two_ways() -> None:
-    half = Trace.of({name: x[::2] for name, x in columns().items()}, 2e-3, {})
+    half = Trace.from_columns({name: x[::2] for name, x in columns().items()}, 2e-3, {})
     slow, sparse = read_cycles(half, MODEL)
     assert slow.period == 2e-3 and len(slow) == 6750 and "taken as the trace's, 2 ms" in slow.notes[0]
     assert sparse.period == 1e-3 and len(sparse) == 13_499 and "one cycle in 2" in sparse.notes[0]
@@ -114,7 +114,7 @@ def test_a_sensor_that_hangs_is_left_out_while_it_does() -> None:
 
 
 def test_a_trace_that_starts_in_motion() -> None:
-    (c,) = read_cycles(Trace.of({name: x[9700:] for name, x in columns().items()}, 1e-3, {}), MODEL)
+    (c,) = read_cycles(Trace.from_columns({name: x[9700:] for name, x in columns().items()}, 1e-3, {}), MODEL)
     assert not c.usable[:300].any() and c.usable[300] and "already moves" in c.notes[0]
 
 
@@ -142,7 +142,7 @@ def test_cubics_fill_gaps_and_long_gaps_are_held() -> None:
 def test_a_repeat_is_found_by_its_command() -> None:
     (c,) = read_cycles(record_healthy(), MODEL)
     assert find_repeat(c, record_healthy(1), MODEL, 1).late == 0
-    later = Trace.of({name: x[100:] for name, x in columns().items()}, 1e-3, {})
+    later = Trace.from_columns({name: x[100:] for name, x in columns().items()}, 1e-3, {})
     repeat = find_repeat(c, later, MODEL, 1)
     assert repeat.late == 100
     rows = align_columns({"xj": repeat.trace.xj}, repeat.late, len(c))["xj"]
@@ -153,7 +153,7 @@ def test_a_repeat_is_found_by_its_command() -> None:
     with pytest.raises(InputError, match="a signal that the trace has too"):
         find_repeat(read_cycles(record_healthy(), MODEL, ["xs"])[0], made(xs=np.full(13_500, np.nan)), MODEL, 1)
     with pytest.raises(InputError, match="rows as in the trace"):
-        find_repeat(c, Trace.of({name: x[::3] for name, x in columns().items()}, 2.5e-3, {}), MODEL, 1)
+        find_repeat(c, Trace.from_columns({name: x[::3] for name, x in columns().items()}, 2.5e-3, {}), MODEL, 1)
 
 
 def test_rows_that_the_check_of_the_firmware_leaves_out() -> None:
@@ -163,12 +163,12 @@ def test_rows_that_the_check_of_the_firmware_leaves_out() -> None:
     (c,) = read_cycles(made(cor=cor, com=com, xj=xj), MODEL)
     assert np.flatnonzero(c.incomplete).tolist() == [5000, 6000, 7000]
 
-    late = Trace.of({name: x[20:] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 1e-3, {})
+    late = Trace.from_columns({name: x[20:] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 1e-3, {})
     (first,) = read_cycles(record_healthy(), MODEL)
     moved = align_repeat(find_repeat(first, late, MODEL, 1), len(first))
     assert np.flatnonzero(moved.incomplete).tolist() == [*range(20), 7000]
 
-    slow = Trace.of({name: x[::2] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 2e-3, {})
+    slow = Trace.from_columns({name: x[::2] for name, x in columns(cor=cor, com=com, xj=xj).items()}, 2e-3, {})
     spread = read_cycles(slow, MODEL)[-1]
     assert len(spread) == 2 * len(slow) - 1 and (spread.incomplete == np.isnan(spread.xj)).all()
 

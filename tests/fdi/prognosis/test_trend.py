@@ -111,7 +111,7 @@ def test_the_law_is_recognised_and_the_time_left_found(law: str) -> None:
     assert left.low <= 140.0 - WEEKS[-1] <= left.high and left.high < 500.0
     assert found.remaining["maintenance"].value <= left.value
     assert found.now.low <= 5.0 + 65.0 * grown[-1] <= found.now.high
-    assert left.within(left.value) == pytest.approx(0.5, abs=0.01)
+    assert left.compute_probability_within(left.value) == pytest.approx(0.5, abs=0.01)
 
 
 def test_what_does_not_grow_has_no_trend() -> None:
@@ -290,7 +290,7 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     made = simulate(load_model(), command, seed=4)
     (tmp_path / "unit").mkdir()
     there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
-    Trace.of(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
+    Trace.from_columns(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
     monkeypatch.setattr(gather, "find_cache_folder", lambda: tmp_path / "cache")
     first = rig("trend", tmp_path / "unit", "--json")
     assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"

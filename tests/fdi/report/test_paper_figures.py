@@ -23,7 +23,7 @@ PREFLIGHT = load_sequence("preflight").main_profile().command
 def trace(kintas: float, fss: float) -> Trace:
     model = Model().replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
-    return Trace.of(simulate(model, PREFLIGHT)._asdict(), 1e-3, {})
+    return Trace.from_columns(simulate(model, PREFLIGHT)._asdict(), 1e-3, {})
 
 
 def texts(svg: str) -> set[str]:
@@ -63,7 +63,7 @@ def test_the_maps() -> None:
 @pytest.mark.parametrize("cells", [1, 2, 5])
 def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
     com = build_profile([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
-    measured = Trace.of(simulate(Model(), com)._asdict(), 1e-3, {})
+    measured = Trace.from_columns(simulate(Model(), com)._asdict(), 1e-3, {})
     grid = search_grid(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
     said = texts(figures.draw_maps(grid))
     assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -149,7 +149,8 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     np.testing.assert_allclose(line[:59], values[:59], atol=0.01)
     assert np.isnan(run_figures._bridge_short_gaps(np.full(5, np.nan))).all()
     columns = {"com": values, "xj": values, "cor": values}
-    sound, broken = (run_figures.draw_signals(Trace.of({**columns, "xj": xj}, 1e-3, {})) for xj in (values, holes))
+    traces = [Trace.from_columns({**columns, "xj": xj}, 1e-3, {}) for xj in (values, holes)]
+    sound, broken = (run_figures.draw_signals(trace) for trace in traces)
     assert drawing.RED in broken and drawing.RED not in sound
 
 

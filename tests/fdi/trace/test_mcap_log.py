@@ -25,7 +25,7 @@ def rewrite(log: Log, path: Path, index_types: IndexType) -> Log:
             schema = log.schemas[channel.schema_id]
             number = writer.register_channel(channel.topic, channel.message_encoding,
                                              writer.register_schema(schema.name, schema.encoding, schema.data))
-            for _, time_ns, message in log.messages(channel.topic):
+            for _, time_ns, message in log.read_messages(channel.topic):
                 writer.add_message(number, time_ns, message.SerializeToString(), time_ns)
         writer.finish()
     return open_log(path)
@@ -34,7 +34,7 @@ def rewrite(log: Log, path: Path, index_types: IndexType) -> Log:
 @pytest.mark.parametrize("topic", ["/signals", "/timing"])
 def test_columns_equal_the_parsed_messages(log: Log, topic: str) -> None:
     columns = log.read_columns(topic)
-    messages = [(time_ns, message) for _, time_ns, message in log.messages(topic)]
+    messages = [(time_ns, message) for _, time_ns, message in log.read_messages(topic)]
     assert len(messages) > 100
     assert columns["time_ns"].tolist() == [time_ns for time_ns, _ in messages]
     for name in columns.keys() - {"time_ns"}:
@@ -54,5 +54,5 @@ def test_columns_of_another_writer_are_the_same(log: Log, tmp_path: Path, index_
 
 def test_a_topic_without_numbers_alone_is_read_too(log: Log) -> None:
     columns = log.read_columns("/events")
-    assert len(columns["text"]) == len(list(log.messages("/events"))) > 0
+    assert len(columns["text"]) == len(list(log.read_messages("/events"))) > 0
     assert len(log.read_columns("/nothing")["time_ns"]) == 0

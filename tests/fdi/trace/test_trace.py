@@ -108,7 +108,7 @@ def test_csv_there_and_back(run: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_trace_of_columns() -> None:
-    trace = Trace.of({"com": np.zeros(3), "xj": np.ones(3), "cor": np.zeros(3)}, 1e-3, {"model": "eha"})
+    trace = Trace.from_columns({"com": np.zeros(3), "xj": np.ones(3), "cor": np.zeros(3)}, 1e-3, {"model": "eha"})
     assert trace.t.tolist() == [0, 0.001, 0.002] and trace.signals == ("com", "xj", "cor")
 
 

@@ -134,6 +134,6 @@ def test_a_users_own_effect(folder: Path) -> None:
 
 def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
     short = {name: getattr(record_healthy(2), name)[:300] for name in ("com", "xj", "cor", "p12", "xs")}
-    Trace.of(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
+    Trace.from_columns(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
     said = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
     assert said.status in (0, 1) and (tmp_path / "short.html").exists(), said.err

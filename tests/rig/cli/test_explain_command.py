@@ -150,7 +150,7 @@ def test_effects_of_a_model_are_free_from_where_they_are() -> None:
     assert own["null_bias.current"].centre == 1e-4 and np.isinf(own["null_bias.current"].prior)
     names = [f.name for f in all_unknowns(model)]
     assert len(names) == len(set(names)) and {"jack.mass", "null_bias.current"} <= set(names)
-    assert not active_effects(Model()) and not own_unknowns(Model().having(["null_bias"]))
+    assert not active_effects(Model()) and not own_unknowns(Model().with_effects(["null_bias"]))
 
 
 def test_numbers_in_words() -> None:

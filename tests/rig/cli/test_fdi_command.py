@@ -168,4 +168,4 @@ def load_trace_with_hole(path: Path, rows: slice) -> Trace:
     columns = {name: trace.column(name).copy() for name in ("com", "xj", "cor", "p12", "xs")}
     for column in columns.values():
         column[rows] = np.nan
-    return Trace.of(columns, trace.period, {})
+    return Trace.from_columns(columns, trace.period, {})

@@ -57,7 +57,7 @@ def send_by_timer(factor: float) -> Any:
 
         def tick(t_ns: int) -> None:
             old(t_ns)
-            period = device.od.number(0x1800, 5) * MS * factor
+            period = device.od.read_number(0x1800, 5) * MS * factor
             if period and device.state is NmtState.OPERATIONAL and t_ns - last[0] >= period:
                 last[0] = t_ns
                 device.pdo.tpdos[1].send()
@@ -106,8 +106,8 @@ def map_freely(*rules: str) -> Any:
             if index not in bases:
                 old(index, sub, value)
                 return
-            is_valid = not device.od.number(bases[index], 1) & INVALID
-            if "off" in rules and (is_valid or (sub and device.od.number(index, 0))):
+            is_valid = not device.od.read_number(bases[index], 1) & INVALID
+            if "off" in rules and (is_valid or (sub and device.od.read_number(index, 0))):
                 raise SdoAbort(0x08000022)
             if sub:
                 entry = device.od.entries.get((value >> 16, value >> 8 & 0xFF))
@@ -115,7 +115,7 @@ def map_freely(*rules: str) -> Any:
                     raise SdoAbort(0x06020000)
                 if entry is not None and not entry.mappable and "mappable" in rules:
                     raise SdoAbort(0x06040041)
-            elif "length" in rules and sum(device.od.number(index, n) & 0xFF for n in range(1, value + 1)) > 64:
+            elif "length" in rules and sum(device.od.read_number(index, n) & 0xFF for n in range(1, value + 1)) > 64:
                 raise SdoAbort(0x06040042)
         device._check = check
     return patch

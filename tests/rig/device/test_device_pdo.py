@@ -164,7 +164,7 @@ def test_a_frame_that_waits_for_sync_is_dropped_when_its_pdo_is_switched_off() -
     assert rack.device.read(0x2205) == 0
 
 
-def writable(tmp_path: Path, *sections: str) -> Rack:
+def require_writable(tmp_path: Path, *sections: str) -> Rack:
     """Node 3 with a dictionary in which these constants may be written."""
     text = EDS[3].read_text()
     for section in sections:
@@ -179,7 +179,7 @@ def writable(tmp_path: Path, *sections: str) -> Rack:
 
 
 def test_identifier_of_emcy_follows_the_same_rules(tmp_path: Path) -> None:
-    rack = writable(tmp_path, "1014")
+    rack = require_writable(tmp_path, "1014")
     assert download(rack, 0x1014, 0, 0x84, 4).hex() == "8014100022000008"
     assert download(rack, 0x1014, 0, 0x80000083, 4)[0] == 0x60
     assert rack.send(0x182, b"") == []
@@ -190,7 +190,7 @@ def test_identifier_of_emcy_follows_the_same_rules(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [0x40000080, 0x20000080, 0x701, 0x0])
 def test_identifier_of_sync_may_not_be_restricted_nor_make_a_producer(tmp_path: Path, value: int) -> None:
-    rack = writable(tmp_path, "1005")
+    rack = require_writable(tmp_path, "1005")
     assert download(rack, 0x1005, 0, value, 4).hex() == "8005100030000906"
     assert download(rack, 0x1005, 0, 0x90, 4)[0] == 0x60
     assert rack.sync() == []
@@ -200,7 +200,7 @@ def test_identifier_of_sync_may_not_be_restricted_nor_make_a_producer(tmp_path: 
 def test_a_mapping_that_a_master_could_change_is_refused(tmp_path: Path) -> None:
     """The core reads mappings once: it must not confirm a change that has no effect."""
     with pytest.raises(InputError, match=r"1A00sub1\.AccessType: expected const"):
-        writable(tmp_path, "1A00sub1")
+        require_writable(tmp_path, "1A00sub1")
 
 
 def test_short_pdo_is_not_processed_and_says_so_once() -> None:

@@ -111,7 +111,7 @@ def test_bring_up(wire: Wire) -> None:
     for node in (CONTROLLER, PLANT):
         states = [state for n, state in seen if n == node]
         assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
-    assert master.errors() == [] and not master.hears_rival(0.0)
+    assert master.list_errors() == [] and not master.hears_rival(0.0)
 
 
 def test_a_rig_that_stood_still_knows_how_long_answers_may_have_waited(wire: Wire) -> None:
@@ -177,9 +177,9 @@ def test_a_short_sdo_response_is_none() -> None:
 def test_emergencies_come_and_go() -> None:
     master = alone()
     master.receive(Frame(0, 0x083, bytes.fromhex("5082110100000000")))
-    assert master.errors() == [3]
+    assert master.list_errors() == [3]
     master.receive(Frame(0, 0x083, bytes(8)))
-    assert master.errors() == []
+    assert master.list_errors() == []
 
 
 def test_a_boot_up_ends_the_errors_of_a_node() -> None:
@@ -187,7 +187,7 @@ def test_a_boot_up_ends_the_errors_of_a_node() -> None:
     master = alone()
     master.receive(Frame(0, 0x082, bytes.fromhex("3081110000000000")))
     master.receive(Frame(0, 0x702, bytes(1)))
-    assert master.errors() == []
+    assert master.list_errors() == []
 
 
 @pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x202, 0x701])

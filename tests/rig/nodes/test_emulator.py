@@ -38,7 +38,7 @@ STOP = 200
 def scenario(*faults: Fault, model: Model = QUIET_MODEL, load: tuple[int, ...] = (), start: int = 0) -> Scenario:
     plan = Plan(faults=faults, start=start, stop=STOP)
     groups = {fault.parameter.partition(".")[0] for fault in faults if isinstance(fault, Parameter)}
-    return Scenario(model.having(groups), plan, load)
+    return Scenario(model.with_effects(groups), plan, load)
 
 
 def counters(desk: PlantDesk) -> tuple[Any, Any]:

@@ -239,7 +239,7 @@ class TestServices:
         schedule = Schedule(scenario.plan)
         script: list[tuple[int, bytes]] = []
         for k in range(14):
-            action = schedule.frame("sync", k)
+            action = schedule.find_action("sync", k)
             script += [(codec.SYNC, b"")] * (0 if isinstance(action, Drop) else 2 if isinstance(action, Double) else 1)
             script.append((codec.DRIVE, codec.pack_drive(1e-4 * k, 15, k)))
         expected: list[tuple[int, bytes]] = []

@@ -27,7 +27,7 @@ def read_columns(folder: Path) -> np.ndarray:
 
 
 def read_frames(folder: Path) -> list[tuple[int, bytes]]:
-    return [(m.cob_id, m.data) for _, _, m in open_log(folder / "trace.mcap").messages("/can")]
+    return [(m.cob_id, m.data) for _, _, m in open_log(folder / "trace.mcap").read_messages("/can")]
 
 
 def emergencies(outcome: Outcome) -> list[str]:

@@ -59,7 +59,7 @@ def test_all_that_decides_is_in_the_log(tmp_path: Path) -> None:
     first = job(seed=7, set_={"filter.clogging": 0.2, "sensor_lag.time": 1e-3}, max_overruns=0.5, plant="builtin")
     play(first, tmp_path / "a")
     again = read_job(tmp_path / "a" / "trace.mcap")
-    assert (again.model, again.sequence, again.settings()) == (first.model, first.sequence, first.settings())
+    assert (again.model, again.sequence, again.list_settings()) == (first.model, first.sequence, first.list_settings())
     play(again, tmp_path / "b")
     assert same(tmp_path / "a", tmp_path / "b")
     assert read_job(tmp_path / "b" / "trace.mcap") == again

@@ -53,7 +53,8 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     from fdi.trace.mcap_log import open_log
 
     outcome = play_sequence("reset_in_mid_run", tmp_path, set_={"controller.current_limit": 7e-3})
-    frames = [(message.cob_id, message.data) for _, _, message in open_log(tmp_path / "trace.mcap").messages("/can")]
+    log = open_log(tmp_path / "trace.mcap")
+    frames = [(message.cob_id, message.data) for _, _, message in log.read_messages("/can")]
     booted = max(k for k, frame in enumerate(frames) if frame == (0x702, b"\0"))
     started = next(k for k in range(booted, len(frames)) if frames[k] == (0x000, b"\x01\x02"))
     written = {data[1:4]: data for cob_id, data in frames[booted:started] if cob_id == 0x602 and data[0] >> 5 == 1}

@@ -67,7 +67,7 @@ def test_the_drive_is_enabled_step_by_step(tmp_path: Path) -> None:
 def control_words(folder: Path) -> list[int]:
     from fdi.trace.mcap_log import open_log
 
-    return [message.control for _, _, message in open_log(folder / "trace.mcap").messages("/signals")]
+    return [message.control for _, _, message in open_log(folder / "trace.mcap").read_messages("/signals")]
 
 
 def test_without_set_up_and_clean_up_and_a_main_of_one_cycle(tmp_path: Path) -> None:
@@ -361,7 +361,7 @@ def test_a_bench_that_is_late_in_bring_up_is_not_the_controllers_fault(
 def frames_sent(folder: Path) -> list[tuple[int, bytes]]:
     from fdi.trace.mcap_log import open_log
 
-    return [(message.cob_id, message.data) for _, _, message in open_log(folder / "trace.mcap").messages("/can")]
+    return [(message.cob_id, message.data) for _, _, message in open_log(folder / "trace.mcap").read_messages("/can")]
 
 
 def test_bring_up_begins_with_the_rigs_boot_up_and_addresses_its_own_nodes(tmp_path: Path) -> None:

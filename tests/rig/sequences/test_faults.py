@@ -52,7 +52,7 @@ def parse(text: str) -> Sequence:
 
 def test_without_faults_everything_is_as_it_was() -> None:
     s = schedule()
-    assert s.parameters_at(5) == {} and s.signal("xj", 1.5, 5) == 1.5 and s.frame("drive", 5) is None
+    assert s.parameters_at(5) == {} and s.change_signal("xj", 1.5, 5) == 1.5 and s.find_action("drive", 5) is None
     assert s.is_heartbeat_alive("plant", 5) and s.edges == ()
 
 
@@ -76,46 +76,46 @@ def test_faults_end_when_main_ends() -> None:
     clogged = Parameter(parameter="filter.clogging", value=0.5, start=1.0)
     s = schedule(clogged, Lost(frame="drive", start=1.0), stop=2000)
     assert s.parameters_at(2000) == {"filter.clogging": 0.0}
-    assert s.frame("drive", 1999) == Drop() and s.frame("drive", 2000) is None
+    assert s.find_action("drive", 1999) == Drop() and s.find_action("drive", 2000) is None
     assert s.edges[:2] == ((1000, "parameter filter.clogging", True), (2000, "parameter filter.clogging", False))
 
 
 def test_sensor_faults() -> None:
     stuck = schedule(Stuck(signal="xj", start=0.003, end=0.006))
-    assert [stuck.signal("xj", float(k), k) for k in range(8)] == [0, 1, 2, 2, 2, 2, 6, 7]
+    assert [stuck.change_signal("xj", float(k), k) for k in range(8)] == [0, 1, 2, 2, 2, 2, 6, 7]
     at_value = schedule(Stuck(signal="p12", value=7.0, start=0.0, end=0.001))
-    assert [at_value.signal("p12", 1.0, k) for k in range(2)] == [7.0, 1.0]
+    assert [at_value.change_signal("p12", 1.0, k) for k in range(2)] == [7.0, 1.0]
     offset = schedule(Offset(signal="xs", value=4.0, start=0.0, end=0.006, ramp=0.004))
-    assert [offset.signal("xs", 1.0, k) for k in range(7)] == [1, 2, 3, 4, 5, 5, 1]
-    assert offset.signal("xj", 1.0, 5) == 1.0
+    assert [offset.change_signal("xs", 1.0, k) for k in range(7)] == [1, 2, 3, 4, 5, 5, 1]
+    assert offset.change_signal("xj", 1.0, 5) == 1.0
     both = schedule(Offset(signal="xj", value=1.0, start=0.0), Stuck(signal="xj", value=9.0, start=0.0))
-    assert both.signal("xj", 0.0, 5) == 9.0  # in the order of the plan
+    assert both.change_signal("xj", 0.0, 5) == 9.0  # in the order of the plan
 
 
 def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
     fault = Noise(signal="xj", value=3e-6, start=0.0)
     one, same, other = schedule(fault, seed=1), schedule(fault, seed=1), schedule(fault, seed=2)
-    values = [one.signal("xj", 0.0, k) for k in range(10_000)]
+    values = [one.change_signal("xj", 0.0, k) for k in range(10_000)]
     assert np.std(values) == pytest.approx(3e-6, rel=0.03) and abs(np.mean(values)) < 1e-7
-    assert values[77] == same.signal("xj", 0.0, 77) != other.signal("xj", 0.0, 77)
+    assert values[77] == same.change_signal("xj", 0.0, 77) != other.change_signal("xj", 0.0, 77)
 
 
 def test_frames_are_lost_by_count_period_and_chance() -> None:
     three = schedule(Lost(frame="drive", start=0.01, count=3))
-    assert [k for k in range(30) if three.frame("drive", k) is not None] == [10, 11, 12]
+    assert [k for k in range(30) if three.find_action("drive", k) is not None] == [10, 11, 12]
     assert three.edges == ((10, "lost drive", True), (13, "lost drive", False))
     periodic = schedule(Lost(frame="feedback", start=0.0, end=0.1, every=20, count=4))
-    assert [k for k in range(200) if periodic.frame("feedback", k) == Drop()] == [0, 20, 40, 60]
+    assert [k for k in range(200) if periodic.find_action("feedback", k) == Drop()] == [0, 20, 40, 60]
     chance = schedule(Lost(frame="command", start=0.0, probability=0.2), seed=3)
-    hits = [k for k in range(10_000) if chance.frame("command", k) is not None]
+    hits = [k for k in range(10_000) if chance.find_action("command", k) is not None]
     assert len(hits) == pytest.approx(2000, abs=150)
     again = schedule(Lost(frame="command", start=0.0, probability=0.2), seed=3)
-    assert hits == [k for k in range(10_000) if again.frame("command", k) is not None]
-    assert three.frame("feedback", 10) is None
+    assert hits == [k for k in range(10_000) if again.find_action("command", k) is not None]
+    assert three.find_action("feedback", 10) is None
 
 
 def test_late_frames_say_how_late() -> None:
-    assert schedule(Late(frame="valve_state", start=0.0, delay=400e-6)).frame("valve_state", 0) == Delay(400_000)
+    assert schedule(Late(frame="valve_state", start=0.0, delay=400e-6)).find_action("valve_state", 0) == Delay(400_000)
 
 
 def test_a_silent_node_comes_back() -> None:
@@ -170,7 +170,7 @@ def test_words_stand_for_their_numbers_and_what_fits_together_is_taken() -> None
     assert s.model.overrides == {"filter.law": "pressure"}
     model = load_model("eha").replace(s.model.overrides)
     asked = Schedule(s.plan(0), {**model.values, "null_bias.current": 0.0})
-    at = [asked.parameters(k) for k in (0, 100, 999, 1000)]
+    at = [asked.list_parameters(k) for k in (0, 100, 999, 1000)]
     assert [values["filter.law"] for values in at] == [0.0, 1.0, 1.0, 0.0]
     assert [values["spool.static_friction"] for values in at] == [5.0, 5.0, 70.0, 5.0]
 
@@ -179,9 +179,9 @@ def test_a_fault_that_contradicts_the_model_of_the_run_is_refused_before_it() ->
     """The sequence is sound on the actuator it names; --set has made another of it."""
     s = parse(MAIN + 'faults = [{ kind = "parameter", parameter = "jack.static_friction", value = 600, start = 0 }]')
     other = load_model("eha").replace({"jack.dynamic_friction": 700.0})
-    Scenario.of(load_model("eha"), s.plan(0), s.load_profile(), 0)
+    Scenario.build(load_model("eha"), s.plan(0), s.load_profile(), 0)
     with pytest.raises(InputError, match=r"parameter jack.static_friction: expected jack.dynamic_friction at most "):
-        Scenario.of(other, s.plan(0), s.load_profile(), 0)
+        Scenario.build(other, s.plan(0), s.load_profile(), 0)
 
 
 def test_it_is_cheap_enough_to_ask_in_every_cycle() -> None:
@@ -190,9 +190,9 @@ def test_it_is_cheap_enough_to_ask_in_every_cycle() -> None:
     for k in range(2000):
         s.parameters_at(k)
         for signal in ("xj", "p12", "xs"):
-            s.signal(signal, 0.0, k)
+            s.change_signal(signal, 0.0, k)
         for frame in ("feedback", "valve_state", "drive", "command"):
-            s.frame(frame, k)
+            s.find_action(frame, k)
         s.is_heartbeat_alive("plant", k)
     assert (time.perf_counter() - begin) / 2000 < 100e-6  # some 5 us on an idle machine; a cycle is 1000 us
 
@@ -207,15 +207,15 @@ def test_what_arrives_of_a_frame() -> None:
 
 def test_corrupted_frames_have_as_many_bits_inverted_as_asked_for() -> None:
     s = schedule(Corrupted(frame="drive", start=0.0, end=0.1, bits=3), seed=5)
-    masks = [action.mask for k in range(100) if isinstance(action := s.frame("drive", k), Corrupt)]
+    masks = [action.mask for k in range(100) if isinstance(action := s.find_action("drive", k), Corrupt)]
     assert len(masks) == 100 and {mask.bit_count() for mask in masks} == {3} and len(set(masks)) > 90
 
 
 def test_jitter_delays_sync_within_its_size() -> None:
     s = schedule(Jitter(size=2e-4, start=0.01, end=0.5), seed=2)
-    delays = [action.ns for k in range(10, 500) if isinstance(action := s.frame("sync", k), Delay)]
+    delays = [action.ns for k in range(10, 500) if isinstance(action := s.find_action("sync", k), Delay)]
     assert len(delays) == 490 and 0 <= min(delays) < 10_000 and 190_000 < max(delays) <= 200_000
-    assert s.frame("sync", 9) is None and s.frame("sync", 500) is None
+    assert s.find_action("sync", 9) is None and s.find_action("sync", 500) is None
 
 
 def test_the_table_of_a_frame_says_what_frame_says() -> None:
@@ -230,7 +230,7 @@ def test_the_table_of_a_frame_says_what_frame_says() -> None:
         assert hits[hits[:, 0] < 1900].tolist() == [[k, *row] for k, row in enumerate(table.tolist()) if row[0]]
         found |= set(hits[:, 1].tolist())
         for k, (code, argument) in enumerate(table.tolist()):
-            action = s.frame(name, k)
+            action = s.find_action(name, k)
             assert type(action) is kinds.get(code, type(None)), (name, k)
             assert argument & (1 << 64) - 1 == (action[0] if action else 0)
     assert found == set(kinds)
@@ -248,8 +248,8 @@ def test_frames_of_other_nodes() -> None:
 def test_a_node_that_is_bus_off_sends_and_receives_nothing() -> None:
     s = schedule(BusOff(node="plant", start=0.1, end=0.2), BusOff(node="rig", start=0.3, end=0.4))
     for name in ("feedback", "valve_state", "drive"):
-        assert [s.frame(name, k) for k in (99, 100, 199, 200)] == [None, Drop(), Drop(), None]
-    assert s.frame("command", 300) == s.frame("sync", 399) == Drop() and s.frame("sync", 150) is None
+        assert [s.find_action(name, k) for k in (99, 100, 199, 200)] == [None, Drop(), Drop(), None]
+    assert s.find_action("command", 300) == s.find_action("sync", 399) == Drop() and s.find_action("sync", 150) is None
     assert s.is_bus_off("plant", 150) and not s.is_bus_off("rig", 150) and not s.is_heartbeat_alive("rig", 350)
     assert s.count_lost_syncs(300) == 100 and s.count_lost_syncs(299) == 0
 

@@ -281,14 +281,14 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
     n = 400
     columns = {name: np.linspace(0.0, 1e-3, n) for name in ("com", "xj", "cor", "p12", "xs", "load")}
     for name in ("b.csv", "a.csv.gz"):
-        Trace.of(columns, 1e-3, {}).write_csv(tmp_path / name)
+        Trace.from_columns(columns, 1e-3, {}).write_csv(tmp_path / name)
     (tmp_path / "c.csv").write_text("nothing\n1\n")
     words = ("campaign", tmp_path, "--out", tmp_path / "out", *MATRIX[-2:], "--json", "--jobs", 1)
     said = rig(*words)
     assert said.json["status"] == {"ok": 2, "refused": 1} and said.status == 0
     assert [row["label"] for row in rows(tmp_path / "out")] == ["a.csv.gz", "b.csv", "c.csv"]
     assert rows(tmp_path / "out")[2]["reason"].startswith(str(tmp_path / "c.csv"))
-    Trace.of(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
+    Trace.from_columns(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
     assert "it differs in files" in rig(*words).err
 
 

@@ -116,7 +116,7 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     drawn = [hidden.draw_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
              for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
     drawn = [effect for effect in drawn if effect.name != "command_rate_limit"]  # not in the plant
-    model = Model().having(effect.name for effect in drawn)
+    model = Model().with_effects(effect.name for effect in drawn)
     names = sorted({name for effect in drawn for name in plants(effect)})
     rows = [[plants(effect).get(name, model[name]) for name in names] for effect in drawn]
     ours = Lanes(model, names, 100).replay(np.array(rows), drive, load)
