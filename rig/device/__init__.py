@@ -2,7 +2,7 @@
 from rig.device.device import Device
 from rig.device.dictionary import Dictionary, Value
 from rig.device.emcy import EmcyCode, ErrorRegister
-from rig.device.nmt import NmtCommand, NmtState
 from rig.device.sdo import Abort, SdoAbort
+from rig.network.nmt_states import NmtCommand, NmtState
 
 __all__ = ["Abort", "Device", "Dictionary", "EmcyCode", "ErrorRegister", "NmtCommand", "NmtState", "SdoAbort", "Value"]

@@ -2,29 +2,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum
 
 from rig.network.frame import Frame
-
-
-class NmtState(IntEnum):
-    """States as the heartbeat carries them."""
-
-    INITIALISING = 0
-    STOPPED = 4
-    OPERATIONAL = 5
-    PRE_OPERATIONAL = 127
-
-
-class NmtCommand(IntEnum):
-    """Command specifiers of the frame 0x000."""
-
-    START = 1
-    STOP = 2
-    ENTER_PRE_OPERATIONAL = 128
-    RESET_NODE = 129
-    RESET_COMMUNICATION = 130
-
+from rig.network.nmt_states import NmtCommand, NmtState
 
 _TARGET = {
     NmtCommand.START: NmtState.OPERATIONAL,

@@ -15,29 +15,24 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from dbc import EDS
 from plant.errors import InputError, RigError
-from rig.device.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from rig.device.nmt import NmtCommand, NmtState
 from rig.network import codec
+from rig.network.cycle_record import CycleRecord, decode_cycle_record
 from rig.network.frame import Frame
+from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from rig.network.identity import Identity, read_identity
+from rig.network.nmt_states import NmtCommand, NmtState
+from rig.network.node_objects import CONTROLLER, CYCLE_RECORD, GAINS, NAMES, PLANT, RIG, SCENARIO, Gains
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import Wire
-from rig.nodes import firmware
-from rig.nodes.cycle_record import CycleRecord, decode_cycle_record
-from rig.nodes.emulator import SCENARIO
-from rig.nodes.firmware import GAINS, Gains
 
-NODE, CONTROLLER, PLANT = 1, 2, 3
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 QUICK_HEARTBEAT = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
-RECORD = 0x2212  # object of the plant
 BOOT_TIMEOUT = 2.0  # s
 SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
-_OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + NODE)  # frames that only the rig may send
+_OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + RIG)  # frames that only the rig may send
 R = TypeVar("R")
 _BROKEN_OFF = (0x05030000, 0x05040000, 0x05040001)  # aborts of a server that has lost a transfer, or given it up
-NAMES = {NODE: "rig", CONTROLLER: "controller", PLANT: "plant"}
 
 
 class BusError(RigError):
@@ -99,7 +94,7 @@ class Master:
         self._rivals: set[int] = set()  # our own COB-IDs that another node sends
         self.network = _Network(wire, self.send)
         self._nodes = {node: self._join(node) for node in (PLANT, CONTROLLER)}
-        self._beat = HeartbeatProducer(NODE, self._send_heartbeat)
+        self._beat = HeartbeatProducer(RIG, self._send_heartbeat)
         self._beat_ns = self._last_pause_ns = 0  # when the rig's own heartbeat was sent; the time between the last two
         self._limit_ns = 0  # after which the nodes miss it
         self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
@@ -220,7 +215,7 @@ class Master:
 
     def read_plant_record(self) -> CycleRecord | None:
         """The plant's own record of its cycles (object 0x2212); None if it has none."""
-        data = self._upload(PLANT, RECORD, 0)
+        data = self._upload(PLANT, CYCLE_RECORD, 0)
         try:
             record = decode_cycle_record(data or b"")
         except InputError:  # of a foreign plant
@@ -243,7 +238,7 @@ class Master:
             self._set(CONTROLLER, GAINS, sub, value)
         for node in (CONTROLLER, PLANT):
             foreign = node == CONTROLLER and gains is None
-            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, NODE << 16 | limit_ms), (0x1017, 0, QUICK_HEARTBEAT))
+            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, RIG << 16 | limit_ms), (0x1017, 0, QUICK_HEARTBEAT))
             for index, sub, value in settings:
                 self._keep(node, index, sub)
                 try:
@@ -406,6 +401,3 @@ def repeat_transfer(transfer: Callable[[], R], attempts: int = 3) -> R:
             if error.code not in _BROKEN_OFF:
                 raise
     return transfer()
-
-
-assert firmware.NODE == CONTROLLER

@@ -18,14 +18,13 @@ from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbor
 from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.frame import Frame, Send
+from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import Delay, Double, Plan, Schedule, apply_action
 
-NODE = 3
-SCENARIO, COUNTERS = 0x2210, 0x2211
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 _NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
-_HEARTBEAT = 0x700 + NODE
+_HEARTBEAT = 0x700 + PLANT
 _NO_FLAGS = Flags(0)  # made once: an operation on an IntFlag takes a microsecond
 
 
@@ -48,7 +47,7 @@ class Emulator:
 
     def __init__(self, send: Send, scenario: Scenario | None = None) -> None:
         self._send = send
-        self.device = Device(NODE, EDS[NODE], self._transmit)
+        self.device = Device(PLANT, EDS[PLANT], self._transmit)
         self.device.on_sync = self._on_sync
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt

@@ -24,6 +24,7 @@ from plant.model import STEPS
 from plant.run import PRESSURE, SENSED, SPOOL
 from plant.segments import RATE
 from plant.solve import NOISES
+from rig.network.cycle_record import RING
 from rig.network.raw_bus import (
     FRAME,
     NEVER,
@@ -39,7 +40,6 @@ from rig.network.raw_bus import (
     sleep_until,
     split_words,
 )
-from rig.nodes.cycle_record import RING
 from rig.sequences.faults import Schedule
 from rig.sequences.frame_faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 from rig.sequences.injection import AddedSignal

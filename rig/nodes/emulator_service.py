@@ -7,9 +7,10 @@ in its socket.
 """
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from typing import Any
 
@@ -27,19 +28,18 @@ from plant.run import load_stored_advance, report_law_errors
 from plant.solve import NOISES, read_flat_sensors
 from rig.device import Device, EmcyCode, ErrorRegister, NmtState
 from rig.network import codec
+from rig.network.cycle_record import RING, CycleRecord, encode_cycle_record
 from rig.network.frame import Frame, Send
+from rig.network.node_objects import COUNTERS, CYCLE_RECORD, PLANT, SCENARIO
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.cycle_record import RING, CycleRecord, encode_cycle_record
-from rig.nodes.emulator import COUNTERS, NODE, SCENARIO, accept_scenario
+from rig.nodes.emulator import accept_scenario
 from rig.nodes.scenario import Scenario
-from rig.run.priority import enter_loop_thread, list_cpus
 from rig.sequences.faults import Plan, Schedule
 
-RECORD = 0x2212
 # what the services need not hear: the PDOs, and what the loop hears
 LEFT_OUT = (0x000, codec.SYNC, codec.DRIVE, codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE)
-_HEARTBEAT, _EMCY, _SDO, _REPLY = 0x700 + NODE, 0x080 + NODE, 0x600 + NODE, 0x580 + NODE
+_HEARTBEAT, _EMCY, _SDO, _REPLY = 0x700 + PLANT, 0x080 + PLANT, 0x600 + PLANT, 0x580 + PLANT
 _COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
 _STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
 
@@ -47,11 +47,13 @@ _STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, f
 class EmulatorService:
     """The plant node on a bus of its own. Its interface is `receive` and `tick`, as that of `Emulator`, and `close`.
 
-    `send` is for the services; the loop uses `bus`. `is_locked`: the memory of the process is locked.
+    `send` is for the services; the loop uses `bus`. `enter_thread` gives the loop's thread its priority and its CPU and
+    yields the name of the scheduler. `is_locked`: the memory of the process is locked.
     """
 
-    def __init__(self, send: Send, bus: RawBus, scenario: Scenario | None = None, is_locked: bool = False) -> None:
-        self._send, self._bus, self._is_locked = send, bus, is_locked
+    def __init__(self, send: Send, bus: RawBus, enter_thread: Callable[[], AbstractContextManager[str]],
+                 scenario: Scenario | None = None, is_locked: bool = False) -> None:
+        self._send, self._bus, self._enter_thread, self._is_locked = send, bus, enter_thread, is_locked
         self._thread: threading.Thread | None = None
         self._kind = _COMPILED
         self._obeying = False  # an NMT command, which the loop obeys by itself
@@ -59,7 +61,7 @@ class EmulatorService:
         self._booking = False  # an error whose EMCY the loop has sent
         self._scenario: Scenario | None = None
         self._seen = self._last_sync = 0
-        self.device = Device(NODE, EDS[NODE], self._transmit)
+        self.device = Device(PLANT, EDS[PLANT], self._transmit)
         self.device.on_write = self._on_write
         self.device.on_nmt = self._on_nmt
         self._od = self.device.od.values
@@ -132,9 +134,9 @@ class EmulatorService:
             self._thread.start()
 
     def _serve(self) -> None:
-        with enter_loop_thread() as scheduler:
+        with self._enter_thread() as scheduler:
             self._kind = _COMPILED | _FIFO * (scheduler == "SCHED_FIFO") | _LOCKED * self._is_locked
-            self._kind |= _PINNED * (len(list_cpus()) == 1)
+            self._kind |= _PINNED * (len(os.sched_getaffinity(0)) == 1)
             self._run(self._bus.port, self._memory)
 
     def _halt(self) -> None:
@@ -161,7 +163,7 @@ class EmulatorService:
         """Do what the loop has done at an NMT command, or left to the services."""
         self._obeying = True
         try:
-            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, NODE))))
+            self.device.receive(Frame(self.device.t_ns, 0, bytes((command, PLANT))))
         finally:
             self._obeying = False
 
@@ -277,8 +279,8 @@ class EmulatorService:
                   *longest, self._kind)
         for sub, value in enumerate(counts, 1):
             od[COUNTERS, sub] = min(int(value), 0xFFFFFFFF)
-        if len(request) == 8 and request[0] >> 5 == 2 and int.from_bytes(request[1:3], "little") == RECORD:
-            od[RECORD, 0] = encode_cycle_record(self.read_record())
+        if len(request) == 8 and request[0] >> 5 == 2 and int.from_bytes(request[1:3], "little") == CYCLE_RECORD:
+            od[CYCLE_RECORD, 0] = encode_cycle_record(self.read_record())
 
     def read_record(self) -> CycleRecord:
         """The record of the cycles so far, at most the last RING."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from math import isfinite
-from typing import NamedTuple, cast
+from typing import cast
 
 from dbc import EDS
 from plant.controller import Loop, compute_current
@@ -17,30 +17,14 @@ from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbor
 from rig.network import codec
 from rig.network.codec import Control, Status
 from rig.network.frame import Send
+from rig.network.node_objects import CONTROLLER, GAINS, Gains
 
-NODE = 2
-GAINS = 0x2110
 # As plain integers: an operation on an IntFlag takes a microsecond, and there are five in each cycle.
 _RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
 _LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
 _CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
 LOST_AFTER = 3  # SYNCs in a row without feedback, or without a command
 _COMMAND_PDO, _FEEDBACK_PDO = b"\x01", b"\x02"  # RPDO numbers, first information byte of EMCY 0x8250
-
-
-class Gains(NamedTuple):
-    """Object 0x2110 sub 1..5: the fields of `plant.parameters.Controller`."""
-
-    proportional_gain: float
-    integral_gain: float
-    derivative_gain: float
-    current_limit: float
-    period: float
-
-
-def read_gains(model: Model) -> Gains:
-    """What a model's [controller] says."""
-    return Gains(*(model[f"controller.{field}"] for field in Gains._fields))
 
 
 class Firmware:
@@ -51,7 +35,7 @@ class Firmware:
 
     def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
         self._taken = Demand(model or Model())
-        self.device = Device(NODE, EDS[NODE], send)
+        self.device = Device(CONTROLLER, EDS[CONTROLLER], send)
         self.device.on_sync = self._on_sync
         self.device.on_rpdo = self._on_rpdo
         self.device.on_nmt = self._on_nmt

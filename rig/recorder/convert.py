@@ -17,9 +17,9 @@ from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.device.nmt import NmtState as State
 from rig.network import codec
 from rig.network.frame import Frame
+from rig.network.nmt_states import NmtState as State
 from rig.recorder.provenance import collect_provenance
 from rig.recorder.schema import Event, NmtState, Record, Signals
 from rig.recorder.writer import Recorder

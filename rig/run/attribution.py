@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from plant.segments import Array
 from rig.network.codec import Flags
-from rig.network.master import CONTROLLER, NAMES, NODE, PLANT, StartTime
+from rig.network.master import StartTime
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.sequences.faults import BusOff, Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.timing import PERIOD, TimingPolicy
 
@@ -201,7 +202,7 @@ def find_start_problem(times: Mapping[int, StartTime], limit: float) -> StartPro
         return StartProblem(node, kind, f"node {node} {NAMES[node]} {rule} and {said[node]}")
     for node, time in times.items():
         if time.seconds > limit:
-            return StartProblem(NODE, "late", f"the rig stood still for {time.waited:.2f} s and cannot know "
+            return StartProblem(RIG, "late", f"the rig stood still for {time.waited:.2f} s and cannot know "
                                               f"whether node {node} {NAMES[node]} was OPERATIONAL within {limit:g} s")
     return None
 
@@ -235,7 +236,7 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
     if late.sync[first] or (late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2):
         worst = float(np.nanmax(records.lateness[span])) if span.stop > span.start else 0.0
-        return Disturbance(first, last, reach, NODE, int(overruns), f"the rig sent SYNC {1e3 * worst:.1f} ms late")
+        return Disturbance(first, last, reach, RIG, int(overruns), f"the rig sent SYNC {1e3 * worst:.1f} ms late")
     return Disturbance(first, last, reach, PLANT, int(overruns), _describe_plant(records, late, span))
 
 

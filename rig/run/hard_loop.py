@@ -22,7 +22,8 @@ from plant.compile import compile_function
 from plant.errors import RigError
 from rig.network import codec
 from rig.network.frame import Frame
-from rig.network.master import PLANT, Master
+from rig.network.master import Master
+from rig.network.node_objects import PLANT
 from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
 from rig.network.wire import LinkWire
 from rig.recorder import Signals, Timing

@@ -16,7 +16,7 @@ from fdi.output import write_text
 from fdi.report.json import to_plain
 from plant.segments import RATE, Array
 from rig.network.identity import Identity
-from rig.network.master import NAMES, PLANT
+from rig.network.node_objects import NAMES, PLANT
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.history import History
 from rig.run.job import Job

@@ -15,7 +15,8 @@ from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Node, Send
 from rig.network.link import Link
-from rig.network.master import CONTROLLER, NAMES, PLANT, BusError, Master
+from rig.network.master import BusError, Master
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT
 from rig.network.wire import EmbeddedWire, LinkWire, Wire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware

@@ -14,8 +14,8 @@ from plant import Actuator, Columns, InputError
 from plant.segments import Array
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
+from rig.network.cycle_record import CycleRecord
 from rig.network.raw_bus import can_open
-from rig.nodes.cycle_record import CycleRecord
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected

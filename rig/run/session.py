@@ -20,16 +20,16 @@ from plant.errors import InputError
 from plant.profile import Profile, build_profile
 from plant.segments import RATE, Hold
 from rig.device.emcy import EmcyCode
-from rig.device.nmt import NmtState
 from rig.network import codec
 from rig.network.clock import WallClock
 from rig.network.codec import Control
+from rig.network.cycle_record import CycleRecord
 from rig.network.frame import Frame
 from rig.network.identity import Identity
-from rig.network.master import CONTROLLER, HEARTBEAT, HEARTBEAT_LIMIT, NAMES, NODE, PATIENT, PLANT, Master
+from rig.network.master import HEARTBEAT, HEARTBEAT_LIMIT, PATIENT, Master
+from rig.network.nmt_states import NmtState
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG, Gains, read_gains
 from rig.network.wire import EmbeddedWire
-from rig.nodes import firmware
-from rig.nodes.cycle_record import CycleRecord
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
@@ -115,7 +115,7 @@ class Session:
         self._is_watching = False  # from the reset of the nodes for the run until its last cycle
         self._emergencies: list[Emergency] = []
         self._heartbeats: dict[int, list[Heartbeat]] = {node: [] for node in (CONTROLLER, PLANT)}
-        self._gains: firmware.Gains | None = None  # object 0x2110 of the controller, if it has it
+        self._gains: Gains | None = None  # object 0x2110 of the controller, if it has it
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self._begun_ns = 0  # when the nodes were started for the run
         self._stalled_ns = 0  # how long the rig had not received before that
@@ -146,7 +146,7 @@ class Session:
             Heartbeat(t_ns * 1e-9, wire.blind_ns * 1e-9))
         self._master.on_lost = self._handle_silence
         self._master.on_rival = lambda cob_id: self._handle_trouble(
-            "bus", f"another node sends 0x{cob_id:03X}, a frame of node {NODE} {NAMES[NODE]}")
+            "bus", f"another node sends 0x{cob_id:03X}, a frame of node {RIG} {NAMES[RIG]}")
         self._master.on_back = self._handle_return
 
     def now(self) -> int:
@@ -231,7 +231,7 @@ class Session:
         self._is_watching = is_run
         if not self.identities:
             self._identify_nodes()
-        gains = firmware.read_gains(job.model) if job.controller != "external" else None
+        gains = read_gains(job.model) if job.controller != "external" else None
         if self._gains is None:
             self._gains = gains or self._master.read_gains()
         patient = not job.realtime and isinstance(self._clock, WallClock)
@@ -515,7 +515,7 @@ class Session:
             self.log_event("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
         elif error.code == EmcyCode.HEARTBEAT_LOST and self._master.is_behind():
             self._handle_trouble("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and node {node} "
-                                         f"{NAMES[node]} reports 0x{error.code:04X}", NODE)
+                                         f"{NAMES[node]} reports 0x{error.code:04X}", RIG)
         else:
             self._handle_trouble("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip(),
                                  node, error.code, round(error.timestamp * 1e9))

@@ -20,7 +20,7 @@ from rig.device import Device, NmtState, SdoAbort, Value
 from rig.device.dictionary import Dictionary, Entry
 from rig.firmware.build import FLAGS, FOLDER, build_program
 from rig.network.frame import Frame, Send
-from rig.nodes.firmware import GAINS, Gains
+from rig.network.node_objects import GAINS, Gains
 
 SUPPORT = Path(__file__).parent / "firmware"
 STRICT = (*FLAGS, "-Werror")

@@ -10,7 +10,8 @@ from rig.network import codec
 from rig.network.bus import EmbeddedBus
 from rig.network.codec import Drive, Feedback, ValveState
 from rig.network.frame import Send
-from rig.nodes.emulator import SCENARIO, Emulator
+from rig.network.node_objects import SCENARIO
+from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario
 

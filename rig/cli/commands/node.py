@@ -72,18 +72,20 @@ def open_compiled_plant(args: argparse.Namespace, bus: str, link: Link, stack: c
     """The plant emulator with its loop in compiled code; `link` is for its services. `stack` closes it."""
     from rig.network.raw_bus import open_raw_bus
     from rig.nodes.emulator_service import LEFT_OUT, EmulatorService
+    from rig.run.priority import enter_loop_thread
 
     raw = stack.enter_context(open_raw_bus(bus))
     link.leave_out(LEFT_OUT)
-    service = EmulatorService(link.send, raw, choose_scenario(args), is_locked)
+    service = EmulatorService(link.send, raw, enter_loop_thread, choose_scenario(args), is_locked)
     stack.callback(service.close)
     return service
 
 
 def choose_node(args: argparse.Namespace) -> Callable[[Send], Node]:
     """A function that builds the node which the options describe."""
+    from rig.network.node_objects import read_gains
     from rig.nodes.emulator import Emulator
-    from rig.nodes.firmware import Firmware, read_gains
+    from rig.nodes.firmware import Firmware
     from rig.nodes.scenario import require_servovalve
 
     if args.node == "plant":

@@ -17,12 +17,12 @@ from plant.errors import RigError
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.link import Link
+from rig.network.node_objects import PLANT
 from rig.network.raw_bus import open_raw_bus
-from rig.nodes.emulator import NODE
 from rig.run.priority import LOOP_PRIORITY, list_cpus
 from rig.studies.benchmarks.rivals import find_gcc
 
-_NMT, _BOOT_UP = 0x000, 0x700 + NODE
+_NMT, _BOOT_UP = 0x000, 0x700 + PLANT
 _START, _RESET = 1, 130  # NMT commands, CiA 301 section 7.2.8.3.1
 
 
@@ -72,8 +72,8 @@ def run_emulator(bus: str, is_compiled: bool) -> Iterator[None]:
     with _run_process([sys.executable, "-m", *module, bus]) as process:
         link = Link(open_can(bus), time.monotonic_ns)
         try:
-            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, NODE])), bytes([0]), process)
-            link.send(_NMT, bytes([_START, NODE]))
+            _wait_for(link, lambda: link.send(_NMT, bytes([_RESET, PLANT])), bytes([0]), process)
+            link.send(_NMT, bytes([_START, PLANT]))
             time.sleep(0.3)
         finally:
             link.close()

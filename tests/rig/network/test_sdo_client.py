@@ -9,7 +9,8 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.master import PLANT, Master, repeat_transfer
+from rig.network.master import Master, repeat_transfer
+from rig.network.node_objects import PLANT
 from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import EmbeddedWire
 

@@ -18,15 +18,16 @@ from rig.device import NmtState
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
+from rig.network.cycle_record import decode_cycle_record
 from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.raw_bus import open_raw_bus
 from rig.network.wire import serve_node
 from rig.nodes import emulator_cycle as ec
-from rig.nodes.cycle_record import decode_cycle_record
 from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop
 from rig.nodes.scenario import Scenario
+from rig.run.priority import enter_loop_thread
 from rig.sequences.faults import BusOff, Corrupted, Double, Drop, Duplicated, Fault, Lost, Plan, Schedule, Short
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
@@ -50,7 +51,7 @@ class BusDesk:
             with open_raw_bus(self.where) as raw:
                 link = Link(open_can(self.where), clock.now)
                 link.leave_out(LEFT_OUT)
-                self.node = EmulatorService(link.send, raw, self.scenario)
+                self.node = EmulatorService(link.send, raw, enter_loop_thread, self.scenario)
                 ready.set()
                 serve_node(self.node, link, clock, ended.is_set)
                 self.node.close()

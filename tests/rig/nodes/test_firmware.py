@@ -14,7 +14,8 @@ from plant.controller import Loop, compute_current
 from rig.device import Abort, NmtState
 from rig.network import codec
 from rig.network.codec import Control, Status
-from rig.nodes.firmware import GAINS, LOST_AFTER, Gains
+from rig.network.node_objects import GAINS, Gains
+from rig.nodes.firmware import LOST_AFTER
 
 ACTIVE, RESET = int(Control.ACTIVE), int(Control.RESET)
 GIVEN = Gains(2.0, 30.0, 1e-3, 8e-3, 1e-3)

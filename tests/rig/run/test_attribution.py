@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rig.network.codec import Flags
-from rig.network.master import CONTROLLER, NODE, PLANT, StartTime
-from rig.nodes.cycle_record import CycleRecord
+from rig.network.cycle_record import CycleRecord
+from rig.network.master import StartTime
+from rig.network.node_objects import CONTROLLER, PLANT, RIG
 from rig.run.attribution import (
     Attribution,
     CycleRecords,
@@ -69,7 +70,7 @@ def source_and_kind(found: Attribution) -> tuple[int, str]:
     (StartTime(0.02), StartTime(0.01), None), (StartTime(1.0), StartTime(0.99), None),
     (StartTime(1.5), StartTime(0.01), (CONTROLLER, "bring_up")), (None, StartTime(0.01), (CONTROLLER, "bring_up")),
     (StartTime(1.5, 0.2), StartTime(0.01), (CONTROLLER, "bring_up")),  # the rig stood still, but not that long
-    (StartTime(1.5, 0.6), StartTime(0.01), (NODE, "late")), (StartTime(0.01), StartTime(1.3, 1.2), (NODE, "late")),
+    (StartTime(1.5, 0.6), StartTime(0.01), (RIG, "late")), (StartTime(0.01), StartTime(1.3, 1.2), (RIG, "late")),
     (StartTime(1.5), StartTime(1.4), (0, "late")), (StartTime(1.5), None, (0, "late")), (None, None, (0, "late")),
     (StartTime(0.02), StartTime(1.4), (PLANT, "late")), (StartTime(0.02), None, (PLANT, "bring_up")),
 ])
@@ -104,7 +105,7 @@ def test_a_late_sync_is_the_cause_of_what_follows(node: int, code: int, at: floa
         script.lose_drive(300, 303)
     script.report(at, node, code)
     found = script.attribute()
-    assert source_and_kind(found) == (NODE, "late") and found.cause is not None and found.cause.cycle == 300
+    assert source_and_kind(found) == (RIG, "late") and found.cause is not None and found.cause.cycle == 300
     assert found.cause.text == "the rig sent SYNC 1.9 ms late"
     assert [trouble.code for trouble in found.consequences] == [code] and found.by_bench == 1
     assert not found.judged[299:303].any() and found.judged[:299].all() and found.judged[310:].all()

@@ -10,6 +10,7 @@ from firmware_variants import Variant
 from short_sequences import job, play
 
 from rig.network.frame import Frame
+from rig.network.node_objects import GAINS
 from rig.nodes import firmware
 from rig.run import participants
 from rig.run.outcome import Outcome
@@ -60,7 +61,7 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     written = {data[1:4]: data for cob_id, data in frames[booted:started] if cob_id == 0x602 and data[0] >> 5 == 1}
     first = {data[1:4]: data for cob_id, data in frames[:booted] if cob_id == 0x602 and data[0] >> 5 == 1}
     indexes = {int.from_bytes(key[:2], "little") for key in written}
-    assert indexes == {0x1006, 0x1016, 0x1017, firmware.GAINS}
+    assert indexes == {0x1006, 0x1016, 0x1017, GAINS}
     assert all(first[key] == data for key, data in written.items() if key[:2] != b"\x17\x10")
     assert written[b"\x17\x10\0"][4:6] == (100).to_bytes(2, "little")
     assert outcome.verdict == "PASS"
