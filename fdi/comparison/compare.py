@@ -41,6 +41,7 @@ from fdi.thresholds import (
     LAG_MISFIT_RATIO,
     LOWER_BOUND_ERROR_RATIO,
     REPEAT_DIFFERENCE_RATIO,
+    REPEAT_FLOOR_RATIO,
     SECTION_ERROR_SD,
     SIGNAL_ERROR_RATIO,
     SOLVER_HIDES_RATIO,
@@ -64,6 +65,7 @@ class SignalError:
     unit: str
     error: float  # RMS of the replay from measured inputs; XJ: drawn to the measured position at 20 1/s
     floor: Floor
+    sensor_noise: float  # RMS of the model's sensor noise alone, or of the data's own where that is more
     closed_loop_error: float  # RMS of the replay from the command alone
     solver_error: float
     limit: float  # the ratio up to which the error is noise
@@ -125,14 +127,16 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     judged = {name: np.where(_find_undecided(replay), np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
     closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
-    table = {name: _measure_signal(name, r, floor[name], closed[name], replay) for name, r in judged.items()}
+    table = {name: _measure_signal(name, r, floor[name], noise[name], closed[name], replay)
+             for name, r in judged.items()}
+    doubtful = _describe_doubtful_repeats(floor, noise)
     progress("blocks", 4 / STAGES)
     ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, found, noise)
     progress("where", 5 / STAGES)
     m = describe_motion(trace, replay.model)
     z2 = combine_residuals(judged, {name: f.value for name, f in floor.items()})
     sections, when = locate_error(trace, z2, m, found.limit), find_condition(z2, m, found.limit)
-    verdict, reason = _decide_verdict(table, sections, ratios, replay, trace.period)
+    verdict, reason = _decide_verdict(table, sections, ratios, replay, trace.period, doubtful)
     diagnoses = examine_residuals(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (theirs[0] if theirs else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
@@ -141,7 +145,8 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("done", 1.0)
     return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, _list_blocks_above(ratios),
                       tuple(sections), when, free, speed, scattered, diagnoses, replay, m, closed, len(others),
-                      (*trace.notes, *_list_notes(floor, replay, trace)))
+                      (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
+                       *_list_notes(floor, replay, trace)))
 
 
 def _widen_by_guess(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
@@ -155,9 +160,24 @@ def _find_undecided(replay: Replay) -> NDArray[np.bool_]:
     return out
 
 
-def _measure_signal(name: str, residual: Floats, floor: Floor, closed: Floats, replay: Replay) -> SignalError:
+def _describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor]) -> str:
+    """What makes a noise floor from repeats larger than the sensors' own noise explains; empty if nothing does."""
+    def limit(name: str) -> float:  # the data's own noise is a lower bound: coloured noise has less of it
+        return REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if noise[name].lower_bound else 1.0)
+
+    above = [f"{SIGNALS[name].symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
+             if f.source == "repeats" and f.value > limit(name) * noise[name].value]
+    if not above:
+        return ""
+    return (f"the repeats differ by more than the noise of the sensors: {', '.join(above)} times. Use repeats of the "
+            "same unit; if its sensors are so noisy, set sensors.*_noise of the model")
+
+
+def _measure_signal(name: str, residual: Floats, floor: Floor, noise: Floor, closed: Floats,
+                    replay: Replay) -> SignalError:
     limit = SIGNAL_ERROR_RATIO + 3 * _ratio_spread(floor, int((~np.isnan(residual)).sum()))
-    return SignalError(name, SIGNALS[name].unit, rms(residual), floor, rms(closed), replay.solver_error[name], limit)
+    return SignalError(name, SIGNALS[name].unit, rms(residual), floor, noise.value, rms(closed),
+                       replay.solver_error[name], limit)
 
 
 def _ratio_spread(floor: Floor, samples: int) -> float:
@@ -216,8 +236,8 @@ def _list_blocks_above(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
 
 
 def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
-                    replay: Replay, period: float) -> tuple[str, str]:
-    """The verdict, and why it cannot tell."""
+                    replay: Replay, period: float, doubtful: str) -> tuple[str, str]:
+    """The verdict, and why it cannot tell; `doubtful` says why the repeats are no measure of the noise."""
     coarse = [s.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]
     if coarse:
         return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
@@ -230,7 +250,11 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
 
     local = [p for p in sections if is_above(p)]
     if not (above or local or _list_blocks_above(ratios)):
-        return "WITHIN_FLOOR", ""
+        apart = _list_signals_apart({name: s.floor for name, s in table.items()})
+        if apart and not doubtful:
+            doubtful = (f"the model fits this trace but not its repeat: they differ by more than noise "
+                        f"({', '.join(apart)} noise floors). Use repeats of the same unit")
+        return ("CANNOT_TELL", doubtful) if doubtful else ("WITHIN_FLOOR", "")
     edgy = float(replay.undecided.mean())
     doubt = ""
     if any(s.floor.lower_bound for s in table.values()):
@@ -250,14 +274,18 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace) -> lis
             for name, sensor in trace.sensors.items() if name in trace.outputs]
     if trace.filtered:
         said.append(f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor")
-    apart = [f"{SIGNALS[name].symbol} by {f.difference / f.value:.2g}" for name, f in floor.items()
-             if f.source == "repeats" and f.difference > REPEAT_DIFFERENCE_RATIO * f.value]
-    if apart:
+    if apart := _list_signals_apart(floor):
         said.append(f"the error differs between the repeats, as with stick-slip: {', '.join(apart)} noise floors")
     if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
         seconds = float(replay.undecided.sum()) * trace.period
         said.append(f"{seconds:.1f} s are not judged: whether the ram stops {_describe_cause(replay)}")
     return said
+
+
+def _list_signals_apart(floor: Mapping[str, Floor]) -> list[str]:
+    """The signals whose repeats differ by more than the floor, each with the ratio."""
+    return [f"{SIGNALS[name].symbol} by {f.difference / f.value:.2g}" for name, f in floor.items()
+            if f.source == "repeats" and f.difference > REPEAT_DIFFERENCE_RATIO * f.value]
 
 
 def _describe_cause(replay: Replay) -> str:

@@ -6,6 +6,7 @@ delays a step as clogging does, so the friction that the ramps show is allowed f
 """
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -256,8 +257,35 @@ def is_loaded(load: Floats) -> bool:
 
 def is_nominal_plant(model: Model) -> bool:
     """Whether a healthy unit of the model is a nominal one; its two faults and its noise do not count."""
-    apart = set(model.list_changes()) - {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
-    return model.plant == "eha" and not any(not name.startswith("sensors.") for name in apart)
+    return model.plant == "eha" and not list_design(model)
+
+
+def list_design(model: Model) -> dict[str, float]:
+    """The parameters in which a healthy unit of the model differs from a nominal one, SI: not the two faults and noise.
+    """
+    faults = {CLOGGING.parameter, FRICTION.parameter, DYNAMIC}
+    return {name: value for name, value in sorted(model.list_changes().items())
+            if name not in faults and not name.startswith("sensors.")}
+
+
+def format_design(model: Model) -> str:
+    """`list_design` as the text that bands remember their model by."""
+    return json.dumps(list_design(model))
+
+
+def describe_other_model(bands: Bands, model: Model) -> str:
+    """Which model bands were made for, if it is another than `model`; else ""."""
+    name = bands.provenance.get("model", "eha")
+    known = bands.provenance.get("parameters")
+    if known is None:  # bands of an earlier version say the name alone
+        return f"the model {name}" if name != model.name else ""
+    if known == format_design(model):
+        return ""
+    try:
+        design = ", ".join(f"{parameter} = {value:g}" for parameter, value in json.loads(known).items())
+    except (ValueError, AttributeError, TypeError):
+        design = known
+    return f"the model {name} with {design or 'all parameters nominal'}"
 
 
 def choose_bands(com: Floats, load: Floats, period: float, model: Model | None = None,

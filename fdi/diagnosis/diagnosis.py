@@ -7,7 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdi.diagnosis.bands import Bands, BandVerdict, Event, is_loaded, is_nominal_plant, judge_trace, matches_command
+from fdi.diagnosis.bands import (
+    Bands,
+    BandVerdict,
+    Event,
+    describe_other_model,
+    is_loaded,
+    is_nominal_plant,
+    judge_trace,
+    list_design,
+    matches_command,
+)
 from fdi.diagnosis.bands_file import load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
 from fdi.diagnosis.precursors import Precursor, measure_precursors
@@ -76,7 +86,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         workers: threads.
 
     Raises:
-        InputError: a trace that cannot be judged at all.
+        InputError: a trace that cannot be judged at all, or bands of another model.
     """
     model = model or load_model()
     if model.plant != "eha":
@@ -91,6 +101,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     progress("bands", 0.25)
     if bands is None:
         bands = _find_own_bands(trace, model, notes)
+    elif other := describe_other_model(bands, model):
+        design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model).items())
+        raise InputError("--bands", f"made for {other}", f"bands of the model of this diagnosis, {model.name}"
+                         + (f" with {design}" if design else "") + "; rig fdi --learn-bands makes them")
     band_verdict = None
     if bands is not None:
         band_verdict = judge_trace(trace, bands, model)

@@ -23,6 +23,7 @@ from fdi.diagnosis.bands import (
     compute_speed,
     find_excursions,
     find_lasting_peak,
+    format_design,
     is_loaded,
     judge_position,
     read_columns,
@@ -130,8 +131,8 @@ def simulate_bands(model: Model, com: Floats, load: Floats, period: float, count
                    for i, s in enumerate(parts) if is_slow_ramp(s, period))
     tables = {"healthy": healthy[:faulty], CLOGGING.name: clogged[0],
               FRICTION.name: rubbing[amounts.index(FRICTION.middle)]}
-    facts = {"made": "by simulation", "command": name, "model": model.name, "runs": str(count), "faulty": str(faulty),
-             "seed": str(seed), **_describe_origin(parts, period)}
+    facts = {"made": "by simulation", "command": name, "model": model.name, "parameters": format_design(model),
+             "runs": str(count), "faulty": str(faulty), "seed": str(seed), **_describe_origin(parts, period)}
     if np.abs(load).max() > 0.0:
         facts["load"] = f"up to {np.abs(load).max():.4g} N"
     bands = Bands(tuple(parts), period, np.array(amounts), stepped, ramped, 1.0, 1.0, facts,

@@ -118,7 +118,10 @@ class Problem:
         return limit_dynamic_friction([f.name for f in free], values)
 
     def subtract_measurements(self, predicted: Floats) -> Floats:
-        """What predictions (m, s, n) leave of the measurement, but for steady lines of the mains: (m, s, n)."""
+        """Predicted minus measured, without steady lines of the mains, (m, s, n) as `predicted`: the misfit of a fit.
+
+        Its slope is that of the prediction. What a report shows is the residual, measured minus model.
+        """
         parts, start = [], 0
         for trace in (self.trace, *self.also):
             residuals = predicted[..., start:start + len(trace)] - trace.measurements

@@ -106,8 +106,8 @@ def _tabulate_signals(c: Comparison) -> Table:
             bound + format_signal(s.floor.value, s.name),
             Cell(format_ratio(s.ratio), "bad" if s.ratio > s.limit else "good"), Cell(s.floor.source, "muted"),
             format_signal(s.closed_loop_error, s.name), Cell(format_signal(s.solver_error, s.name), "muted")])
-    return Table(columns, rows, "Error: RMS of the residual with the measured current as input. Noise floor: RMS that "
-                                "noise alone leaves. A perfect model has ratio 1.")
+    return Table(columns, rows, "Error: RMS of the residual (measured minus model) with the measured current as "
+                                "input. Noise floor: RMS that noise alone leaves. A perfect model has ratio 1.")
 
 
 def _tabulate_blocks(c: Comparison) -> list[Item]:
@@ -185,7 +185,16 @@ def describe_findings(c: Comparison) -> list[Line]:
             lines.append(Line("residual", f"{SIGNAL_NAMES[name]}: {'; '.join(found)}"))
     if c.scatter is not None:
         lines.append(Line("scatter", _describe_scatter(c)))
+    if changes := _describe_changes(c):
+        lines.append(Line("not nominal", changes, medium=Medium.TERMINAL))
     return lines
+
+
+def _describe_changes(c: Comparison, most: int = 6) -> str:
+    """The parameters of the model that are not nominal; the page has a table of them."""
+    changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())]
+    more = f" and {len(changes) - most} more" if len(changes) > most else ""
+    return ", ".join(changes[:most]) + more
 
 
 def _describe_floor(c: Comparison) -> str:
@@ -263,9 +272,9 @@ def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_m
 
 def _show_figures(c: Comparison) -> list[Section]:
     sections = [Section("Measured and replayed", [Figure(
-        "Each signal as measured and as replayed from the measured current, and its residual below. Green: two noise "
-        "floors on either side; noise stays within for 95 % of the time. Shaded: ramps (blue) and dynamic sections "
-        "(violet) of the command. Red: not judged.", partial(compare_figures.draw_overview, c))])]
+        "Each signal as measured and as replayed from the measured current, and its residual (measured minus model) "
+        "below. Green: two noise floors on either side; noise stays within for 95 % of the time. Shaded: ramps (blue) "
+        "and dynamic sections (violet) of the command. Red: not judged.", partial(compare_figures.draw_overview, c))])]
     if c.where:
         sections.append(Section("Where", [_tabulate_places(c), Figure(
             "Share of each section in the squared error. The longest bar shows where to look first.",
@@ -276,8 +285,9 @@ def _show_figures(c: Comparison) -> list[Section]:
         "colour of the noise, the residual is whitened by it.", partial(compare_figures.draw_whiteness, c))]))
     if any(d.depends for d in c.diagnoses.values()):
         sections.append(Section("What the residual depends on", [Figure(
-            "Mean residual over each quantity, in bins of equal count with 95 % intervals. A curve that leaves the "
-            "green band of two noise floors shows a dependence.", partial(compare_figures.draw_dependence, c))]))
+            "Mean residual (measured minus model) over each quantity, in bins of equal count with 95 % intervals. A "
+            "curve that leaves the green band of two noise floors shows a dependence.",
+            partial(compare_figures.draw_dependence, c))]))
     return sections
 
 
@@ -327,8 +337,8 @@ def collect_data(c: Comparison) -> dict[str, Any]:
 def _signal_data(s: SignalError) -> dict[str, Any]:
     return {"unit": s.unit, "error": s.error, "floor": s.floor.value, "ratio": s.ratio,
             "closed_loop_error": s.closed_loop_error, "solver_error": s.solver_error, "limit": s.limit,
-            "floor_source": s.floor.source, "lower_bound": s.floor.lower_bound, "hum": s.floor.hum,
-            "difference": s.floor.difference}
+            "floor_source": s.floor.source, "sensor_noise": s.sensor_noise, "lower_bound": s.floor.lower_bound,
+            "hum": s.floor.hum, "difference": s.floor.difference}
 
 
 def _diagnosis_data(d: ResidualTests) -> dict[str, Any]:

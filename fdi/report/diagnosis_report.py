@@ -44,7 +44,8 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
     """Report on a diagnosis; its `data` is the answer of `rig fdi --json`."""
     return Report(
         command="fdi", title=d.source, verdict=d.verdict, mood=VERDICT_MOODS.get(d.verdict, "doubtful"),
-        sentence=describe_verdict(d), facts=_list_facts(d), notes=[*describe_overruled_bands(d), *d.notes],
+        sentence=describe_verdict(d), facts=_list_facts(d),
+        notes=[*describe_overruled_bands(d), *explain_grid(d), *d.notes],
         sections=[Section("Faults", _show_faults(d)),
                   Section("Response in its bands", _draw_bands(d)),
                   Section("Events", _tabulate_events(d)),
@@ -135,6 +136,35 @@ def describe_overruled_bands(d: Diagnosis) -> list[str]:
             cause = f", with {others}" if others else ""
             sentences.append(f"The bands call {FAULT_NAMES[fault.name]} {LEVEL_NAMES[by_bands]}; the fit, which models "
                              f"the whole plant, finds it {LEVEL_NAMES[level]}{cause}. Trust the fit.")
+    return sentences
+
+
+def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
+    """A sentence for each fault whose size in the grid contradicts the fit, with the reason.
+
+    `far`: cells of the grid outside the interval of the fit.
+    """
+    sentences = []
+    g = d.grid
+    for fault, axis in zip(FAULTS, (g.kintas, g.fss) if g else (), strict=False):
+        assert g is not None
+        size, found = d.sizes[fault.name], float(getattr(g.merged, fault.symbol))
+        outside = max(size.low - found, found - size.high)
+        if outside <= far * float(axis[1] - axis[0]):
+            continue
+        parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.symbol)))}"
+                 for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
+        symbol, unit = SIZE_SYMBOLS[fault.name], "" if fault.unit == "1" else f" {fault.unit}"
+        sentence = (f"The grid gives {symbol} {format_digits(found)}{unit} (minima: {', '.join(parts)}), the fit "
+                    f"{format_size(fault, size)}: the grid matches the position alone with a plant that has only "
+                    "these two faults")
+        if d.others:
+            sentence += f", here with {'; '.join(describe_deviation(name, e) for name, e in d.others.items())}"
+        if "xj" in d.refinement.errors:
+            sentence += (f"; its best cell leaves {1e6 * g.joint.minimum.rms:.3g} um of the position, the fit "
+                         f"{1e6 * d.refinement.errors['xj']:.3g} um")
+        trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
+        sentences.append(f"{sentence}. {trust}.")
     return sentences
 
 
@@ -307,7 +337,7 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
 
         return diagnosis_figures.draw_precursor_shifts(d.precursors)
 
-    return [Table(columns, rows, "Deviation: measured less healthy mean, in standard deviations of healthy units; red "
+    return [Table(columns, rows, "Deviation: measured minus healthy mean, in standard deviations of healthy units; red "
                                  "beyond 4."),
             Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer "
                    "bars discriminate better; below the dotted line (3) a single test does not show the fault.", draw)]

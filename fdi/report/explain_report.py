@@ -270,9 +270,9 @@ def _show_figures(a: Answer, pattern: Pattern | None) -> list[Section]:
     after = a.best if a.best is not e.base else None
     name = "with the missing effect" if e.effects else "with the best candidate"
     sections = [Section("Residual", [Figure(
-        "Residual of each signal, without and with the effect. Where the effect explains it, the blue line stays "
-        "between the dotted lines (two noise floors). Shaded: ramps (blue) and dynamic sections (violet) of the "
-        "command.", partial(explain_figures.draw_residuals, trace, e.base, after, e.floor, name))])]
+        "Residual (measured minus model) of each signal, without and with the effect. Where the effect explains it, "
+        "the blue line stays between the dotted lines (two noise floors). Shaded: ramps (blue) and dynamic sections "
+        "(violet) of the command.", partial(explain_figures.draw_residuals, trace, e.base, after, e.floor, name))])]
     if pattern is not None and pattern.place:
         sections.append(Section("Shape of the residual", [Figure(
             "Left: the missing quantity over the state that it follows best, with two standard errors. Right: over "

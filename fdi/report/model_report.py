@@ -157,8 +157,9 @@ def _show_residuals(update: ModelUpdate) -> list[Item]:
     r = update.refit
     first, last = r.steps[0].hypothesis, r.last.hypothesis
     return [Figure(
-        "Residual of each signal, before and after. Where the model is complete, the blue line stays between the "
-        "dotted lines (two noise floors). Shaded: ramps (blue) and dynamic sections (violet) of the command.",
+        "Residual (measured minus model) of each signal, before and after. Where the model is complete, the blue line "
+        "stays between the dotted lines (two noise floors). Shaded: ramps (blue) and dynamic sections (violet) of the "
+        "command.",
         partial(explain_figures.draw_residuals, r.search.problem.trace, first, last if last is not first else None,
                 update.floor))]
 

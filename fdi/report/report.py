@@ -183,6 +183,7 @@ class Report:
         next_command: what to type next; "" if there is nothing left to do.
         files: (label, path) of the files that were written.
         data: the JSON answer: plain values, numpy values, NaN and infinity; SI units.
+        conclusion: the verdict once more, as the last line of the terminal; "" where the headline is enough.
     """
 
     command: str
@@ -196,6 +197,7 @@ class Report:
     next_command: str = ""
     files: Sequence[tuple[str, str]] = ()
     data: Mapping[str, Any] = field(default_factory=dict)
+    conclusion: str = ""
 
     def select_sections(self, medium: Medium) -> list[tuple[Section, list[Item]]]:
         """The sections that one medium shows, each with its items there."""

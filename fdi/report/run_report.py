@@ -26,7 +26,8 @@ from fdi.report.report import (
 from fdi.report.run_verdict import read_verdict
 from fdi.trace.trace import Check, Event, Trace
 
-MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad"}
+MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
+                          "NOT_JUDGED": "doubtful"}
 EVENT_MOODS: dict[str, Mood] = {"ERROR": "bad", "WARN": "doubtful"}
 
 
@@ -51,6 +52,7 @@ def build_run_report(trace: Trace) -> Report:
         facts=_list_facts(trace), notes=_list_notes(trace),
         sections=[Section("First cause and consequences", _show_cause(trace), medium=Medium.PAGE),
                   Section("Checks", _tabulate_checks(trace.sequence_checks)),
+                  Section("Servovalve", _show_diagnosis(trace), medium=Medium.PAGE),
                   Section("Protocol", _tabulate_protocol(trace.protocol_checks)),
                   Section("Signals", [_draw_signals(trace)]),
                   Section("Cycle timing", _show_timing(trace), medium=Medium.PAGE),
@@ -67,6 +69,8 @@ def _list_facts(trace: Trace) -> list[tuple[str, str]]:
             ("checks passed", trace.sequence_checks), ("protocol checks passed", trace.protocol_checks)) if checks]
     named = ((name, trace.provenance.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host"))
     facts += [(name, text) for name, text in named if text]
+    if "differences.text" in trace.provenance:
+        facts.append(("differs from nominal", trace.provenance["differences.text"]))
     kind = trace.provenance.get("timing.kind", "")
     if kind not in _KINDS_OF_TIMING:
         return facts
@@ -104,9 +108,21 @@ def _read_list(text: str) -> list[Any]:
     return found if isinstance(found, list) else []
 
 
+def _show_diagnosis(trace: Trace) -> list[Item]:
+    """What `rig fdi` found, if the run was asked for it."""
+    word, sentence = (trace.provenance.get(f"fdi.{key}", "") for key in ("verdict", "sentence"))
+    if not word:
+        return []
+    mood: Mood = "good" if word == "ACCEPTABLE" else "doubtful" if word == "CANNOT_TELL" else "bad"
+    return [Line(word, sentence, mood)]
+
+
 def _list_notes(trace: Trace) -> list[str]:
     """What a reader must know before trusting the plots."""
     notes = [*trace.notes, *describe_gaps(trace), *describe_missing_samples(trace)]
+    limits = [text for name, text in sorted(trace.provenance.items()) if name.startswith("limits.")]
+    if limits:
+        notes.append(f"limits reached: {'; '.join(limits)}")
     if "recovered.reason" in trace.provenance:
         notes.append(f"this log was salvaged after its writer died: {trace.provenance['recovered.reason']}")
     return notes
@@ -258,7 +274,7 @@ def _tabulate_nmt(trace: Trace) -> list[Item]:
 
 def _list_provenance(trace: Trace) -> list[Item]:
     rows: list[list[Cell | str]] = [[Cell(name, "muted"), text] for name, text in sorted(trace.provenance.items())
-                                    if not name.startswith("cause.")]
+                                    if not name.startswith(("cause.", "limits.", "fdi.", "differences."))]
     items: list[Item] = [Table([Column(""), Column("")], rows, is_list=True)] if rows else []
     return [*items, *(Listing(data.decode("utf-8", "replace"), f"{name} ({len(data)} bytes)")
                       for name, data in sorted(trace.attachments.items()))]

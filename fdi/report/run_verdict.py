@@ -10,7 +10,7 @@ from fdi.trace.trace import Trace
 class Verdict(NamedTuple):
     """The result of a run."""
 
-    word: str  # PASS, FAIL, INVALID_TIMING, ABORTED; NOT JUDGED for a trace without checks
+    word: str  # PASS, FAIL, INVALID_TIMING, ABORTED; NOT_JUDGED without checks
     why: str  # the reason; empty if the run passed
 
     def __str__(self) -> str:
@@ -40,7 +40,7 @@ def read_verdict(trace: Trace) -> Verdict:
 
 def _judge_checks(trace: Trace) -> str:
     if not trace.checks:
-        return "NOT JUDGED"
+        return "NOT_JUDGED"
     return "PASS" if all(check.passed for check in trace.checks) else "FAIL"
 
 

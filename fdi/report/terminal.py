@@ -39,6 +39,8 @@ def print_report(report: Report, console: Console) -> None:
     labels += [Line(label, path) for label, path in report.files]
     if report.next_command:
         labels.append(Line("next", report.next_command, "neutral"))
+    if report.conclusion:
+        labels.append(Line("verdict", report.conclusion, report.mood))
     _flush_lines(labels, console)
 
 

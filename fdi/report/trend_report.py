@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from fdi.diagnosis.faults import FAULTS, Estimate, Level
+from fdi.diagnosis.faults import FAULTS, Estimate, Level, judge_size
 from fdi.prognosis.breaks import Break
 from fdi.prognosis.dates import format_day
 from fdi.prognosis.gather import Point
@@ -55,11 +55,30 @@ def _describe_traces(unit: UnitTrend) -> str:
     points = unit.gathered.points
     first, last = (format_place(point.t, unit) for point in (points[0], points[-1]))
     span = f"{first} to {last}" if first != last else first
-    return f"{count_nouns(len(points), 'trace').capitalize()}, {span}."
+    worst = max(unit.trends, key=lambda trend: trend.level)
+    return f"{count_nouns(len(points), 'trace').capitalize()}, {span}. {explain_level(worst)}."
+
+
+def explain_level(trend: Trend) -> str:
+    """Why a fault has its level: its size now, beside the limits that decide."""
+    fault, level = trend.fault, trend.level
+    name, unit = fault.name.replace("_", " ").capitalize(), "" if fault.unit == "1" else f" {fault.unit}"
+    words = f"{name} is {level.word.replace('_', '-')}: {_format_size(trend.now, fault.unit)} now"
+    if judge_size(fault, trend.now) is None:
+        return (f"{words}; the interval holds both a healthy unit ({fault.healthy:g}{unit}) and MidBand "
+                f"({fault.middle:g}{unit}), so the value alone decides")
+    if level == Level.ACCEPTABLE:
+        return f"{words}, below MidBand ({fault.middle:g}{unit})"
+    if level == Level.NON_NOMINAL:
+        return f"{words}, above MidBand ({fault.middle:g}{unit}) and up to MaxBand ({fault.most:g}{unit}) or more"
+    if trend.now.value >= fault.middle:
+        return f"{words}, above MidBand ({fault.middle:g}{unit}), not surely at MaxBand ({fault.most:g}{unit})"
+    return f"{words}; its interval comes too near MidBand ({fault.middle:g}{unit}) to be acceptable"
 
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
-    items: list[Item] = [Line("" if i else "size", text) for i, text in enumerate(describe_trend(trend, unit))]
+    items: list[Item] = [Line("level", explain_level(trend))]
+    items += [Line("" if i else "size", text) for i, text in enumerate(describe_trend(trend, unit))]
     for level, remaining in trend.remaining.items():
         items.append(Line(f"{LIMIT_NAMES[level]} ({remaining.limit:g})", _describe_arrival(remaining, trend, unit),
                           medium=Medium.TERMINAL))
@@ -214,7 +233,7 @@ def _collect_trend(trend: Trend, unit: UnitTrend) -> dict[str, Any]:
             "used": int(trend.used.sum()),
             "remaining": {level: _collect_remaining(left, end, axis) for level, left in trend.remaining.items()},
             "forecast": None if trend.future is None else trend.future._asdict(),
-            "says": describe_trend(trend, unit)}
+            "reason": explain_level(trend), "says": describe_trend(trend, unit)}
 
 
 def _collect_remaining(left: Remaining, end: float, axis: str) -> dict[str, Any]:

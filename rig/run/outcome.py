@@ -18,14 +18,17 @@ from plant.segments import RATE, Array
 from rig.network.identity import Identity
 from rig.network.node_objects import NAMES, PLANT
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
+from rig.run.differences import find_differences
 from rig.run.history import History
 from rig.run.job import Job
+from rig.run.limits import LimitReached
 from rig.run.loop import Loop
 from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import HEARTBEAT
 
-STATUS_OF_VERDICT = {"PASS": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
+FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that are no pass
 INTERRUPTED = 130
 
 
@@ -47,23 +50,44 @@ class Outcome:
     due_ns: Sequence[int]  # log time of each cycle
     start_times: dict[int, float]  # s from NMT start to OPERATIONAL, by node
     identities: dict[int, Identity]
+    limits: Sequence[LimitReached] = ()  # of travel and current, that the run reached
     fdi: dict[str, Any] = field(default_factory=dict)  # diagnosis of `rig fdi`, if it was requested
 
     @property
     def verdict(self) -> str:
-        """PASS, FAIL, INVALID_TIMING or ABORTED. If the bench itself was late, the controller is not judged."""
+        """PASS, FAIL, INVALID_TIMING, ABORTED or NOT_JUDGED.
+
+        If the bench itself was late, the controller is not judged. Without checks in the sequence nothing says what
+        the actuator should have done: then the protocol checks can fail a run, but not pass it.
+        """
         if self.timing_problem and not self.interrupted:
             return "INVALID_TIMING"
         if self.aborted:
             return "ABORTED"
-        return "PASS" if not self.failures else "FAIL"
+        if self.failures:
+            return "FAIL"
+        return "PASS" if self._has_requirement else "NOT_JUDGED"
+
+    @property
+    def _has_requirement(self) -> bool:
+        """Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`."""
+        sequence = self.job.sequence
+        return bool(sequence.checks) or sequence.ends == "safe_state" or self.fdi.get("verdict") == "ACCEPTABLE"
 
     @property
     def failures(self) -> list[str]:
-        """The checks that did not pass, and an end other than the one the sequence requires."""
+        """The checks that did not pass, an end other than the one the sequence requires, and the faults found."""
         failed = [check.name for check in self.checks if not check.passed]
-        meant = self.job.sequence.ends == "safe_state"
-        return failed if self.safe or not meant else [*failed, "the run did not end in the safe state"]
+        if self.job.sequence.ends == "safe_state" and not self.safe:
+            failed.append("the run did not end in the safe state")
+        if self._has_fault:
+            failed.append(f"rig fdi: {self.fdi['sentence'].rstrip('.')}")
+        return failed
+
+    @property
+    def _has_fault(self) -> bool:
+        """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+        return self.fdi.get("verdict") in FDI_FAILS
 
     @property
     def timing_problem(self) -> str:
@@ -78,7 +102,8 @@ class Outcome:
         if self.aborted or not self.failures:
             return ""
         failed = [check for check in self.checks if not check.passed]
-        is_affected = len(failed) == len(self.failures) and all(map(self._is_affected, failed))
+        is_affected = (len(failed) + self._has_fault == len(self.failures) and all(map(self._is_affected, failed))
+                       and (not self._has_fault or bool(self.attribution.affected.any())))
         if self.attribution.by_bench or is_affected:
             return (f"the bench was late, and the checks that failed depend on it: {'; '.join(self.failures)}; "
                     f"{self._describe_first_lateness()}")
@@ -144,7 +169,9 @@ class Outcome:
     @property
     def why(self) -> str:
         """The reason of a verdict other than PASS, in words."""
-        words = {"FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
+        passed = sum(check.passed for check in self.checks)
+        words = {"NOT_JUDGED": f"the sequence has no checks; {passed} protocol checks passed",
+                 "FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
                  "ABORTED": self.describe_cause() or self.aborted}
         return words.get(self.verdict, "")
 
@@ -159,7 +186,8 @@ class Outcome:
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [to_plain(check._asdict()) for check in self.checks],
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
-                **self._attribution_to_json(),
+                **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
+                "limits": [limit._asdict() for limit in self.limits],
                 "nodes": {str(node): self._node_to_json(node) for node in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
                 "run": self.job.list_settings(), "fdi": self.fdi}

@@ -6,10 +6,12 @@ import fcntl
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fdi.progress import Progress
+from fdi.trace.trace import Trace
 from plant import Actuator, Columns, InputError
 from plant.segments import Array
 from rig.network.clock import WallClock
@@ -19,9 +21,11 @@ from rig.network.raw_bus import can_open
 from rig.recorder import Check, Recorder
 from rig.recorder.provenance import collect_provenance
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
+from rig.run.differences import find_differences
 from rig.run.hard_loop import compile_cycle
 from rig.run.history import History
 from rig.run.job import Job
+from rig.run.limits import find_limits
 from rig.run.outcome import Outcome, summarise_timing
 from rig.run.participants import open_participants
 from rig.run.priority import (
@@ -38,12 +42,21 @@ from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
 
+Diagnose = Callable[[Trace], dict[str, Any]]
+
 
 def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool],
-            prepare: Callable[[], object] = lambda: None) -> Outcome:
+            prepare: Callable[[], object] = lambda: None, diagnose: Diagnose | None = None) -> Outcome:
     """Run a job; its log and verdict are written to `folder`, before the nodes that it started are stopped.
 
-    `prepare()` is called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
+    Args:
+        job: what to run.
+        folder: of the results.
+        progress: called with each stage and the share done, 0 to 1.
+        stop: whether the operator asks to stop.
+        prepare: called when the nodes are there and nothing has moved: it may compute or wait, the run will not.
+        diagnose: gives the answer of `rig fdi --json` on the main phase, called when the run has ended; None: not asked
+            for.
 
     Raises:
         RigError: bad input, a missing bus or node, or a log that cannot be written. The log is closed first.
@@ -55,12 +68,14 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
     with lock_folder(folder), open_participants(job) as participants:
         prepare()
         with open_recorder(job, folder) as recorder:
-            outcome = play_job(job, folder, Session(job, participants, recorder, progress, stop), recorder, progress)
+            session = Session(job, participants, recorder, progress, stop)
+            outcome = play_job(job, folder, session, recorder, progress, diagnose)
         outcome.save()
     return outcome
 
 
-def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progress: Progress) -> Outcome:
+def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progress: Progress,
+             diagnose: Diagnose | None = None) -> Outcome:
     """Play the session of a job and judge it. Raises RigError."""
     progress("bring-up", 0.0)
     session.bring_up()
@@ -86,12 +101,19 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     checks = judge_run(job, session, attribution.judged)
     for check in checks:
         recorder.put(session.now(), _make_check_record(check))
+    found = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.interrupted else {}
     outcome = Outcome(
         job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
         interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind, reason),
         counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
         attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
-        identities=session.identities)
+        identities=session.identities, fdi=found,
+        limits=find_limits(history.column, job.model, job.scenario.plan.start))
+    recorder.metadata("differences", {"text": find_differences(job).describe()})
+    if outcome.limits:
+        recorder.metadata("limits", {f"{number:02d}": limit.describe() for number, limit in enumerate(outcome.limits)})
+    if outcome.fdi:
+        recorder.metadata("fdi", {key: str(outcome.fdi.get(key, "")) for key in ("verdict", "sentence")})
     if outcome.attribution.cause is not None:
         recorder.metadata("cause", outcome.describe_attribution())
     recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
@@ -107,6 +129,13 @@ def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
     results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
                               sequence.fault_starts(), session.read_drives())
     return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
+
+
+def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
+    """The main phase of a run as `Trace.read` gives it from the log."""
+    columns = {name: history.column(name, MAIN) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    settings = {name: str(value) for name, value in job.list_settings().items()}
+    return Trace.from_columns(columns, job.period_ns * 1e-9, {"source": str(folder), **settings})
 
 
 def attribute_run(job: Job, session: Session) -> Attribution:

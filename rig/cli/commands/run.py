@@ -6,13 +6,14 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rig.cli import options
 
 if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
+    from fdi.trace.trace import Trace
     from rig.run.job import Job
     from rig.run.outcome import Outcome
 
@@ -44,6 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """Results go to the folder --out (default: a new one in runs/). Exit status 0 if no check failed."""
+    from functools import partial
+
     from fdi.report.run_report import build_run_report
     from fdi.trace.trace import Trace
     from plant import InputError
@@ -64,12 +67,11 @@ def run_command(args: argparse.Namespace) -> int:
     with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
         with announce_run(job, why, is_silent=args.json or args.quiet) as progress:
             prepare = pages.wait_until_loaded if job.realtime else do_nothing
-            outcome = run_job(job, folder, progress, is_to_stop, prepare)
+            diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
+            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose)
             progress("report", 0.0)
             pages.start_page(folder / "trace.mcap", folder / "report.html")
             report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
-            if args.fdi:
-                outcome = diagnose_run(outcome, progress)
         with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
             show_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
         pages.finish_page()
@@ -100,8 +102,12 @@ def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
 
 
 def add_outcome(report: Report, outcome: Outcome) -> Report:
-    """The report of a run's trace with what only the run knows: its speed, lost frames, where the results are."""
+    """The report of a run's trace with what only the run knows: its speed, lost frames, where the results are.
+
+    Its last line repeats a verdict other than a plain PASS: the headline may have scrolled out of sight.
+    """
     from fdi.report.report import Line, Medium, Section
+    from rig.run.differences import find_differences
 
     timing = outcome.timing
     if outcome.job.realtime:
@@ -123,29 +129,34 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     missing = [f"{name.replace('_', ' ')} {count}" for name, count in outcome.counters.items() if count]
     if missing:
         lines.append(Line("missing", ", ".join(missing)))
+    differences = find_differences(outcome.job).describe()
+    if differences != "nothing":
+        lines.append(Line("not nominal", differences))
     if outcome.fdi:
-        lines.append(Line("servovalve", outcome.fdi["sentence"]))
+        lines.append(Line("servovalve", f"{outcome.fdi['verdict']}: {outcome.fdi['sentence']}"))
+    is_plain = outcome.verdict == "PASS" and not outcome.fdi
+    reason = outcome.why or "every check passed"
+    if outcome.fdi.get("verdict") == "CANNOT_TELL":
+        reason += "; rig fdi cannot tell"
+    conclusion = "" if is_plain else f"{outcome.verdict}: {reason}"
     return replace(report, sections=[*report.sections, Section("Run", lines, medium=Medium.TERMINAL)],
                    files=[("results", f"{outcome.folder}/ trace.mcap, verdict.json, report.html")],
+                   conclusion=conclusion,
                    data=outcome.to_json())
 
 
-def diagnose_run(outcome: Outcome, progress: Progress) -> Outcome:
-    """The outcome with the answer of `rig fdi`, in verdict.json as well; the run's own verdict stays."""
+def diagnose_servovalve(trace: Trace, progress: Progress) -> dict[str, Any]:
+    """The answer of `rig fdi --json` on the main phase of a run, against the nominal unit."""
     from fdi.diagnosis.diagnosis import diagnose
     from fdi.report.diagnosis_report import collect_data
     from fdi.report.json import to_plain
-    from fdi.trace.trace import Trace
     from plant import InputError
 
     try:
-        diagnosis = diagnose(Trace.read(outcome.folder), progress=progress, source=str(outcome.folder))
-        answer = to_plain(collect_data(diagnosis))
+        diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"])
     except InputError as error:  # for example a sequence that is too short
-        answer = {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
-    diagnosed = replace(outcome, fdi=answer)
-    diagnosed.save()
-    return diagnosed
+        return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
+    return dict(to_plain(collect_data(diagnosis)))
 
 
 def build_job(args: argparse.Namespace) -> Job:
@@ -205,7 +216,6 @@ def read_job(source: Path, args: argparse.Namespace) -> Job:
 def replace_settings(job: Job, **given: object) -> Job:
     """The job with the settings that are not None."""
     from dataclasses import replace
-    from typing import Any
 
     settings: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     return replace(job, **settings)

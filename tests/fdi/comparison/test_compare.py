@@ -67,6 +67,29 @@ def test_seeds_do_not_matter(colour: str) -> None:
     assert ratios.std(axis=0).max() < 0.06
 
 
+OTHER_UNITS: dict[str, dict[str, float]] = {
+    "far from it at all times": {"filter.clogging": 0.2},
+    "far from it where the ram stops": {"torque_motor.gain": 2.2, "jack.static_friction": 1200.0},
+}
+
+
+@pytest.mark.parametrize("kind", OTHER_UNITS)
+def test_a_repeat_from_another_unit_is_no_measure_of_noise(kind: str) -> None:
+    trace = record_plant(com=SHORT, seed=2)
+    other = record_plant(OTHER_UNITS[kind], com=SHORT, seed=3)
+    found = compare(trace, MODEL, [other])
+    assert found.verdict == "CANNOT_TELL", describe_verdict(found)
+    assert "repeats of the same unit" in found.reason and "by more than" in found.reason
+    assert compare(trace, MODEL, [record_plant(com=SHORT, seed=3)]).verdict == "WITHIN_FLOOR"
+
+
+def test_an_error_above_a_doubtful_floor_is_one_and_the_doubt_is_a_note() -> None:
+    trace = record_plant({"jack.static_friction": 4000.0, "jack.dynamic_friction": 3000.0}, com=SHORT, seed=2)
+    found = compare(trace, MODEL, [record_plant({"torque_motor.gain": 2.2}, com=SHORT, seed=3)])
+    assert found.verdict == "MODEL_INCOMPLETE" and not found.reason
+    assert [note for note in found.notes if "by more than the noise of the sensors" in note], found.notes
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_block_with_the_fault_is_named(fault: str) -> None:
     block = fault.partition(":")[0]

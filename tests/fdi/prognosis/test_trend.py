@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from fdi.prognosis.dates import Row, find_date_in_name, find_row, format_day, pa
 from fdi.prognosis.growth_laws import evaluate_shapes, list_shapes
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import ignore_progress
+from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.provenance import collect_provenance
@@ -136,6 +138,18 @@ def test_a_size_past_a_limit() -> None:
     found = friction(np.linspace(20.0, 45.0, 10))
     assert found.level.word == "maintenance"
     assert found.remaining["maintenance"].high == 0.0 < found.remaining["non_nominal"].low
+
+
+@pytest.mark.parametrize(("now", "words"), [
+    (Estimate(10.0, 8.0, 12.0), "Spool friction is acceptable: 10 N (8 .. 12) now, below MidBand (35 N)"),
+    (Estimate(45.0, 42.0, 48.0), "Spool friction is maintenance: 45 N (42 .. 48) now, above MidBand (35 N), not "
+                                 "surely at MaxBand (70 N)"),
+    (Estimate(30.0, 20.0, 40.0), "its interval comes too near MidBand (35 N) to be acceptable"),
+    (Estimate(80.0, 70.0, 90.0), "above MidBand (35 N) and up to MaxBand (70 N) or more"),
+    (Estimate(30.0, 0.0, 60.0), "the interval holds both a healthy unit (5 N) and MidBand (35 N), so the value alone"),
+])
+def test_a_level_names_its_reason(now: Estimate, words: str) -> None:
+    assert words in explain_level(replace(friction(np.linspace(10.0, 30.0, 14)), now=now))
 
 
 LINE = 5.0 + 2.0 * np.arange(12)

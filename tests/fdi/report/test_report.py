@@ -135,7 +135,7 @@ def test_a_failed_run_names_its_checks(log: Path) -> None:
     assert read_verdict(trace) == ("FAIL", "1 of 4 checks failed: ramp error")
     bad = tuple(trace.checks[0]._replace(name=f"c{i}", passed=False) for i in range(6))
     assert read_verdict(replace(trace, checks=bad)).why == "6 of 6 checks failed: c0, c1, c2, c3 and 2 more"
-    assert read_verdict(replace(trace, checks=bad[:0])).word == "NOT JUDGED"
+    assert read_verdict(replace(trace, checks=bad[:0])).word == "NOT_JUDGED"
     assert read_verdict(replace(trace, checks=trace.checks[:1])) == ("PASS", "")
 
 
@@ -164,7 +164,7 @@ def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         _Page(page)
         assert ("salvaged" in page) == (name == "salvaged.mcap")
-    assert "NOT JUDGED" in page and "2 cycles missing between 0.001 and 0.004 s" in page
+    assert "NOT_JUDGED" in page and "2 cycles missing between 0.001 and 0.004 s" in page
     assert "Cycle timing" not in page
     with pytest.raises(InputError, match="can be written"):
         write_run_page(tmp_path / "short.csv", tmp_path / "no" / "report.html")

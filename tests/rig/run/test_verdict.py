@@ -1,0 +1,131 @@
+"""No false green: a run without checks is not judged, limits and faults are reported, and so is what is not nominal."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_command import rig
+from short_sequences import SHORT, job, play
+
+from fdi.diagnosis.diagnosis import diagnose
+from fdi.report.run_report import build_run_report
+from fdi.report.terminal import format_report
+from fdi.trace.trace import Trace
+from plant import load_model
+from rig.run.limits import find_limits
+from rig.run.outcome import Outcome
+from rig.run.runner import run_job
+
+UNCHECKED = SHORT.partition("checks = [")[0]
+TO_THE_STOP = """
+title = "To the stop"
+main = [{ kind = "ramp", to = 0.05, time = 1.5 }, { kind = "hold", time = 0.1 }]
+"""
+
+
+def said(outcome: Outcome) -> dict[str, object]:
+    found: dict[str, object] = json.loads((outcome.folder / "verdict.json").read_text())
+    return found
+
+
+def test_without_checks_nothing_passed(tmp_path: Path) -> None:
+    outcome = play(job(UNCHECKED), tmp_path)
+    assert (outcome.verdict, outcome.status, outcome.failures) == ("NOT_JUDGED", 0, [])
+    assert outcome.why.startswith("the sequence has no checks; ")
+    assert said(outcome)["verdict"] == "NOT_JUDGED"
+    report = build_run_report(Trace.read(tmp_path, all=True))
+    assert (report.verdict, report.mood) == ("NOT_JUDGED", "doubtful") and "every check" not in report.sentence.lower()
+    assert play(job(SHORT), tmp_path).verdict == "PASS"
+
+
+def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path: Path) -> None:
+    outcome = play(job(TO_THE_STOP), tmp_path)
+    found = {limit.signal: limit for limit in outcome.limits}
+    xj = Trace.read(tmp_path).xj
+    first = int(np.argmax(xj > 0.04 - 10e-6))
+    assert found["xj"].limit == 0.04 and found["xj"].t == pytest.approx(first * 1e-3, abs=2e-3)
+    assert found["xj"].seconds == pytest.approx(np.count_nonzero(xj > 0.04 - 10e-6) * 1e-3, abs=2e-3)
+    assert found["cor"].limit == 8e-3 and found["cor"].seconds > 0.1
+    text = format_report(build_run_report(Trace.read(tmp_path, all=True)))
+    assert "limits reached: ram at its stop (40 mm)" in text and "current at its limit (8 mA)" in text
+    assert [each["parameter"] for each in said(outcome)["limits"]] == [  # type: ignore[attr-defined]
+        "jack.travel", "spool.travel", "controller.current_limit"]
+
+
+def test_a_signal_just_inside_its_limit_is_not_reported() -> None:
+    model = load_model()
+    columns = {"xj": np.array([0.0399, np.nan]), "xs": np.array([-1.24e-3, 0.0]), "cor": np.array([7.9999e-3, 0.0])}
+    assert find_limits(columns.__getitem__, model, 0) == ()
+    columns["cor"][1] = -8e-3
+    (limit,) = find_limits(columns.__getitem__, model, 1)
+    assert (limit.signal, limit.t, limit.seconds) == ("cor", 0.0, 1e-3)
+
+
+def diagnosis(verdict: str) -> dict[str, object]:
+    return {"verdict": verdict, "sentence": f"The sentence of {verdict}."}
+
+
+@pytest.mark.parametrize(("found", "verdict", "status"), [
+    ("ACCEPTABLE", "PASS", 0), ("MAINTENANCE", "FAIL", 1), ("NON_NOMINAL", "FAIL", 1), ("SOMETHING_ELSE", "FAIL", 1),
+    ("CANNOT_TELL", "PASS", 0)])
+def test_a_fault_that_rig_fdi_finds_fails_the_run(found: str, verdict: str, status: int, tmp_path: Path) -> None:
+    outcome = run_job(job(SHORT), tmp_path, lambda stage, share: None, lambda: False,
+                      diagnose=lambda trace: diagnosis(found))
+    assert (outcome.verdict, outcome.status) == (verdict, status) and said(outcome)["verdict"] == verdict
+    report = build_run_report(Trace.read(tmp_path, all=True))  # the log alone says so too
+    assert report.verdict == verdict
+    section = next(section for section in report.sections if section.title == "Servovalve")
+    assert section.items[0].text == f"The sentence of {found}."  # type: ignore[union-attr]
+    assert (f"The sentence of {found}" in report.sentence) == (verdict == "FAIL")
+
+
+def test_without_checks_only_an_acceptable_diagnosis_is_a_pass(tmp_path: Path) -> None:
+    verdicts = [run_job(job(UNCHECKED), tmp_path, lambda stage, share: None, lambda: False,
+                        diagnose=lambda trace, word=word: diagnosis(word)).verdict  # type: ignore[misc]
+                for word in ("ACCEPTABLE", "CANNOT_TELL")]
+    assert verdicts == ["PASS", "NOT_JUDGED"]
+
+
+def test_the_diagnosis_of_a_run_is_that_of_its_log(tmp_path: Path) -> None:
+    traces: list[Trace] = []
+
+    def keep(trace: Trace) -> dict[str, object]:
+        traces.append(trace)
+        return diagnosis("ACCEPTABLE")
+
+    run_job(job(SHORT), tmp_path, lambda stage, share: None, lambda: False, diagnose=keep)
+    logged = Trace.read(tmp_path)
+    for name in ("t", "com", "xj", "cor", "p12", "xs", "load"):
+        np.testing.assert_array_equal(traces[0].column(name), logged.column(name))
+    assert (traces[0].period, traces[0].provenance["seed"]) == (logged.period, logged.provenance["seed"])
+
+
+def test_a_clogged_filter_fails_a_run_with_fdi(tmp_path: Path) -> None:
+    answer = rig("run", "--fdi", "--set", "filter.clogging=0.28", "--seed", "1", "--out", str(tmp_path / "run"))
+    assert answer.status == 1
+    lines = answer.out.rstrip().splitlines()
+    assert lines[1].startswith("FAIL  rig fdi: Filter clogging requires maintenance")
+    assert lines[-1].split(maxsplit=1) == ["verdict", f"FAIL: {lines[1].removeprefix('FAIL  ')}"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Filter clogging requires maintenance" in page and "filter.clogging = 0.28" in page
+    log = Trace.read(tmp_path / "run")
+    assert diagnose(log).verdict == log.provenance["fdi.verdict"] == "MAINTENANCE"
+
+
+def test_what_is_not_nominal_stands_everywhere(tmp_path: Path) -> None:
+    text = SHORT + 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.1, start = 0.1 }]\n'
+    sequence = tmp_path / "short.toml"
+    sequence.write_text(text)
+    out = tmp_path / "run"
+    answer = rig("run", str(sequence), "--set", "null_bias.current=1e-5", "--set", "filter.law=linear", "--out",
+                 str(out))
+    expected = ("filter.law = linear; null_bias.current = 1e-05 A; fault 'parameter filter.clogging' from 0.1 s")
+    assert f"not nominal  {expected}" in answer.out
+    differences = json.loads((out / "verdict.json").read_text())["differences"]
+    assert differences["text"] == expected and differences["effects"] == ["null_bias"]
+    assert differences["parameters"]["null_bias.current"] == 1e-5
+    assert dict(build_run_report(Trace.read(out, all=True)).facts)["differs from nominal"] == expected
+    nominal = rig("run", str(sequence), "--out", str(out), "--json")
+    assert nominal.json["differences"]["text"] == "fault 'parameter filter.clogging' from 0.1 s"
