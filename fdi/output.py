@@ -1,6 +1,9 @@
 """Where a result is to go: asked before long work is done, and before anything that lies there is lost; or written."""
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from plant.errors import InputError
@@ -32,6 +35,41 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
         InputError: a path that cannot be written.
     """
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        with write_whole(path) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
+
+
+@contextlib.contextmanager
+def write_whole(path: str | Path) -> Iterator[Path]:
+    """Give the path of a file to write, which takes the place of `path` at the end, if nothing went wrong.
+
+    On a full disk, or after Ctrl-C, `path` is what it was before, and no part of a file is left. A device or pipe, and
+    a file in a folder that takes no new files, are written in place.
+    """
+    place = Path(os.path.realpath(path))
+    if (place.exists() and not place.is_file()) or not os.access(place.parent, os.W_OK):
+        yield place
+        return
+    part = place.with_name(f".part-{os.getpid()}-{place.name}")  # the suffix stays: it chooses the format
+    try:
+        yield part
+        if place.exists():
+            part.chmod(place.stat().st_mode & 0o7777)
+        part.replace(place)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def require_new(out: str | Path, *, is_forced: bool) -> Path:
+    """`out`, if no file is there or --force allows to replace it.
+
+    Raises:
+        InputError: there is a file.
+    """
+    path = Path(out)
+    if path.is_file() and not is_forced:
+        raise InputError("--out", str(path), "a file that does not exist yet; --force replaces this one")
+    return path

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.output import write_whole
 from plant.errors import InputError
 from plant.plants import Plant, Table, Term, find_plant, list_plants
 from plant.unpacking import UnpackingError, limit_unpacked_size
@@ -70,7 +71,8 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
     text = "\n".join([",".join(names), *rows]) + "\n"
     raw = text.encode()
     try:
-        path.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
+        with write_whole(path) as part:
+            part.write_bytes(gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
     except OSError as error:
         raise InputError(path, "", f"a place that can be written ({error.strerror})") from error
 

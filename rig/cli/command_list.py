@@ -17,6 +17,7 @@ HELP_OF_COMMAND = {
     "export": "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
     "fdi": "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
     "import": "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
+    "list": "list parameters, signals, sequences, effects, checks or models, with unit, range and default",
     "node": "run one node (plant or controller) on a bus, for example with real hardware",
     "recover": "salvage a log whose writer died: keep everything up to the last intact chunk and index it again",
     "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",

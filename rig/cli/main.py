@@ -14,6 +14,17 @@ from plant.errors import RigError, escape_control_characters
 from rig.cli.answer import discard_output
 from rig.cli.command_list import HELP_OF_COMMAND, import_command
 
+FIRST_STEPS = """\
+rig tests the controller of an electrohydraulic actuator and analyses its recordings. To begin:
+
+    rig run                      run the preflight check on the embedded bus: a few seconds, no hardware
+    rig report runs/preflight    write its page; open runs/preflight/report.html in a browser
+    rig simulate --out run.csv   make a recording of the nominal actuator
+    rig compare run.csv          compare a model with a recording
+    rig list parameters          what --set takes; also signals, sequences, effects, checks, models
+    rig doctor                   what this machine can do
+
+rig --help lists all commands, rig COMMAND --help the options of one."""
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130
 
@@ -123,6 +134,8 @@ def leave_quickly() -> Callable[[int], int]:
 
 def run_command_line(argv: Sequence[str]) -> int:
     """Run the command of a command line; return its exit status."""
+    if not argv:
+        print(FIRST_STEPS, flush=True)
     args = build_parser().parse_args(argv)
     status: int = 0
     try:

@@ -35,6 +35,11 @@ def add_seed_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
 
 
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """Add --force."""
+    parser.add_argument("--force", action="store_true", help="replace the file of --out if there is one")
+
+
 def parse_whole_number(text: str) -> int:
     """Parse a whole number from 0, as an argparse type."""
     return _parse_integer(text, 0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from fdi.output import require_writable
+from fdi.output import require_writable, write_whole
 from fdi.trace.importing.import_map import ImportMap
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
@@ -52,7 +52,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     if not raw:
         raise InputError(path, "/can", "at least one raw frame")
     try:
-        with can.Logger(require_writable(out, "--out")) as writer:
+        with write_whole(require_writable(out, "--out")) as part, can.Logger(part) as writer:
             for frame in raw:
                 writer(can.Message(timestamp=frame.t_ns / 1e9, arbitration_id=frame.cob_id, data=frame.data,
                                    is_extended_id=False, channel="can0" if out.suffix == ".log" else 0))
@@ -88,14 +88,16 @@ def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = Non
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
     given = {**given, **write_sensors(trace.sensors)}
     attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
-    recorder = Recorder(_require_mcap(out), attachments, given)
-    columns: tuple[NDArray[Any], ...] = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load)
-    for k, (phase, *values) in enumerate(_list_rows(columns)):
-        if not all(math.isnan(value) for value in values):
-            com, xj, cor, p12, xs, load = values
-            recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
-            _wait_for_writer(recorder, k)
-    recorder.close()
+    with write_whole(_require_mcap(out)) as part:
+        recorder = Recorder(part, attachments, given)
+        columns: tuple[NDArray[Any], ...] = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs,
+                                             trace.load)
+        for k, (phase, *values) in enumerate(_list_rows(columns)):
+            if not all(math.isnan(value) for value in values):
+                com, xj, cor, p12, xs, load = values
+                recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
+                _wait_for_writer(recorder, k)
+        recorder.close()
 
 
 def _list_rows(columns: Sequence[NDArray[Any]], block: int = 10_000) -> Iterator[tuple[Any, ...]]:
@@ -117,17 +119,18 @@ def import_frames(source: Path, out: Path, dbc: Path) -> int:
         raise InputError(source, "", f"at least one SYNC frame (0x{codec.SYNC:03X})")
     spans = [b[0] - a[0] for a, b in zip(cycles.rows, cycles.rows[1:], strict=False)]
     period = round(sorted(spans)[len(spans) // 2] / 1e9, 4) if spans else 1e-3
-    recorder = Recorder(_require_mcap(out), {dbc.name: ("text/plain", dbc.read_bytes())},
-                        collect_provenance(imported=source.name, period=period, pace="imported"))
     items: list[tuple[int, Frame | Record]] = [(f.t_ns, f) for f in raw]
     items += [*cycles.rows, *records]
-    for k, (t_ns, item) in enumerate(sorted(items, key=lambda pair: pair[0])):
-        if isinstance(item, Frame):
-            recorder.frame(item)
-        else:
-            recorder.put(t_ns, item)
-        _wait_for_writer(recorder, k)
-    recorder.close()
+    with write_whole(_require_mcap(out)) as part:
+        recorder = Recorder(part, {dbc.name: ("text/plain", dbc.read_bytes())},
+                            collect_provenance(imported=source.name, period=period, pace="imported"))
+        for k, (t_ns, item) in enumerate(sorted(items, key=lambda pair: pair[0])):
+            if isinstance(item, Frame):
+                recorder.frame(item)
+            else:
+                recorder.put(t_ns, item)
+            _wait_for_writer(recorder, k)
+        recorder.close()
     return len(cycles.rows)
 
 

@@ -55,4 +55,12 @@ def build_doctor_report(findings: Sequence[Finding]) -> Report:
         sentence=f"The bench cannot run without: {', '.join(blocking)}." if blocking
         else "The embedded bench runs on this machine.",
         sections=[Section("", [Table(columns, rows)])],
+        conclusion="the bench cannot run on this machine" if blocking else
+        f"the embedded bench runs on this machine; {_count_restrictions(findings)}",
         data={"verdict": verdict, "findings": [finding._asdict() for finding in findings]})
+
+
+def _count_restrictions(findings: Sequence[Finding]) -> str:
+    """How many capabilities this machine has, and how many are limited or missing."""
+    counts = {word: sum(finding.status == word for finding in findings) for word in ("ok", "limited", "missing")}
+    return f"{counts['ok']} capabilities ok, {counts['limited']} limited, {counts['missing']} missing (optional)"

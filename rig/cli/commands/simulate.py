@@ -6,6 +6,12 @@ from typing import Any
 
 from rig.cli import options
 
+SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
+SAMPLE_STEPS = 400  # a cycle: finer than those of a fit, as a real unit is
+SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),
+                 (5.0, -1e-3), (5.5, 4e-3), (6.0, 1e-3), (7.5, 1.3e-3), (8.0, -4e-3), (9.0, -4e-3), (9.001, 0.0),
+                 (10.0, 0.0))  # s, m: steps, slow ramps and corners
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig simulate`."""
@@ -13,6 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command", dest="command_file", metavar="FILE",
                         help="CSV with t,com and optionally load (default: the main phase of preflight); of rows up to "
                              "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
+    options.add_force_option(parser)
+    parser.add_argument("--samples", action="store_true",
+                        help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv "
+                             "of another command, into the folder --out (default: here); the model lacks two "
+                             "effects of their unit")
     parser.add_argument("--steps", type=options.parse_whole_number, default=None, metavar="N",
                         help="steps of the plant per cycle (default 100)")
 
@@ -21,7 +32,7 @@ def run_command(args: argparse.Namespace) -> int:
     """Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv)."""
     from pathlib import Path
 
-    from fdi.output import require_writable
+    from fdi.output import require_new, require_writable
     from fdi.report.numbers import format_amount
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
@@ -29,6 +40,8 @@ def run_command(args: argparse.Namespace) -> int:
     from plant.model import STEPS
     from rig.cli.answer import show_answer
 
+    if args.samples:
+        return write_samples(args)
     model = options.load_chosen_model(args)
     com, load, name = load_command(args.command_file, model["controller.period"])
     if args.steps == 0:
@@ -36,7 +49,7 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out or "simulation.csv")
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
-    require_writable(out, "--out", source=args.command_file)
+    require_writable(require_new(out, is_forced=args.force), "--out", source=args.command_file)
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
     trace = Trace.from_columns(columns._asdict(), model["controller.period"], {
         "model": model.name, "seed": str(args.seed), "command": name})
@@ -52,6 +65,39 @@ def run_command(args: argparse.Namespace) -> int:
     sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
                 f"{format_amount(summary['rms_error'], 'm')} RMS, {format_amount(summary['max_error'], 'm')} at most")
     show_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
+    return 0
+
+
+def write_samples(args: argparse.Namespace) -> int:
+    """Write the recordings of --samples; exit status 0."""
+    from pathlib import Path
+
+    from fdi.output import require_new
+    from fdi.report.report import Report
+    from fdi.trace.trace import Trace
+    from plant import InputError, load_model, simulate
+    from plant.profile import build_profile
+    from plant.segments import Points
+    from rig.cli.answer import show_answer
+
+    if args.model or args.set or args.effects or args.command_file:
+        raise InputError("--samples", "", "no --model, --set, --effects and --command beside it: the unit is fixed")
+    folder = Path(args.out or ".")
+    if not folder.is_dir():
+        raise InputError("--out", str(folder), "a folder that exists")
+    model = load_model().replace(SAMPLE_UNIT)
+    period = model["controller.period"]
+    usual, load, _ = load_command(None, period)
+    other = build_profile((Points(points=SAMPLE_POINTS),)).command
+    runs = {"run.csv": usual, "run2.csv": usual, "held.csv": other}
+    places = {name: require_new(folder / name, is_forced=args.force) for name in runs}
+    for seed, (name, com) in enumerate(runs.items(), args.seed + 1):
+        columns = simulate(model, com, load[:len(com)], seed, args.steps or SAMPLE_STEPS)
+        Trace.from_columns(columns._asdict(), period, {"seed": str(seed)}).write_csv(places[name])
+    sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
+                f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
+    show_answer(Report("simulate", "samples", sentence=sentence, data={"traces": [str(p) for p in places.values()]}),
+                args)
     return 0
 
 
