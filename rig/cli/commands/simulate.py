@@ -49,7 +49,7 @@ def run_command(args: argparse.Namespace) -> int:
     out = Path(args.out or "simulation.csv")
     if not out.name.endswith((".csv", ".csv.gz", ".mcap")):
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
-    require_writable(require_new(out, is_forced=args.force), "--out", source=args.command_file)
+    require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
     trace = Trace.from_columns(columns._asdict(), model["controller.period"], {
         "model": model.name, "seed": str(args.seed), "command": name})

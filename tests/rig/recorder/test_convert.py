@@ -124,7 +124,7 @@ def _run(command: object, capsys: pytest.CaptureFixture[str], *words: str,
 
 def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(export_command, capsys, str(log), out=tmp_path / "x.csv")["count"] == 1000
-    assert _run(export_command, capsys, str(log), "--all", out=tmp_path / "x.csv")["count"] == 1300
+    assert _run(export_command, capsys, str(log), "--all", "--force", out=tmp_path / "x.csv")["count"] == 1300
     assert _run(import_command, capsys, str(tmp_path / "x.csv")) == {"trace": str(tmp_path / "x.mcap"), "cycles": 1300}
     (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-2000])
     answer = _run(recover_command, capsys, str(tmp_path / "cut.mcap"))
