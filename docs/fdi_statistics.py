@@ -11,9 +11,9 @@ from typing import Any
 
 from fdi.diagnosis.faults import FAULTS
 from rig.studies.campaign.campaign_report import format_requirement, format_share
+from rig.studies.campaign.campaign_summary import name_size, summarise_campaign
 from rig.studies.campaign.detection_figure import draw_detection_curves
 from rig.studies.campaign.folder import read_campaign_rows, read_matrix_of_folder
-from rig.studies.campaign.summary import name_size, summarise_campaign
 
 PAGE = Path(__file__).with_suffix(".md")
 MET = {None: "", True: "met", False: "**not met**"}

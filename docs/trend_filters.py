@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import predict_unit
+from rig.studies.prognosis.prognosis_score import predict_unit
 
 PARTICLES, PARTS = 2000, (0.3, 0.5, 0.7, 0.9)
 START, SPREAD = np.log(0.2), 1.5  # of the logarithm of a, and of c

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import re
 
-from rig.conformance.case import CaseFailed, case, join_labels, require, require_none
+from rig.conformance.conformance_case import CaseFailed, case, join_labels, require, require_none
 from rig.conformance.data_sheet import (
     DOMAIN,
     MAPPING,

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from rig.conformance.case import (
+from rig.conformance.conformance_case import (
     CaseFailed,
     CaseNotApplicable,
     CaseSkipped,

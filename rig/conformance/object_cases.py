@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from fdi.report.numbers import count_nouns
-from rig.conformance.case import (
+from rig.conformance.conformance_case import (
     CaseFailed,
     CaseNotApplicable,
     case,

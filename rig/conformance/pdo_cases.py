@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rig.conformance.case import CaseSkipped, case, join_labels, require, require_applicable
+from rig.conformance.conformance_case import CaseSkipped, case, join_labels, require, require_applicable
 from rig.conformance.data_sheet import Pdo, Variable
 from rig.conformance.identifiers import list_restricted_ends
 from rig.conformance.target import (

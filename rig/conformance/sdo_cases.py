@@ -1,7 +1,14 @@
 """Chapter 3: the SDO server, frame by frame: transfers, toggle bits, aborts, lengths, malformed requests."""
 from __future__ import annotations
 
-from rig.conformance.case import CaseFailed, CaseNotApplicable, case, join_labels, require, require_applicable
+from rig.conformance.conformance_case import (
+    CaseFailed,
+    CaseNotApplicable,
+    case,
+    join_labels,
+    require,
+    require_applicable,
+)
 from rig.conformance.data_sheet import DOMAIN, Variable
 from rig.conformance.target import (
     COMMAND,

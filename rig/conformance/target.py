@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from rig.conformance.case import CaseFailed, CaseNotApplicable, CaseSkipped
+from rig.conformance.conformance_case import CaseFailed, CaseNotApplicable, CaseSkipped
 from rig.conformance.data_sheet import DataSheet, Number, Variable
 from rig.network.frame import Frame
 from rig.network.wire import Wire

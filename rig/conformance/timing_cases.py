@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 
-from rig.conformance.case import CaseFailed, case, require, require_applicable
+from rig.conformance.conformance_case import CaseFailed, case, require, require_applicable
 from rig.conformance.pdo_cases import INVALID, have_all_come, operational
 from rig.conformance.target import HEAD, OPERATIONAL, RESET_NODE, START, Target
 

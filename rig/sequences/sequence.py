@@ -21,9 +21,9 @@ from plant.profile import Profile, build_profile, name_sections, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
 from rig.sequences.checks import Check, ResponseWithin, ShutOff
+from rig.sequences.fault_parameters import Known, check_faults, check_overrides, check_together
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
-from rig.sequences.parameters import Known, check_faults, check_overrides, check_together
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.required_firmware import RequiredFirmware
 from rig.sequences.run_data import MAIN

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from dbc import EDS
-from rig.conformance.case import Verdict
+from rig.conformance.conformance_case import Verdict
 from rig.conformance.data_sheet import DataSheet
-from rig.conformance.runner import Outcome, choose_cases, run_cases
+from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import Options, Target
 from rig.device import Abort, Device, NmtState, SdoAbort
 from rig.device.cob_id import INVALID

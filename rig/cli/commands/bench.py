@@ -116,8 +116,8 @@ def _run_trial(args: argparse.Namespace) -> int:
     from rig.cli.terminal import open_console
     from rig.studies.trial.blackbox import RIG_EXPLAIN
     from rig.studies.trial.run_trial import run_trial
-    from rig.studies.trial.score import summarise_trial
     from rig.studies.trial.trial_report import build_trial_report, describe_progress
+    from rig.studies.trial.trial_score import summarise_trial
 
     for option, count in (("--cases", args.cases), ("--jobs", args.jobs)):
         if count < 1:

@@ -68,8 +68,8 @@ def _report(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Namespa
     """Write and show the statistics; exit status 1 if a case failed or a required rate is not reached."""
     from rig.cli.answer import show_answer
     from rig.studies.campaign.campaign_report import build_campaign_report
+    from rig.studies.campaign.campaign_summary import summarise_campaign
     from rig.studies.campaign.folder import read_matrix_of_folder
-    from rig.studies.campaign.summary import summarise_campaign
 
     figures = summarise_campaign(rows)
     report = build_campaign_report(figures, str(folder))

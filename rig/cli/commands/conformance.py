@@ -37,9 +37,9 @@ def run_command(args: argparse.Namespace) -> int:
     from plant.errors import InputError
     from rig.cli.answer import choose_file, show_answer
     from rig.cli.progress_bar import show_progress
+    from rig.conformance.conformance_report import Subject, build_conformance_report, write_junit
     from rig.conformance.data_sheet import DataSheet
-    from rig.conformance.report import Subject, build_conformance_report, write_junit
-    from rig.conformance.runner import choose_cases, run_cases
+    from rig.conformance.run_cases import choose_cases, run_cases
     from rig.conformance.target import Options, Target
     from rig.network.bus import choose_bus
 

@@ -83,8 +83,8 @@ def score_method(args: argparse.Namespace) -> int:
     from fdi.report.json import to_json
     from rig.cli.answer import choose_file, show_answer
     from rig.cli.progress_bar import show_progress
+    from rig.studies.prognosis.prognosis_summary import score_laws
     from rig.studies.prognosis.score_report import build_score_report
-    from rig.studies.prognosis.summary import score_laws
 
     out = choose_file(args.out or None, (".json",), None)
     with show_progress(is_silent=args.json or args.quiet) as progress:

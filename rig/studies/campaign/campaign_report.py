@@ -19,7 +19,7 @@ from fdi.report.report import (
     Section,
     Table,
 )
-from rig.studies.campaign.summary import name_size
+from rig.studies.campaign.campaign_summary import name_size
 from rig.studies.resumable.batch import BatchProgress
 
 
@@ -30,7 +30,7 @@ def describe_progress(progress: BatchProgress) -> str:
 
 
 def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -> Report:
-    """Report on the figures of `rig.studies.campaign.summary.summarise_campaign`, which are its `data`."""
+    """Report on the figures of `rig.studies.campaign.campaign_summary.summarise_campaign`, which are its `data`."""
     status = ", ".join(f"{count} {word}" for word, count in figures["status"].items())
     lines: list[Item] = []
     if figures["seconds"]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from fdi.diagnosis.faults import FAULTS, Fault
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, to_svg
-from rig.studies.campaign.summary import name_size
+from rig.studies.campaign.campaign_summary import name_size
 
 BLUE = "#1f6feb"
 LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED), ("ruling", "ruling fault", GREEN),

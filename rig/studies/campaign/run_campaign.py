@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from rig.studies.campaign.case import FAILED, describe_case, hash_campaign_sources, judge_case, load_judgement
+from rig.studies.campaign.campaign_case import FAILED, describe_case, hash_campaign_sources, judge_case, load_judgement
 from rig.studies.campaign.folder import CampaignFolder, import_pyarrow
 from rig.studies.campaign.matrix import Case, Matrix
 from rig.studies.resumable.batch import Batch, BatchProgress, Workers, run_batch

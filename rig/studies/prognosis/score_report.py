@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 from fdi.report.report import Column, Line, Report, Section, Table
-from rig.studies.prognosis.score import LAMBDAS
-from rig.studies.prognosis.summary import LawScores, Scores, to_json
+from rig.studies.prognosis.prognosis_score import LAMBDAS
+from rig.studies.prognosis.prognosis_summary import LawScores, Scores, to_json
 
 
 def build_score_report(scores: Scores) -> Report:

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from rig.network.clock import WallClock
 from rig.studies.resumable.dask_cluster import connect_to_cluster, run_on_cluster
-from rig.studies.resumable.processes import run_in_processes
 from rig.studies.resumable.row_file import Row, RowFile
+from rig.studies.resumable.worker_processes import run_in_processes
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -24,7 +24,7 @@ def _describe_hidden(sizes: Mapping[str, float]) -> str:
 
 
 def build_trial_report(figures: Mapping[str, Any]) -> Report:
-    """Report on the figures of `rig.studies.trial.score.summarise_trial`, which are its `data`."""
+    """Report on the figures of `rig.studies.trial.trial_score.summarise_trial`, which are its `data`."""
     missed = [rate["name"].strip() for rate in figures["rates"] if rate["of"] and not rate["met"]]
     sentence = f"{len(missed)} rates are not met: {'; '.join(missed)}." if missed else "Every counted rate is met."
     return Report(

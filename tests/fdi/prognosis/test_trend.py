@@ -25,7 +25,7 @@ from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.provenance import collect_provenance
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import Prediction, find_false_trends, score_unit
+from rig.studies.prognosis.prognosis_score import Prediction, find_false_trends, score_unit
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)

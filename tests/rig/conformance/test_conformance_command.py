@@ -13,10 +13,10 @@ from c_device import CFirmware, skip_without_compiler
 from rig_command import gone, rig, started
 
 from dbc import EDS
-from rig.conformance.case import CHAPTERS, Result, Verdict
+from rig.conformance.conformance_case import CHAPTERS, Result, Verdict
+from rig.conformance.conformance_report import Subject, write_junit
 from rig.conformance.data_sheet import DataSheet
-from rig.conformance.report import Subject, write_junit
-from rig.conformance.runner import CASES, Outcome, run_cases
+from rig.conformance.run_cases import CASES, Outcome, run_cases
 from rig.conformance.target import Options, Target
 from rig.network.clock import VirtualClock
 from rig.network.wire import EmbeddedWire

@@ -8,8 +8,8 @@ import pytest
 from broken_devices import examine, failures, nothing, skip_checks
 
 from dbc import EDS
-from rig.conformance.case import Verdict
-from rig.conformance.runner import Outcome
+from rig.conformance.conformance_case import Verdict
+from rig.conformance.run_cases import Outcome
 from rig.device import NmtState, SdoAbort
 from rig.device.cob_id import INVALID
 

@@ -9,9 +9,9 @@ from broken_devices import examine, failures, keep_values_over_reset
 
 from dbc import EDS
 from plant.errors import RigError
-from rig.conformance.case import Verdict
+from rig.conformance.conformance_case import Verdict
 from rig.conformance.data_sheet import DataSheet
-from rig.conformance.runner import choose_cases, run_cases
+from rig.conformance.run_cases import choose_cases, run_cases
 from rig.conformance.target import Options, Target
 from rig.network.clock import VirtualClock
 from rig.network.frame import Send

@@ -22,8 +22,8 @@ from rig_command import finished, grown, rig, started
 from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
-from rig.studies.campaign import case as cases
-from rig.studies.campaign import folder, matrix, summary
+from rig.studies.campaign import campaign_case as cases
+from rig.studies.campaign import campaign_summary, folder, matrix
 from rig.studies.campaign.run_campaign import plan_batch, run_campaign
 from rig.studies.resumable import batch, dask_cluster
 from rig.studies.resumable.batch import BatchProgress, Workers, run_jobs
@@ -243,7 +243,7 @@ def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_samp
     assert matrix.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
     shipped = matrix.build_matrix(matrix.read_matrix("statistics"), Model(), "fdi", "statistics")
     labels = Counter(c.label for c in shipped.cases)
-    assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[summary.OFF_GRID] >= 200
+    assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[campaign_summary.OFF_GRID] >= 200
 
 
 def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:

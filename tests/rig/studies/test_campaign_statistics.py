@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.binomial import measure_share
 from fdi.report.terminal import print_report
-from rig.studies.campaign import detection_figure, summary
+from rig.studies.campaign import campaign_summary, detection_figure
 from rig.studies.campaign.campaign_report import build_campaign_report
 
 
@@ -41,8 +41,8 @@ def test_statistics_count_what_was_said() -> None:
              *judged("spool_friction=70", 0.0, 70.0, (fine, worst), 30),
              *judged("spool_friction=70", 0.0, 70.0, (bad, fine), 1),
              *judged("spool_friction=70", 0.0, 70.0, (fine, fine), 1, status="refused"),
-             *judged(summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
-    rates = {rate.name: rate for rate in summary.count_rates(found)}
+             *judged(campaign_summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
+    rates = {rate.name: rate for rate in campaign_summary.count_rates(found)}
 
     def count(name: str) -> tuple[int, int, bool | None]:
         return rates[name].share.good, rates[name].share.of, rates[name].met
@@ -53,16 +53,17 @@ def test_statistics_count_what_was_said() -> None:
     assert count("Kintas at MaxBand detected") == (0, 0, None)
     assert count("ruling fault, MidBand on") == (68, 72, False)
     assert count("off-grid Kintas covered") == (25, 25, False) and count("off-grid FSS within 2 %") == (25, 25, None)
-    points = [(p.size, p.detected.good, p.most.good) for p in summary.count_detections(found, FRICTION)]
-    assert [p.bands.good for p in summary.count_detections(found, FRICTION)] == [0, 30]
+    points = [(p.size, p.detected.good, p.most.good) for p in campaign_summary.count_detections(found, FRICTION)]
+    assert [p.bands.good for p in campaign_summary.count_detections(found, FRICTION)] == [0, 30]
     assert points == [(5.0, 3, 0), (70.0, 30, 30)]
-    assert summary.count_levels(found, CLOGGING)["acceptable"] == {
+    assert campaign_summary.count_levels(found, CLOGGING)["acceptable"] == {
         fine: 402 + 30 + 25, bad: 1, worst: 0, "cannot_tell": 0, "refused": 1, "failed": 0}
-    assert summary.count_ruling_faults(found)["spool_friction, non_nominal"] == {
+    assert campaign_summary.count_ruling_faults(found)["spool_friction, non_nominal"] == {
         "spool_friction": 30, "filter_clogging": 1, "refused": 1}
-    error = next(e for e in summary.measure_errors(found) if (e.label, e.fault) == (summary.OFF_GRID, "spool_friction"))
+    wanted = campaign_summary.OFF_GRID, "spool_friction"
+    error = next(e for e in campaign_summary.measure_errors(found) if (e.label, e.fault) == wanted)
     assert (error.bias, error.rms, error.covered.good) == (pytest.approx(0.45), pytest.approx(0.45), 25)
-    figures = summary.summarise_campaign(found)
+    figures = campaign_summary.summarise_campaign(found)
     json.dumps(figures, allow_nan=False)
     out = Console(width=100, record=True, quiet=False)
     print_report(build_campaign_report(figures), out)
@@ -77,4 +78,4 @@ def test_statistics_count_what_was_said() -> None:
     (99, 100, 0.93, 0.97, False), (3, 9, 0.0, 1.0, None), (0, 0, 0.95, 1.0, None)])
 def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, met: bool | None
                                                   ) -> None:
-    assert summary.Rate("", measure_share(good, of), least, most).met is met
+    assert campaign_summary.Rate("", measure_share(good, of), least, most).met is met

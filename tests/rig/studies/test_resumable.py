@@ -15,8 +15,8 @@ import pytest
 
 from plant import InputError, RigError
 from rig.studies.resumable.batch import Batch, BatchProgress, Workers, run_batch, run_jobs
-from rig.studies.resumable.processes import run_in_processes
 from rig.studies.resumable.row_file import RowFile, read_rows
+from rig.studies.resumable.worker_processes import run_in_processes
 
 
 def fail_test(job: object, reason: str) -> Any:

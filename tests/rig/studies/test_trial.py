@@ -21,7 +21,7 @@ from fdi.trace.trace import Trace
 from plant import InputError, Model
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes
-from rig.studies.trial import cases, command, hidden, score
+from rig.studies.trial import cases, command, hidden, trial_score
 from rig.studies.trial.blackbox import RIG_EXPLAIN
 from rig.studies.trial.run_trial import load_explain, run_trial
 from rig.studies.trial.trial_report import build_trial_report, describe_progress
@@ -199,14 +199,14 @@ RECORDS = [
 
 
 def test_rates_count_what_they_say() -> None:
-    found = [(rate.good, rate.of, rate.bad) for rate in score.count_rates(RECORDS)]
+    found = [(rate.good, rate.of, rate.bad) for rate in trial_score.count_rates(RECORDS)]
     assert found == [(1, 2, (1,)), (2, 3, (4,)), (1, 2, (3,)), (1, 2, (3,)), (1, 1, ()), (1, 2, (7,)), (1, 2, (9,)),
                      (9, 10, (0,))]
-    assert score.average_named_effects(RECORDS) == 1.5
+    assert trial_score.average_named_effects(RECORDS) == 1.5
 
 
 def test_the_summary_tells_every_failure_and_is_json() -> None:
-    figures = json.loads(json.dumps(score.summarise_trial(RECORDS)))
+    figures = json.loads(json.dumps(trial_score.summarise_trial(RECORDS)))
     assert [f["seed"] for f in figures["failures"]] == [0, 1, 3, 4, 7, 9]
     assert figures["rates"][0]["bad"] == [1] and figures["by_signals"]["xj"]["two effects: both named"] == [0, 0]
     print_report(build_trial_report(figures), Console(file=(shown := io.StringIO()), width=200))
@@ -255,7 +255,7 @@ def test_the_command_refuses_no_cases_in_one_line() -> None:
 @pytest.mark.slow
 def test_blind_trial(tmp_path: Path) -> None:
     """200 cases through `rig explain`: an hour or two."""
-    missed = [rate for rate in score.count_rates(run_trial(RIG_EXPLAIN, range(200), tmp_path)) if not rate.met]
+    missed = [rate for rate in trial_score.count_rates(run_trial(RIG_EXPLAIN, range(200), tmp_path)) if not rate.met]
     assert missed == []
 
 

@@ -11,7 +11,7 @@ from fdi.progress import Progress
 from fdi.report.json import to_plain
 from plant.errors import RigError
 from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.score import LAMBDAS, Score, find_false_trends, score_unit
+from rig.studies.prognosis.prognosis_score import LAMBDAS, Score, find_false_trends, score_unit
 from rig.studies.resumable.batch import Workers, run_jobs
 
 

@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table
-from rig.conformance.case import CHAPTERS, Result, Verdict
+from rig.conformance.conformance_case import CHAPTERS, Result, Verdict
 from rig.conformance.data_sheet import DataSheet
-from rig.conformance.runner import Outcome
+from rig.conformance.run_cases import Outcome
 
 MOODS: dict[Verdict, Mood] = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.NOT_APPLICABLE: "muted",
                               Verdict.SKIPPED: "doubtful"}

@@ -15,7 +15,7 @@ from rig.conformance import (
     sdo_cases,
     timing_cases,
 )
-from rig.conformance.case import CHAPTERS, Case, CaseEnd, CaseFailed, Result, Verdict
+from rig.conformance.conformance_case import CHAPTERS, Case, CaseEnd, CaseFailed, Result, Verdict
 from rig.conformance.data_sheet import Variable
 from rig.conformance.object_cases import list_readable
 from rig.conformance.target import RESET_COMMUNICATION, Refusal, Target

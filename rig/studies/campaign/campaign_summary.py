@@ -11,7 +11,7 @@ import numpy as np
 
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
 from fdi.estimation.binomial import Share, measure_share
-from rig.studies.campaign.case import FAILED, OK, REFUSED
+from rig.studies.campaign.campaign_case import FAILED, OK, REFUSED
 from rig.studies.campaign.judge import CANNOT_TELL
 from rig.studies.campaign.matrix import HEALTHY, label_plant
 from rig.studies.resumable.row_file import Row
