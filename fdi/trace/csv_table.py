@@ -7,7 +7,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,7 +136,7 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
     if not values[0]:
         raise InputError(path, "", "at least one row after the header")
     unknown = [name for name in header if name not in required and name not in optional]
-    notes = (*(f"column {name} is not known and was left out" for name in unknown),
+    notes = (*_describe_unknown(unknown),
              *(f"column {name}: {count} fields say nan and count as missing" for name, count in words.items() if count))
     return {name: np.array(column) for column, (_, name) in zip(values, known, strict=True)}, notes
 
@@ -166,6 +166,14 @@ def _find_table(header: str, plant: Plant) -> Table | None:
 
 def _split_header(line: str, table: Table) -> list[str]:
     return [name.strip() for name in next(csv.reader([line], delimiter=table.separator), [])]
+
+
+def _describe_unknown(names: Sequence[str], most: int = 3) -> list[str]:
+    """At most one note: the columns that were left out, the first ones by name."""
+    if len(names) < 2:
+        return [f"column {name} is not known and was left out" for name in names]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return [f"{len(names)} columns are not known and were left out: {', '.join(names[:most])}{more}"]
 
 
 def _combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:

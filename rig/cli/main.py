@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """`rig COMMAND`: parse the command line, run the command, report errors in one line, return the exit status."""
 from __future__ import annotations
 
@@ -96,6 +97,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status. Without `argv` it is the program, which ends right after this."""
+    if argv is None and "_ARGCOMPLETE" in os.environ:
+        from rig.cli.completion import complete_line
+
+        complete_line()
     if argv is None:
         leave_out_reader(sys.argv[1:])
         return leave_quickly()(run_command_line(sys.argv[1:]))

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """The suffix of --out chooses the format."""
-    from fdi.output import require_new
+    from fdi.output import require_new, require_writable
     from fdi.report.report import Report
     from plant.errors import InputError
     from rig.cli.answer import show_answer
@@ -24,7 +24,8 @@ def run_command(args: argparse.Namespace) -> int:
 
     if args.out is None:
         raise InputError("--out", "", "the file to write, such as run.csv or frames.blf")
-    count = export_trace(Path(args.trace), require_new(args.out, is_forced=args.force), args.all)
+    out = require_new(require_writable(args.out, "--out", source=args.trace), is_forced=args.force)
+    count = export_trace(Path(args.trace), out, args.all)
     sentence = f"{args.out}: {count} {'rows' if '.csv' in Path(args.out).suffixes else 'frames'}"
     show_answer(Report("export", args.trace, sentence=sentence, data={"path": str(args.out), "count": count}), args)
     return 0

@@ -128,6 +128,8 @@ def test_missing_samples_and_gaps(tmp_path: Path) -> None:
     assert trace.gaps == (Gap(0.001, 0.004, 2),)
     assert trace.signals == ("com", "xj", "cor") and np.isnan(trace.p12).all()
     assert trace.notes == ("column note is not known and was left out",)
+    several = Trace.read(_csv(tmp_path, "t,com,xj,cor,a,b,c,d,e\n0,0,0,0,1,2,3,4,5\n0.001,0,0,0,1,2,3,4,5\n"))
+    assert several.notes == ("5 columns are not known and were left out: a, b, c and 2 more",)
     trace.write_csv(tmp_path / "y.csv")
     assert Trace.read(tmp_path / "y.csv").gaps == trace.gaps
 
