@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Container
+from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import canopen
@@ -55,6 +56,12 @@ class _Node(canopen.RemoteNode):
         return client
 
 
+@cache
+def _read_dictionary(node: int) -> canopen.ObjectDictionary:
+    """The library's object dictionary of a node. The library does not change it; to read it takes 20 ms."""
+    return canopen.import_od(str(EDS[node]), node)
+
+
 class _Network(canopen.Network):
     """The library's network on our wire."""
 
@@ -74,14 +81,7 @@ class Master:
 
     def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
         self.wire, self._now, self._stamped = wire, now, stamped
-        self.on_frame: Callable[[Frame], None] = lambda frame: None
-        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
-        self.on_state: Callable[[int, int], None] = lambda node, state: None
-        self.on_lost: Callable[[int], None] = lambda node: None
-        self.on_back: Callable[[int], None] = lambda node: None
-        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
-        self.on_rival: Callable[[int], None] = lambda cob_id: None
-        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+        self._ignore_all()
         self.silent = False  # a fault: no heartbeat of ours
         self.is_deaf = False  # a fault: the rig receives nothing
         self.states = {CONTROLLER: -1, PLANT: -1}
@@ -104,8 +104,24 @@ class Master:
                           for node in self._nodes}
         wire.receive = self.receive
 
+    def close(self) -> None:
+        """Report to nobody any more. Whoever the master reported to is then free, together with what it holds."""
+        self._now = self.wire.clock.now
+        self._ignore_all()
+
+    def _ignore_all(self) -> None:
+        """Set the hooks to nobody."""
+        self.on_frame: Callable[[Frame], None] = lambda frame: None
+        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
+        self.on_state: Callable[[int, int], None] = lambda node, state: None
+        self.on_lost: Callable[[int], None] = lambda node: None
+        self.on_back: Callable[[int], None] = lambda node: None
+        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
+        self.on_rival: Callable[[int], None] = lambda cob_id: None
+        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+
     def _join(self, node: int) -> Any:  # the library's node; its types are too loose to help
-        remote = _Node(node, str(EDS[node]))
+        remote = _Node(node, _read_dictionary(node))
         self.network.add_node(remote)
         remote.emcy.add_callback(lambda error: self.on_emcy(node, error))
         remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(node, state))

@@ -67,8 +67,8 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         compile_cycle(job.realtime)
     with lock_folder(folder), open_participants(job) as participants:
         prepare()
-        with open_recorder(job, folder) as recorder:
-            session = Session(job, participants, recorder, progress, stop)
+        with (open_recorder(job, folder) as recorder,
+              contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
             outcome = play_job(job, folder, session, recorder, progress, diagnose)
         outcome.save()
     return outcome

@@ -1,9 +1,11 @@
 """Whole runs: the same bytes for the same seed, whatever the pace and the bus; and what a killed one leaves behind."""
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from plant import simulate
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.link import Link
+from rig.run import runner
+from rig.run.session import Session
 
 SIGNALS = ("com", "xj", "cor", "p12", "xs")
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60') + 'ends = "safe_state"\n'
@@ -242,3 +246,24 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, r
         said = [finished(node) for node in nodes]
     assert outcome.verdict == "PASS" and [one.status for one in said] == [0, 0]
     assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
+
+
+@pytest.mark.parametrize("bus_kind", ["embedded", "udp_multicast"])
+def test_the_memory_of_a_run_is_free_when_it_ends(
+    bus_kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not when Python next looks for reference cycles: many runs in one process would grow in between."""
+    kept: list[weakref.ref[object]] = []
+
+    class NotedSession(Session):
+        def run_phases(self) -> None:
+            super().run_phases()
+            kept.extend((weakref.ref(self), weakref.ref(self.loop), weakref.ref(self.history)))
+
+    monkeypatch.setattr(runner, "Session", NotedSession)
+    gc.disable()
+    try:
+        play(job(bus=spec(bus_kind) if bus_kind != "embedded" else bus_kind), tmp_path)
+        assert [each() for each in kept] == [None] * 3
+    finally:
+        gc.enable()
