@@ -7,7 +7,9 @@
 #include <sys/sem.h>
 #include <time.h>
 
-enum { TURN, USERS, REMOVED, SEMAPHORES }; /* REMOVED: the last program removes the set */
+/* REMOVED: the last program removes the set. MARK: by this value the rig knows a set whose programs were killed. */
+enum { TURN, USERS, REMOVED, MARK, SEMAPHORES };
+enum { MARK_VALUE = 0x4548 };
 
 static int set = -1; /* of semaphores */
 
@@ -36,14 +38,16 @@ bool turn_join(const char *group, uint16_t port)
 {
     struct sembuf join[] = {{REMOVED, 0, IPC_NOWAIT}, {USERS, 1, SEM_UNDO}};
     char name[64];
-    snprintf(name, sizeof name, "eha-rig %s %u", group, (unsigned)port);
+    snprintf(name, sizeof name, "eha-rig %s %u %d", group, (unsigned)port, SEMAPHORES);
     const key_t key = (key_t)(compute_crc(name) & 0x7FFFFFFF);
     do {
         set = semget(key, SEMAPHORES, IPC_CREAT | 0666);
         if (set < 0)
             return false;
-        if (operate(join, 2, NULL))
+        if (operate(join, 2, NULL)) {
+            semctl(set, MARK, SETVAL, MARK_VALUE);
             return true;
+        }
     } while (errno == EAGAIN || errno == EIDRM || errno == EINVAL); /* the set is being removed */
     return false;
 }

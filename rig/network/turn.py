@@ -4,7 +4,9 @@ It is a System V semaphore set. The kernel takes the turn back when its holder d
 names the holder. There is no file that a symbolic link could divert. A lock file has no limit for the wait.
 
 Every user of the machine may take the turn, as every user may send on the group: multicast has no access control.
-Semaphore 0 is the turn, 1 counts the programs that use the set, 2 says that the last of them removes it.
+Semaphore 0 is the turn, 1 counts the programs that use the set, 2 says that the last of them removes it, and 3 holds a
+mark by which the set is known as one of ours. The kernel keeps the set of programs that were all killed; the next
+program that opens a bus removes it.
 """
 from __future__ import annotations
 
@@ -19,10 +21,11 @@ import numpy as np
 from plant.errors import RigError
 
 TURN_LIMIT_NS = 1_000_000_000  # a turn takes 20 us; one that takes a second is held by a stopped or foreign program
-_TURN, _USERS, _REMOVED = range(3)
+_TURN, _USERS, _REMOVED, _MARK, _SEMAPHORES = range(5)
+_MARK_VALUE = 0x4548
 _NOWAIT, _UNDO = 0o4000, 0x1000  # linux/ipc.h, linux/sem.h
 _CREATE = 0o1000
-_REMOVE, _GET_PID = 0, 11
+_REMOVE, _GET_PID, _GET_VALUE, _SET_VALUE = 0, 11, 12, 16
 _OPERATION = np.dtype([("number", np.uint16), ("change", np.int16), ("flags", np.int16)])  # struct sembuf
 
 # Waiting for zero and counting up is one operation to the kernel, so a new set needs no first value.
@@ -32,6 +35,15 @@ _JOIN = np.array([(_REMOVED, 0, _NOWAIT), (_USERS, 1, _UNDO)], _OPERATION)
 _LEAVE = np.array([(_USERS, -1, _UNDO)], _OPERATION)
 _LEAVE_LAST = np.array([(_USERS, -1, _UNDO), (_USERS, 0, _NOWAIT), (_REMOVED, 1, 0)], _OPERATION)
 _RESTORE = np.array([(_REMOVED, -1, _NOWAIT)], _OPERATION)
+_CLAIM_UNUSED = np.array([(_USERS, 0, _NOWAIT), (_REMOVED, 1, 0)], _OPERATION)
+
+
+def find_key(group: str, port: int) -> int:
+    """Key of the semaphores of a group and port; rig/firmware/turn.c calculates the same.
+
+    The number is that of the semaphores: a set of another layout has another key.
+    """
+    return zlib.crc32(f"eha-rig {group} {port} {_SEMAPHORES}".encode()) & 0x7FFFFFFF
 
 
 class Turn:
@@ -42,8 +54,7 @@ class Turn:
 
     def __init__(self, group: str, port: int) -> None:
         self._where = f"udp_multicast {group}:{port}"
-        name = f"eha-rig {group} {port}".encode()
-        self._key = zlib.crc32(name) & 0x7FFFFFFF  # rig/firmware/turn.c calculates the same
+        self._key = find_key(group, port)
         self._library = ctypes.CDLL(None, use_errno=True)
         self.identifier = self._join()
 
@@ -82,15 +93,34 @@ class Turn:
 
     def _join(self) -> int:
         while True:
-            identifier = int(self._library.semget(self._key, 3, _CREATE | 0o666))
+            self._remove_unused()
+            identifier = int(self._library.semget(self._key, _SEMAPHORES, _CREATE | 0o666))
             if identifier < 0:
                 number = ctypes.get_errno()
                 raise OSError(number, f"no semaphores for the turn to send: {os.strerror(number)}")
             number = self._operate(_JOIN, identifier=identifier)
             if number == 0:
+                self._library.semctl(identifier, _MARK, _SET_VALUE, _MARK_VALUE)
                 return identifier
             if number not in (errno.EAGAIN, errno.EIDRM, errno.EINVAL):  # else: being removed just now
                 raise OSError(number, f"no semaphores for the turn to send: {os.strerror(number)}")
+
+    def _remove_unused(self) -> None:
+        """Remove our sets that nobody uses: their programs were killed.
+
+        A program that is about to join such a set finds it gone, and makes a new one.
+        """
+        try:
+            lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
+        except OSError:
+            return
+        for line in lines:
+            _, identifier, _, count, owner = map(int, line.split()[:5])
+            is_ours = count == _SEMAPHORES and owner == os.geteuid()
+            if not is_ours or self._library.semctl(identifier, _MARK, _GET_VALUE) != _MARK_VALUE:
+                continue
+            if self._operate(_CLAIM_UNUSED, identifier=identifier) == 0:
+                self._library.semctl(identifier, 0, _REMOVE)
 
     def _operate(self, operations: np.ndarray, limit: np.ndarray | None = None, identifier: int = -1) -> int:
         """semtimedop; errno, 0 when done."""

@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -32,6 +31,7 @@ from rig.network.clock import WallClock
 from rig.network.codec import Flags
 from rig.network.frame import Frame
 from rig.network.link import Link
+from rig.network.turn import find_key
 from rig.network.udp import PORT
 from rig.recorder.recover import recover_log
 
@@ -272,6 +272,6 @@ def find_processes(group: str) -> list[tuple[int, str]]:
 
 def has_semaphores(group: str) -> bool:
     """Whether the turn to send on a group still has its semaphores (rig/network/turn.py)."""
-    key = zlib.crc32(f"eha-rig {group} {PORT}".encode()) & 0x7FFFFFFF
+    key = find_key(group, PORT)
     lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
     return any(int(line.split()[0]) == key for line in lines)

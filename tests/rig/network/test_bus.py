@@ -1,9 +1,13 @@
 """One set of tests for every back end, then what is particular to each."""
 from __future__ import annotations
 
+import ctypes
 import select
+import signal
 import socket
 import struct
+import subprocess
+import sys
 import time
 
 import can
@@ -18,7 +22,9 @@ from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
-from rig.network.udp import LoopbackBus
+from rig.network.turn import Turn
+from rig.network.udp import PORT, LoopbackBus
+from rig.studies.robustness.disturb import has_semaphores
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
@@ -284,3 +290,23 @@ class TestLink:
                 use()
             assert str(caught.value)
             assert "\n" not in str(caught.value)
+
+
+def test_the_semaphores_of_killed_programs_are_removed_by_the_next_one() -> None:
+    """Those of programs at work stay, and so do sets of the same size that are not ours."""
+    killed, used, following = (spec("udp_multicast").partition(":")[2] for _ in range(3))
+    code = ("import os, signal, sys; from rig.network.turn import Turn; Turn(sys.argv[1], int(sys.argv[2])); "
+            "os.kill(os.getpid(), signal.SIGKILL)")
+    assert subprocess.run([sys.executable, "-c", code, killed, str(PORT)], check=False).returncode == -signal.SIGKILL
+    library = ctypes.CDLL(None)
+    foreign = library.semget(0, 4, 0o1000 | 0o666)  # IPC_PRIVATE
+    turn = Turn(used, PORT)
+    try:
+        other = Turn(following, PORT)
+        assert [has_semaphores(group) for group in (killed, used, following)] == [False, True, True]
+        assert library.semctl(foreign, 0, 12) == 0  # GETVAL
+        other.close()
+    finally:
+        turn.close()
+        library.semctl(foreign, 0, 0)  # IPC_RMID
+    assert not any(map(has_semaphores, (killed, used, following)))
