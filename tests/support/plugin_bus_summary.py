@@ -2,7 +2,8 @@
 
 A test belongs to a bus when its parameters name one (the `bus_kind` fixture). On a kernel without vcan0, but with the
 User-Mode-Linux guest at hand, the socketcan tests are taken out here and run once, all together, inside the guest by
-vcan/test_vcan_guest.py; it notes their number in `GUEST_TESTS`.
+vcan/test_vcan_guest.py; it records their number as the property `GUEST_TESTS`. A property travels from the worker that
+ran the test to the session that prints the summary.
 """
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from vcan_host import APT_LINE, guest_missing, kernel_has_vcan0
 from rig.network.bus import explain_socketcan_problem
 
 BUSES = ("embedded", "virtual", "udp_multicast", "socketcan")
-GUEST_TESTS = pytest.StashKey[int]()  # socketcan tests that passed in the guest
-NOTES = pytest.StashKey[list[str]]()  # sentences for the summary, such as what the dissector found
+GUEST_TESTS = "socketcan tests passed in the guest"  # property of a test: their number
+NOTE = "note for the summary"  # property of a test: a sentence, such as what the dissector found
 LEFT_TO_GUEST = pytest.StashKey[int]()  # socketcan tests taken out of this session
 RUNNER = "tests/vcan/test_vcan_guest.py"
 
@@ -55,11 +56,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """The notes, the tests passed per bus, and what it takes where none ran on a real CAN interface."""
-    for note in config.stash.get(NOTES, []):
-        terminalreporter.write_line(note)
     passed = terminalreporter.stats.get("passed", [])
+    properties = [(name, value) for report in passed for name, value in report.user_properties]
+    for name, value in properties:
+        if name == NOTE:
+            terminalreporter.write_line(value)
     counts = Counter(bus for report in passed if (bus := bus_of(report.nodeid)))
-    in_guest = config.stash.get(GUEST_TESTS, 0)
+    in_guest = sum(value for name, value in properties if name == GUEST_TESTS)
     if not counts and not in_guest:
         return
     words = [f"{bus} {counts[bus]}" for bus in BUSES[:-1]]

@@ -10,12 +10,13 @@ import shutil
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import dissect
 import numpy as np
 import pytest
-from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTES
+from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTE
 from vcan_host import FOLDER, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
 
 from fdi.trace.trace import Trace
@@ -39,7 +40,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_bus_tests_pass_on_a_real_can_interface(out: Path, pytestconfig: pytest.Config) -> None:
+def test_bus_tests_pass_on_a_real_can_interface(
+    out: Path, pytestconfig: pytest.Config, record_property: Callable[[str, object], None]
+) -> None:
     """All of them, none skipped, and no fewer than were left to the guest."""
     if kernel_has_vcan0():
         return  # they are part of this very session, see the summary's 'tests per bus'
@@ -47,7 +50,7 @@ def test_bus_tests_pass_on_a_real_can_interface(out: Path, pytestconfig: pytest.
     assert report.exists(), (out / "output.txt").read_text()
     cases = ElementTree.parse(report).iter("testcase")
     outcomes = [{child.tag for child in case} & {"failure", "error", "skipped"} for case in cases]
-    pytestconfig.stash[GUEST_TESTS] = sum(not bad for bad in outcomes)
+    record_property(GUEST_TESTS, sum(not bad for bad in outcomes))
     assert outcomes
     assert not any(outcomes), (out / "output.txt").read_text()
     assert len(outcomes) >= pytestconfig.stash.get(LEFT_TO_GUEST, 0)
@@ -60,13 +63,8 @@ def frames(out: Path) -> list[tuple[int, bytes]]:
     return dissect.candump_frames(out / "candump.log")
 
 
-def note(config: pytest.Config, text: str) -> None:
-    """Say it in the session's summary."""
-    config.stash.setdefault(NOTES, []).append(text)
-
-
 def test_preflight_passes_with_three_processes(
-    out: Path, frames: list[tuple[int, bytes]], pytestconfig: pytest.Config
+    out: Path, frames: list[tuple[int, bytes]], record_property: Callable[[str, object], None]
 ) -> None:
     """Plant, controller and sequencer are processes that share nothing but vcan0."""
     facts = json.loads((out / "facts.json").read_text())
@@ -79,7 +77,7 @@ def test_preflight_passes_with_three_processes(
     assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
     counts = Counter(cob_id for cob_id, _ in frames)
     assert counts[0x080] >= answer["timing"]["cycles"] > 1000
-    note(pytestconfig, f"vcan0: preflight by three processes, {counts[0x080]} cycles in {facts['seconds']:.0f} s")
+    record_property(NOTE, f"vcan0: preflight by three processes, {counts[0x080]} cycles in {facts['seconds']:.0f} s")
 
 
 def test_cyclic_frames_are_in_order(frames: list[tuple[int, bytes]]) -> None:
@@ -97,7 +95,7 @@ def test_log_holds_what_was_on_the_bus(out: Path, frames: list[tuple[int, bytes]
 
 
 def test_wireshark_decodes_every_frame(
-    out: Path, frames: list[tuple[int, bytes]], pytestconfig: pytest.Config
+    out: Path, frames: list[tuple[int, bytes]], record_property: Callable[[str, object], None]
 ) -> None:
     """tshark's CANopen dissector finds every service, counts the same frames, and calls none malformed."""
     if shutil.which("tshark") is None:
@@ -108,7 +106,7 @@ def test_wireshark_decodes_every_frame(
     assert counts == Counter(cob_id for cob_id, _ in frames)
     assert {cob_id: name for cob_id, name in SERVICES.items() if not counts[cob_id]} == {}
     named = ", ".join(f"{cob_id:03X}: {number}" for cob_id, number in sorted(counts.items()))
-    note(pytestconfig, f"vcan0: tshark decoded {len(rows)} CANopen frames, none malformed; {named}")
+    record_property(NOTE, f"vcan0: tshark decoded {len(rows)} CANopen frames, none malformed; {named}")
 
 
 def test_dissector_tells_a_broken_frame(tmp_path: Path) -> None:
@@ -124,7 +122,7 @@ def test_dissector_tells_a_broken_frame(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_minute_at_1_khz_with_the_firmware_in_c_loses_no_cycle(
-    tmp_path: Path, pytestconfig: pytest.Config
+    tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     """In lockstep: each of 60,000 cycles has its feedback, valve state and drive frame, and the plant missed none."""
     if not kernel_has_vcan0() and guest_missing():
@@ -136,5 +134,5 @@ def test_a_minute_at_1_khz_with_the_firmware_in_c_loses_no_cycle(
     assert answer["timing"]["cycles"] == 60_400
     trace = Trace.read(tmp_path / "minute", all=True)
     assert len(trace.t) == 60_400 and not any(np.isnan(trace.column(name)).any() for name in ("xj", "xs", "cor"))
-    note(pytestconfig, f"vcan0: 60,000 cycles with the C firmware in lockstep, none lost, {answer['speed']} times real "
-                       "time")
+    record_property(NOTE, "vcan0: 60,000 cycles with the C firmware in lockstep, none lost, "
+                          f"{answer['speed']} times real time")
