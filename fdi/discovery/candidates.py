@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi.discovery.detectable import Detectable
 from fdi.discovery.explain import Explanation, measure_gain
 from fdi.discovery.fingerprints import Fingerprint, measure_firmware_resolution
 from fdi.discovery.search import Hypothesis
-from fdi.discovery.significance import compute_p_value, find_smallest_visible
+from fdi.discovery.significance import compute_p_value
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import limit_friction_values
 from fdi.estimation.unknowns import UNREPLAYED
@@ -57,13 +58,13 @@ class Candidate(NamedTuple):
 
 
 class Blind(NamedTuple):
-    """The smallest size of an effect that this test shows; infinite where none that was tried does."""
+    """An effect that the tolerances make up for, so that this test does not show it at any usual size."""
 
     effect: str
     parameter: str
-    smallest: float  # distance from the off value
-    usual: float  # the largest that is usual
+    usual: float  # distance from the off value, the largest that is usual
     unit: str
+    revealed_by: str  # what would show it
 
 
 class Suspicious(NamedTuple):
@@ -121,7 +122,7 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
         baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
-    blind = tuple(_describe_blind(name, size, model) for name, size in find_smallest_visible(e.blind).items())
+    blind = tuple(_describe_blind(d) for d in e.detectable if not d.size <= d.usual)
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,
@@ -209,11 +210,10 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
                      "explains" if p.effect in e.effects else "no")
 
 
-def _describe_blind(name: str, size: float, model: Model) -> Blind:
-    entry = CATALOGUE[name]
+def _describe_blind(d: Detectable) -> Blind:
+    entry = CATALOGUE[d.effect]
     first = entry.fitted[0]
-    off = entry.off.get(first, model.kind.nominal.get(first, 0.0))
-    return Blind(name, first, size, max(abs(s[first] - off) for s in entry.starts), entry.parameters[first].unit)
+    return Blind(d.effect, first, d.usual, entry.parameters[first].unit, entry.revealed_by)
 
 
 def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]

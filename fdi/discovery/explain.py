@@ -3,13 +3,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.discovery.detectable import Detectable, find_detectable_sizes
 from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
 from fdi.discovery.search import Hypothesis, Search
-from fdi.discovery.significance import Sensitivity, compute_sensitivity
+from fdi.discovery.significance import Sensitivity, compute_sensitivity, find_smallest_visible
+from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -19,6 +22,7 @@ from fdi.thresholds import (
     GAIN_DOUBTFUL,
     GAIN_SEEN,
     GAIN_TIE,
+    HELD_OUT_UNDECIDED_SHARE,
     RESIDUAL_HELD_OUT,
     SOLVER_ERROR_SHARE,
 )
@@ -30,7 +34,16 @@ Floats = NDArray[np.float64]
 
 FINE = 20  # steps a cycle of the last fits
 TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
+NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
+
+
+class HeldOut(NamedTuple):
+    """How a hypothesis does on the held-out run."""
+
+    holds: bool
+    undecided: float = 0.0  # share of the run that no model can predict, and that was therefore not judged
+    decided: Mapping[str, float] = {}  # RMS residual of the rest, SI; empty where all of the run was judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +61,8 @@ class Explanation:
     controller: float  # error of the firmware's answer, in units of its resolution
     blind: Sensitivity
     search: Search = field(repr=False)
+    unseen: Mapping[tuple[str, ...], HeldOut] = field(default_factory=dict)  # of the best hypotheses
+    detectable: tuple[Detectable, ...] = ()  # effects that hide in the tolerances; none where more than noise is left
 
 
 def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
@@ -77,7 +92,7 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         base = search.refit_hypothesis(base)
     levels = _search_levels(search, base, holdout, progress)
     progress("last fits, with finer steps", 0.8)
-    return _conclude(search, levels, found, controller, holdout)
+    return _conclude(search, levels, found, controller, holdout, progress)
 
 
 def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress
@@ -149,7 +164,7 @@ def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN)
 
 
 def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
-              holdout: Trace | None) -> Explanation:
+              holdout: Trace | None, progress: Progress) -> Explanation:
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
@@ -175,13 +190,23 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
-    holding = [h for h in close if not holdout or _holds_on_unseen_run(search, h, holdout, floor)]
+    unseen = {h.effects: _judge_unseen_run(search, h, holdout, floor) for h in close} if holdout else {}
+    holding = [h for h in close if not holdout or unseen[h.effects].holds]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
     verdict, named = _decide_verdict(base, close, holding, part, found, controller, floor)
+    if verdict == "PARTLY" and close and _is_named_for_a_period(search, base, close[0]):
+        named = tuple(f.effect for f in found)
+        verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
+    detectable: tuple[Detectable, ...] = ()
+    if verdict in NOISE_LEFT:
+        progress("what this test cannot see", 0.9)
+        hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
+        detectable = tuple(find_detectable_sizes(search.problem, explained.fit, hard_to_see,
+                                                 find_smallest_visible(blind)))
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
-                       blind, search)
+                       blind, search, unseen, detectable)
 
 
 def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:
@@ -229,14 +254,34 @@ def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequ
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
 
+def _is_named_for_a_period(search: Search, base: Hypothesis, best: Hypothesis) -> bool:
+    from fdi.discovery.residual_pattern import is_periodic_in_position  # takes half a second to import
+
+    return is_periodic_in_position(search, base, best)
+
+
 def _measure_excess(h: Hypothesis, floor: Mapping[str, float]) -> float:
     """How far above the floor what is left is, in all signals together."""
     return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
 
 
-def _holds_on_unseen_run(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> bool:
-    left = compute_typical_rms(_compute_unseen_residuals(search, h, trace))
-    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, left, strict=True))
+def _judge_unseen_run(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> HeldOut:
+    """Whether noise alone is left of the held-out run; if not of all of it, of what does not hang on a small stop."""
+    problem = _make_unseen_problem(search, trace)
+    left = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+    if _is_noise(left, trace, floor):
+        return HeldOut(True)
+    undecided = find_undecided_rows(problem, h.fit, floor)
+    share = float(undecided.mean())
+    if share == 0.0 or share > HELD_OUT_UNDECIDED_SHARE:
+        return HeldOut(False)
+    kept = left[:, ~undecided]
+    rms = np.sqrt(np.nanmean(kept**2, axis=1))
+    return HeldOut(_is_noise(kept, trace, floor), share, dict(zip(trace.outputs, rms.tolist(), strict=True)))
+
+
+def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
+    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, compute_typical_rms(left), strict=True))
 
 
 def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
@@ -246,6 +291,9 @@ def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, fl
 
 
 def _compute_unseen_residuals(search: Search, h: Hypothesis, trace: Trace) -> Floats:
-    problem: Problem = replace(search.problem, trace=trace, steps=TRUEST, also=(), _lanes={})
-    left: Floats = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+    left: Floats = _make_unseen_problem(search, trace).compute_residuals(h.fit.free, h.fit.x[None])[0]
     return left
+
+
+def _make_unseen_problem(search: Search, trace: Trace) -> Problem:
+    return replace(search.problem, trace=trace, steps=TRUEST, also=(), _lanes={})

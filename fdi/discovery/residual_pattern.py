@@ -15,6 +15,7 @@ from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 Floats = NDArray[np.float64]
 
 KNOTS = 15  # of a curve
+SPATIAL_TURNS = 3.0  # over the range of the position: a slower wave is a trend, for example a spring
 PERIODS = np.geomspace(2.0, 60.0, 600)  # over the range of the position
 
 WORDS = {"force": "a force on the ram, against extension", "flow": "a flow that leaves the jack",
@@ -69,6 +70,24 @@ def find_pattern(search: Search, h: Hypothesis) -> Pattern:
     found, states = compute_balances(search, h)
     pumped = found[0].place == "flow" and "pump.displacement" in search.problem.model.values
     return _find_shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
+
+
+def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis) -> bool:
+    """Whether a force that repeats along the stroke explains more of what the base leaves than the found effects do.
+
+    Teeth, magnets and a bent rod make such a force. A friction law that fits its mean at each speed helps a little, on
+    every run, and is then named for it.
+    """
+    balances, states = compute_balances(search, base)
+    force = next((b for b in balances if b.place == "force"), None)
+    if force is None or force.ratio < PATTERN_VISIBLE_RATIO:
+        return False
+    left = next(b for b in compute_balances(search, found)[0] if b.place == "force")
+    taken = 1.0 - (left.size / force.size) ** 2 if force.size else 1.0
+    inner = slice(EDGE, -EDGE)
+    (_, length, _), share = fit_wave(force.missing[inner], states.position[inner], force.noise)
+    turns = float(np.ptp(states.position[inner])) / length
+    return turns >= SPATIAL_TURNS and share >= PATTERN_EXPLAINED_SHARE and share > taken
 
 
 def _find_shape(best: Balance, states: States) -> Pattern:

@@ -99,7 +99,7 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
     for i, name in enumerate(OUTPUTS):
         if name in floor:
             moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-            large = _windows_above(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
+            large = find_large_windows(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
             undecided |= large & ~np.isnan(trace.mask_unusable(name))
     coarse, steps = runs[0], REPLAY_STEPS
     while True:
@@ -153,10 +153,10 @@ def vary_frictions(model: Model) -> Floats:
     return limit_dynamic_friction(names, values)
 
 
-def _windows_above(moved: Floats, floor: float) -> Flags:
+def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Flags:
     """Rows of windows in which one of the runs (m, n) is moved by more than the floor, RMS."""
     n = moved.shape[1]
-    starts = np.arange(0, n, WINDOW)
+    starts = np.arange(0, n, window)
     sizes = np.diff(np.append(starts, n))
     power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0) / sizes
     out: Flags = np.repeat(power > floor**2, sizes)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious, Value
+from fdi.discovery.candidates import Answer, Candidate, Suspicious, Value
 from fdi.discovery.model_file import Row
 from fdi.discovery.runs import Source
 from fdi.report import explain_figures
@@ -55,7 +55,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("Findings", describe_findings(a)),
         *_show_figures(a, pattern),
         *list_suspicious(a.suspicious),
-        Section("What this test can detect", [_tabulate_blind(a)] if a.blind else [], medium=Medium.PAGE),
+        Section("What this test cannot detect", [_tabulate_blind(a)] if a.blind else [], medium=Medium.PAGE),
         Section("Provenance", [Listing(command, medium=Medium.PAGE)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
     return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
@@ -167,7 +167,19 @@ def describe_findings(a: Answer) -> list[Line]:
         lines.append(Line("residual", a.pattern))
     if a.suspicious:
         lines.append(Line("suspicious", describe_suspicious(a.suspicious)))
-    return [*lines, Line("not detectable", describe_blind(a))]
+    lines += [Line("held-out run", text) for text in _describe_undecided(a)]
+    return [*lines, Line("not detectable", describe_blind(a))] if a.blind else lines
+
+
+def _describe_undecided(a: Answer) -> list[str]:
+    """Why a held-out run was not judged as a whole, if so."""
+    held = a.explanation.unseen.get(a.best.effects)
+    if held is None or not held.decided:
+        return []
+    floor = a.explanation.floor
+    worst = max(held.decided[s] / floor[s] for s in held.decided)
+    return [f"{held.undecided:.0%} of it is not judged, because stops of the ram or the spool there depend on a "
+            f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor"]
 
 
 def describe_suspicious(found: Sequence[Suspicious]) -> str:
@@ -180,19 +192,11 @@ def describe_suspicious(found: Sequence[Suspicious]) -> str:
 
 
 def describe_blind(a: Answer) -> str:
-    """The effects that this test could not have detected at their usual size, and how many it would have detected."""
-    unseen = [b for b in a.blind if not b.smallest <= b.usual]
-    detectable = len(a.blind) - len(unseen) + len(a.noiseless)
-    named = join_words(_describe_limit(b) for b in unseen[:NAMED_MOST])
-    more = f" and {len(unseen) - NAMED_MOST} more" if len(unseen) > NAMED_MOST else ""
-    if not unseen:
-        return f"nothing of usual size; {detectable} other effects would have been detected"
-    return f"{named}{more}; {detectable} other effects would have been detected"
-
-
-def _describe_limit(b: Blind) -> str:
-    limit = "at any size" if math.isinf(b.smallest) else f"below {format_amount(b.smallest, b.unit)}"
-    return f"{b.effect} ({limit})"
+    """The effects that the tolerances make up for up to their usual size, and what would reveal each of them."""
+    named = join_words(f"{b.effect} (up to {format_amount(b.usual, b.unit)})" for b in a.blind)
+    aids = dict.fromkeys(b.revealed_by for b in a.blind)
+    revealed = [f"{aid} would reveal {join_words(b.effect for b in a.blind if b.revealed_by == aid)}" for aid in aids]
+    return "; ".join([named, *revealed])
 
 
 def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
@@ -292,13 +296,11 @@ def _show_figures(a: Answer, pattern: Pattern | None) -> list[Section]:
 
 def _tabulate_blind(a: Answer) -> Table:
     rows: list[list[Cell | str]] = [
-        [Cell(b.effect, "" if b.smallest <= b.usual else "bad"), Cell(name_parameter(b.parameter), "muted"),
-         format_amount(b.smallest, b.unit) if math.isfinite(b.smallest) else "none",
-         Cell(format_amount(b.usual, b.unit), "muted")] for b in a.blind]
-    return Table([Column("effect"), Column("parameter"), Column("smallest detectable", align="right"),
-                  Column("largest usual", align="right")], rows,
-                 "The smallest size of each effect that this test would have shown. Red: larger than the usual size, "
-                 "so this test says nothing about the effect.")
+        [Cell(b.effect, "bad"), Cell(name_parameter(b.parameter), "muted"), format_amount(b.usual, b.unit),
+         b.revealed_by] for b in a.blind]
+    return Table([Column("effect"), Column("parameter"), Column("not detectable up to", align="right"),
+                  Column("would reveal it")], rows,
+                 "Tolerances of a healthy unit make up for these effects, so this test says nothing about them.")
 
 
 def collect_data(a: Answer) -> dict[str, Any]:
@@ -307,11 +309,14 @@ def collect_data(a: Answer) -> dict[str, Any]:
     data: dict[str, Any] = {
         "verdict": e.verdict, "effects": list(e.effects), "candidates": [_candidate_data(c) for c in a.candidates],
         "baseline": {**a.baseline, "ratio": e.base.ratio},
-        "blind_to": [{"effect": b.effect, "parameter": b.parameter, "smallest_visible": b.smallest, "unit": b.unit,
-                      "usual": b.usual} for b in a.blind],
+        "blind_to": [{"effect": b.effect, "parameter": b.parameter, "smallest_visible": None, "unit": b.unit,
+                      "usual": b.usual, "revealed_by": b.revealed_by} for b in a.blind],
         "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
         "separate": dict(a.separate), "pattern": a.pattern,
         "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor}}
+    held = e.unseen.get(a.best.effects)
+    if held is not None and held.decided:
+        data["undecided"] = {"share": held.undecided, "holdout": dict(held.decided)}
     if len(e.effects) > 1 and e.verdict != "AMBIGUOUS":
         data["ledger"] = [{"effect": effect, "error": error, "holdout": holdout} for effect, error, holdout in a.ledger]
     return data

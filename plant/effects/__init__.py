@@ -53,6 +53,7 @@ class Effect:
     starts: tuple[Mapping[str, float], ...] = ()  # where fits and scans begin: all `fitted`, small to large, SI
     excludes: tuple[str, ...] = ()  # effects that cannot be at work together with this one
     confused_with: tuple[str, ...] = ()  # effects, or parameters, that position alone cannot tell from it
+    revealed_by: str = ""  # what shows it where a usual test does not, for people
     source: str = ""  # where the law is from
     plant: str = ""  # the one plant that has it; "" for any that has its port
     searched_in: tuple[str, ...] = ()  # the plants where `rig explain` tests it unasked; () for all that can have it
@@ -116,7 +117,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         disturbance: noise of the bench, which nobody fits.
         fitted: fields that a fit frees; default all.
         starts: values of these, one tuple a start; without any, `plant.starts` finds some.
-        more: `excludes`, `confused_with`, `source`, `plant`, `searched_in` of `Effect`.
+        more: `excludes`, `confused_with`, `revealed_by`, `source`, `plant`, `searched_in` of `Effect`.
 
     Raises:
         ValueError: unknown port or field, a parameter without default, or a name already taken.

@@ -1,6 +1,7 @@
 """Effects of the position transducer, in the order of its signal path."""
 from __future__ import annotations
 
+from math import sqrt
 from typing import Annotated, Any, NamedTuple
 
 from numpy import floor
@@ -11,17 +12,40 @@ from plant.quantity import Quantity
 
 
 class MountCompliance(NamedTuple):
-    """Compliance 1/K of the actuator's mount."""
+    """Compliance 1/K of the actuator's mount, mass of the body on it, and damping ratio of the two."""
 
     compliance: Annotated[float, Quantity("m/N", low=0, high=1e-3, typical="1e-8-1e-7 m/N, 1/K")] = 0.0
+    mass: Annotated[float, Quantity("kg", low=0, high=1e4, typical="0: a light body; 5-50 kg")] = 0.0
+    damping_ratio: Annotated[float, Quantity("1", low=0, high=10, typical="0.02-0.1")] = 0.05
 
 
-@effect("position", MountCompliance, law="XJ = XJ + AJ P12/K, K = 1/compliance",
-        symptoms="position residual proportional to P12", starts=(1e-8, 3e-8, 1e-7),
-        source="a light body on an elastic mount, static")
-def mount_compliance(x: float, s: Any, u: Any, p: Any) -> float:
-    """The body recoils under the ram's force, and the transducer sees the ram against the body."""
-    return x + p.mount_compliance.compliance * p.jack.area * s.pressure
+class Recoil(NamedTuple):
+    """How far the body has recoiled, its speed, and the force in metres of static recoil."""
+
+    distance: float = 0.0
+    speed: float = 0.0
+    static: float = 0.0
+
+
+@effect("position", MountCompliance, law="XJ = XJ + z, M z'' + 2 D sqrt(M K) z' + K z = AJ P12, K = 1/compliance",
+        symptoms="position residual proportional to P12; with a heavy body it rings", memory=Recoil,
+        starts=((1e-8, 0.0, 0.05), (3e-8, 0.0, 0.05), (1e-7, 0.0, 0.05), (4e-8, 20.0, 0.05)),
+        source="a body on an elastic mount; without mass its static limit")
+def mount_compliance(x: float, m: Recoil, s: Any, u: Any, p: Any) -> tuple[float, Recoil]:
+    """The body recoils under the ram's force, and the transducer sees the ram against the body.
+
+    One step of the theta method, its law divided by K. It is the trapezoidal rule, which damps nothing, where the body
+    is slower than the step, and exact without mass.
+    """
+    g = p.mount_compliance
+    inertia, step = g.mass * g.compliance, u.h * u.h  # s^2
+    later = (inertia + step) / (2.0 * inertia + step)  # theta: 1/2 for a heavy body, 1 without mass
+    static = g.compliance * p.jack.area * s.pressure
+    pull = later * static + (1.0 - later) * m.static - m.distance
+    damping = 2.0 * g.damping_ratio * sqrt(inertia)
+    mean = (inertia * m.speed + later * u.h * pull) / (inertia + later * u.h * (damping + later * u.h))
+    distance = m.distance + u.h * mean
+    return x + distance, Recoil(distance, m.speed + (mean - m.speed) / later, static)
 
 
 class RodBacklash(NamedTuple):
@@ -74,7 +98,9 @@ class SensorGain(NamedTuple):
 
 
 @effect("position", SensorGain, law="XJ = XJ (1 + error)", symptoms="residual proportional to position",
-        starts=(0.003, -0.003, 0.02, -0.02), confused_with=("jack.area",), source="calibration of the transducer")
+        starts=(0.003, -0.003, 0.02, -0.02), confused_with=("jack.area",),
+        revealed_by="an end stop at a known position, or a second position sensor",
+        source="calibration of the transducer")
 def sensor_gain(x: float, s: Any, u: Any, p: Any) -> float:
     """The transducer's scale is not the ram's."""
     return x + p.sensor_gain.error * x
@@ -87,7 +113,9 @@ class SensorOffset(NamedTuple):
 
 
 @effect("position", SensorOffset, law="XJ = XJ + offset", symptoms="unobservable in closed loop except at end stops",
-        starts=(3e-5, -3e-5, 2e-4, -2e-4), source="calibration of the transducer")
+        starts=(3e-5, -3e-5, 2e-4, -2e-4),
+        revealed_by="an end stop at a known position, or a second position sensor",
+        source="calibration of the transducer")
 def sensor_offset(x: float, s: Any, u: Any, p: Any) -> float:
     """The transducer's zero is not the ram's; behind the lag, which would else begin a run by catching up with it."""
     return x + p.sensor_offset.offset

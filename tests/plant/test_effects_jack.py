@@ -12,7 +12,7 @@ from plant import Actuator, Model, simulate
 from plant.compile import interpret_function
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
-from plant.effects.sensors import Lag, sensor_lag
+from plant.effects.sensors import Lag, Recoil, mount_compliance, sensor_lag
 from plant.model import build_initial_state, collect_bindings
 from plant.state import Input, State
 from plant.step import compute_coefficients, step_plant
@@ -234,3 +234,22 @@ def test_friction_only_takes_energy(v: float, rise: float, speed: float, asymmet
 def test_the_order_of_the_sensors_chain_is_that_of_its_signal() -> None:
     assert [e for e in CATALOGUE if CATALOGUE[e].port == "position"] == [
         "mount_compliance", "rod_backlash", "sensor_lag", "sensor_gain", "sensor_offset"]
+
+
+def test_a_heavy_body_on_its_mount_rings_as_its_equation_says() -> None:
+    mass, compliance, ratio = 20.0, 1.0 / 27e6, 0.05
+    g = {"mount_compliance.compliance": compliance, "mount_compliance.mass": mass,
+         "mount_compliance.damping_ratio": ratio}
+    model = EASY.replace(g)
+    p, h = model.build_record()[0], 1e-5
+    sensed, recoil = [], Recoil()
+    for k in range(4000):  # 40 ms, a step of pressure
+        x, recoil = mount_compliance(0.0, recoil, State(pressure=1e6), Input(h=h, t=k * h), p)
+        sensed.append(x)
+    t = h * np.arange(1, 4001)
+    w = 1.0 / np.sqrt(mass * compliance)
+    damped = w * np.sqrt(1.0 - ratio**2)
+    decay = np.exp(-ratio * w * t)
+    exact = compliance * AREA * 1e6 * (1.0 - decay * (np.cos(damped * t) + ratio * w / damped * np.sin(damped * t)))
+    np.testing.assert_allclose(sensed, exact, atol=0.01 * exact.max())
+    assert exact.max() > 1.8 * compliance * AREA * 1e6, "it overshoots"

@@ -1,7 +1,6 @@
 """Reports of explanations and of model updates: each verdict in a sentence, each error beside its noise floor."""
 from __future__ import annotations
 
-import math
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any, cast
@@ -41,12 +40,12 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            **fields: Any) -> Answer:
-    base = SimpleNamespace(is_at_floor=is_at_floor, ratio={"xj": 22.5, "p12": 15.0})
+    base = SimpleNamespace(is_at_floor=is_at_floor, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, controller=1.0,
-                                  ledger=[base], search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+                                  ledger=[base], unseen={}, search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
-    blind = (Blind("null_bias", "null_bias.current", 1e-6, 1e-4, "A"),
-             Blind("sensor_offset", "sensor_offset.offset", math.inf, 1e-4, "m"))
+    blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
+             Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))
     return Answer(cast(Any, explanation), candidates, baseline, blind, ("quantisation",), (), (), **fields)
 
 
@@ -94,7 +93,8 @@ def test_all_verdicts_have_a_mood() -> None:
 def test_findings() -> None:
     lines = {line.label: line.text for line in describe_findings(CASES["AMBIGUOUS"][0])}
     assert lines["to discriminate"].startswith("no sensor and no command")
-    assert lines["not detectable"] == "sensor_offset (at any size); 2 other effects would have been detected"
+    assert lines["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
+        "a stop would reveal sensor_gain and sensor_offset"
     by = {"by": "measure XS too", "between": ("a", "b")}
     lines = {line.label: line.text for line in describe_findings(answer(
         "AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force"))}
@@ -106,9 +106,9 @@ def test_long_lists_name_four_and_count_the_rest() -> None:
     found = [Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)]
     text = describe_suspicious(found)
     assert text.startswith("group.field_5 1.00 N (+9.0 tolerances)") and " and 2 more: outside the range" in text
-    unseen = tuple(Blind(f"e{i}", "g.f", math.inf, 1.0, "N") for i in range(6))
-    many = Answer(cast(Any, None), (), {}, unseen, (), (), ())
-    assert "e3 (at any size) and 2 more" in describe_blind(many)
+    unseen = tuple(Blind(f"e{i}", "g.f", 1.0, "N", "a gauge") for i in range(2))
+    two = Answer(cast(Any, None), (), {}, unseen, (), (), ())
+    assert describe_blind(two) == "e0 (up to 1.00 N) and e1 (up to 1.00 N); a gauge would reveal e0 and e1"
 
 
 def test_the_report_of_an_explanation_in_all_forms() -> None:
@@ -123,7 +123,7 @@ def test_the_report_of_an_explanation_in_all_forms() -> None:
     assert "note            3 rows left out" in text and "next            rig add a est.csv" in text
     report = build_explanation_report(given, "est.csv", "eha", sources, "rig explain est.csv")
     page = render_html(_without_figures(report))
-    for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "smallest detectable", "rig explain est.csv"):
+    for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "not detectable up to", "rig explain est.csv"):
         assert words in page
     data = to_plain(report.data)
     assert data["verdict"] == "EXPLAINED" and data["candidates"][0]["with"] == [] and "ledger" not in data

@@ -1,0 +1,265 @@
+"""How large an effect must be for a test to show it: the decision of `explain`, applied to simulated runs.
+
+An effect of some size is simulated at the fitted values, and the tolerances are fitted to that run as `explain` would
+fit them. What they cannot make up for is what the effect gains. The run is simulated with other solver steps than the
+fit: the spool makes about a hundred small stops, each of which moves with any change, and so do the fits to a real
+run. Without this a size of which the tolerances make up for all but the stops looks visible.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from fdi.estimation.fit import Fit, fit_unknowns
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds
+from fdi.estimation.unidentifiable import list_powers, scale_together
+from fdi.thresholds import GAIN_DETECTED
+from plant.effects import CATALOGUE
+from plant.model import Model
+from plant.threads import map_in_threads
+
+Floats = NDArray[np.float64]
+
+FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
+REFIT_ROUNDS = 4
+VISCOSITY = {"viscosity_drift.factor": -1.0, "jack.damping": 1.0, "flapper.damping": 1.0, "jack.leakage": -1.0}
+SMALLEST_SEARCHED = 0.015  # of the smallest start: a scan tries no smaller sizes
+WITHOUT_SIZE = ("Hz", "rad")  # units of parameters that say where an effect is and not how large
+
+
+class Direction(NamedTuple):
+    """An effect with one sign: `start` is one of its starting sizes, `reach` the distance of that from the off value.
+
+    Sizes are distances of the first parameter from the off value: `least` and `most` of its starts, `guess` to try.
+    """
+
+    effect: str
+    start: Mapping[str, float]
+    reach: float
+    least: float
+    most: float
+    guess: float
+
+
+class Detectable(NamedTuple):
+    """The smallest size of an effect, from its off value, that the test shows; infinite if none of usual size does."""
+
+    effect: str
+    size: float
+    usual: float  # the largest usual size
+
+
+def find_detectable_sizes(problem: Problem, fit: Fit, effects: Iterable[str], linear: Mapping[str, float] | None = None,
+                          gain: float = GAIN_DETECTED, evaluations: int = 4) -> list[Detectable]:
+    """The smallest size of each effect at which it gains `gain`, the larger one of its signs.
+
+    Args:
+        problem: of which the first run counts.
+        fit: where nothing but noise is left.
+        effects: names of the catalogue.
+        linear: sizes at which a linear forecast has them visible; the search begins at twice these.
+        gain: in -2 log likelihood, on that run.
+        evaluations: sizes tried of each effect.
+    """
+    ways = [way for name in effects for way in _list_directions(name, problem.model, linear or {})]
+    test = _VirtualTest(problem, fit)
+    tried: list[list[tuple[float, float]]] = [[] for _ in ways]  # (log size, gain) of each
+    for _ in range(evaluations):
+        sizes = [_choose_size(way, pairs, gain) for way, pairs in zip(ways, tried, strict=True)]
+        open_ = [k for k, size in enumerate(sizes) if size]
+        if not open_:
+            break
+        found = test.measure_gains([ways[k] for k in open_], [sizes[k] for k in open_], gain)
+        for k, won in zip(open_, found, strict=True):
+            tried[k].append((float(np.log(sizes[k])), won))
+    smallest: dict[str, Detectable] = {}
+    for way, pairs in zip(ways, tried, strict=True):
+        size = _interpolate_size(way, pairs, gain)
+        before = smallest.get(way.effect, Detectable(way.effect, 0.0, 0.0))
+        smallest[way.effect] = Detectable(way.effect, max(size, before.size), max(way.most, before.usual))
+    return list(smallest.values())
+
+
+def _list_directions(effect: str, model: Model, linear: Mapping[str, float]) -> list[Direction]:
+    """One for each sign of the first parameter."""
+    entry = CATALOGUE[effect]
+    first = entry.fitted[0]
+    off = entry.off.get(first, model.kind.nominal.get(first, 0.0))
+    found: dict[bool, Direction] = {}
+    for start in entry.starts:
+        reach = start[first] - off
+        if reach == 0.0:
+            continue
+        size = abs(reach)
+        guess = 2.0 * linear.get(effect, np.inf)
+        first_try = guess if np.isfinite(guess) else size / 3.0
+        before = found.get(reach > 0.0, Direction(effect, start, size, size, size, first_try))
+        found[reach > 0.0] = before._replace(least=min(before.least, size), most=max(before.most, size))
+    return list(found.values())
+
+
+def _choose_size(way: Direction, tried: Sequence[tuple[float, float]], gain: float) -> float:
+    """The next size to try; 0 where enough is known."""
+    if not tried:
+        return float(np.clip(way.guess, SMALLEST_SEARCHED * way.least, way.most))
+    low = max((p for p in tried if p[1] < gain), default=None)
+    high = min((p for p in tried if p[1] >= gain), default=None)
+    if low and high:
+        size = np.exp(low[0] + (high[0] - low[0]) * np.clip(_interpolate_share(low[1], high[1], gain), 0.3, 0.7))
+        return float(size) if high[0] - low[0] > 0.4 else 0.0
+    at, won = tried[-1]
+    factor = np.clip(np.sqrt(gain / max(won, 1e-9)), 0.15, 6.0)  # gains go with the square
+    size = np.clip(np.exp(at) * factor * (1.2 if low else 1.0 / 1.2), SMALLEST_SEARCHED * way.least, way.most)
+    return 0.0 if abs(np.log(size) - at) < 0.05 else float(size)
+
+
+def _interpolate_size(way: Direction, tried: Sequence[tuple[float, float]], gain: float) -> float:
+    """The size that gains `gain`, between those tried; infinite where that of the largest start gains less.
+
+    Where even the smallest size that a search tries gains more, it is that one.
+    """
+    low = max((p for p in tried if p[1] < gain), default=None)
+    high = min((p for p in tried if p[1] >= gain), default=None)
+    if high is None:
+        return np.inf
+    if low is None or low[0] > high[0]:  # small stops: the larger size counts
+        return float(np.exp(high[0] if low is None else low[0]))
+    return float(np.exp(low[0] + (high[0] - low[0]) * _interpolate_share(low[1], high[1], gain)))
+
+
+def _interpolate_share(low: float, high: float, gain: float) -> float:
+    """How far between two gains, in their logarithms, a third one lies."""
+    before = max(low, 0.02 * gain)
+    return float(np.log(gain / before) / np.log(high / before))
+
+
+@dataclass
+class SimulatedRun(Problem):
+    """A problem whose `run`, (s, n) SI, stands for the measurement, where something was measured."""
+
+    run: Floats = field(default_factory=lambda: np.empty(0))
+
+    def subtract_measurements(self, predicted: Floats) -> Floats:
+        """What predictions (m, s, n) leave of the simulated run: (m, s, n)."""
+        return super().subtract_measurements(predicted - self.run + self.trace.measurements)
+
+
+class _VirtualTest:
+    """Simulated runs of a plant at the values of a fit, and what a fit of the tolerances leaves of them."""
+
+    def __init__(self, problem: Problem, fit: Fit) -> None:
+        self.problem = replace(problem, also=(), steps=FITTED_STEPS, _lanes={})
+        self.simulated = replace(self.problem, steps=SIMULATED_STEPS, _lanes={})
+        self.fit, self.names = fit, [f.name for f in fit.free]
+        self.slope = fit.jacobian[:, :, :len(problem.trace)]
+        self.prior = np.array([f.prior**-2 for f in fit.free])
+        self.bounds = scaled_bounds(fit.free)
+
+    def measure_gains(self, ways: Sequence[Direction], sizes: Sequence[float], enough: float, rounds: int = 6
+                      ) -> list[float]:
+        """What each effect gains in -2 log likelihood over a fit of the tolerances.
+
+        A fit takes so many rounds, fewer where the gain falls below `enough` or no longer falls.
+        """
+        names, rows = self._list_values(ways, sizes)
+        run = self._predict_values(self.simulated, names, rows)
+        with_effect = compute_misfit(self._whiten(self._predict_values(self.problem, names, rows) - run))
+        own = np.array([[name in CATALOGUE[way.effect].fitted for name in self.names] for way in ways])
+        known = np.where(own, 0.0, self.prior) @ self.fit.x**2  # the effect has no prior on its own parameters
+        begun = np.array([self._list_beginnings(dict(zip(names, row, strict=True))) for row in rows])
+        costs, left = self._measure_costs(begun, run)
+        best = np.argmin(costs, axis=1)
+        every = np.arange(len(ways))
+        x, white, cost = begun[every, best], left[every, best], costs[every, best]
+        still = np.arange(len(ways))
+        for _ in range(rounds):
+            still = still[cost[still] - known[still] - with_effect[still] > enough]
+            if not len(still):
+                break
+            steps = np.array([self._list_steps(white[k], x[k]) for k in still])
+            trials = np.clip(x[still, None] + steps, *self.bounds)
+            costs, left = self._measure_costs(trials, run[still])
+            best = np.argmin(costs, axis=1)
+            least = np.take_along_axis(costs, best[:, None], 1)[:, 0]
+            won = cost[still] - least
+            for n in np.flatnonzero(won > 0.0):
+                k = still[n]
+                cost[k], x[k], white[k] = least[n], trials[n, best[n]], left[n, best[n]]
+            still = still[won > np.maximum(3.0, 0.02 * cost[still])]
+
+        def refit(k: int) -> float:
+            """With slopes of its own, as a fit to a measured run has them."""
+            if cost[k] - known[k] - with_effect[k] <= enough:
+                return float(cost[k])
+            own_run = SimulatedRun(**vars(self.problem), run=run[k])
+            return min(float(cost[k]), fit_unknowns(own_run, self.fit.free, x[k], REFIT_ROUNDS).cost)
+
+        refitted = map_in_threads(refit, range(len(ways)), self.problem.workers)
+        return [float(c) for c in np.array(refitted) - known - with_effect]
+
+    def _measure_costs(self, trials: Floats, runs: Floats) -> tuple[Floats, Floats]:
+        """Costs (m, k) and whitened residuals (m, k, s, n) of scaled unknowns (m, k, p) for each of the runs (m, s, n).
+        """
+        m, k, p = trials.shape
+        flat = trials.reshape(-1, p)
+        white = self._whiten(self._predict(flat) - np.repeat(runs, k, 0))
+        costs = compute_misfit(white) + flat**2 @ self.prior
+        return costs.reshape(m, k), white.reshape(m, k, *white.shape[1:])
+
+    def _list_beginnings(self, values: Mapping[str, float]) -> Floats:
+        """Unknowns, (2, p), where a fit without the effect may begin: as they are, and where its `values` are alike.
+
+        Parameters of the effect that have a tolerance take its values. Where a direction that no signal shows leads
+        through a parameter that has none, the others go the other way; so they do for a changed viscosity.
+        """
+        held = {**self.problem.model.values, **self.fit.values}
+        x = np.array([(values[f.name] - f.centre) / f.scale for f in self.fit.free])
+        for way in (*list_powers(self.problem), VISCOSITY):
+            first = next(iter(way))
+            if first in self.names or values.get(first, held[first]) == held[first]:
+                continue
+            ratio = (1.0 - values[first]) / (1.0 - held[first]) if first == "filter.clogging" else \
+                values[first] / held[first]
+            x = scale_together(self.fit.free, x, way, -float(np.log(max(ratio, 0.01))))
+        both: Floats = np.clip([self.fit.x, x], *self.bounds)
+        return both
+
+    def _list_steps(self, white: Floats, x: Floats) -> Floats:
+        """Gauss-Newton steps of the tolerances, (k, p), from whitened residuals (s, n): whole, damped and short."""
+        heavy = (self.slope * compute_weights(white)).reshape(len(x), -1)
+        hessian = heavy @ self.slope.reshape(len(x), -1).T + np.diag(self.prior + 1e-9)
+        gradient = heavy @ white.reshape(-1) + self.prior * x
+        whole, damped = (-cho_solve(cho_factor(hessian + d * np.diag(np.diag(hessian))), gradient) for d in (0.0, 0.1))
+        return np.array([whole, damped, 0.3 * whole])
+
+    def _list_values(self, ways: Sequence[Direction], sizes: Sequence[float]) -> tuple[list[str], Floats]:
+        """Names and values, (m, p), of the fit's parameters with each effect at its size."""
+        model = self.problem.model
+        names = list(dict.fromkeys([*self.names, *(name for way in ways for name in way.start)]))
+        values = {**model.values, **self.fit.values}
+        rows = []
+        for way, size in zip(ways, sizes, strict=True):
+            entry, at = CATALOGUE[way.effect], {}
+            for name, start in way.start.items():
+                off = entry.off.get(name, model.kind.nominal.get(name, 0.0))
+                moved = values[name] + (start - off) * size / way.reach
+                at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
+            rows.append([at.get(name, values[name]) for name in names])
+        return names, np.array(rows)
+
+    def _predict(self, x: Floats) -> Floats:
+        return self._predict_values(self.problem, self.names, self.problem.convert_unknowns(self.fit.free, x))
+
+    def _predict_values(self, problem: Problem, names: Sequence[str], rows: Floats, together: int = 64) -> Floats:
+        parts = np.array_split(rows, -(-len(rows) // together))
+        return np.concatenate([problem.predict_outputs(names, part) for part in parts])
+
+    def _whiten(self, difference: Floats) -> Floats:
+        """A difference of runs, (m, s, n) SI, as the fit counts it: without the mains, where it was measured."""
+        measured = self.problem.trace.measurements
+        return self.problem.whiten_residuals(self.problem.subtract_measurements(difference + measured))
