@@ -18,7 +18,7 @@ import pytest
 from rig_command import rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
-from plant import Model, segments, simulate
+from plant import Model, load_model, segments, simulate
 from plant.effects import CATALOGUE, effect, load_effects
 from plant.parameters import GROUPS
 from plant.quantity import list_quantities
@@ -53,6 +53,19 @@ def documented_keys() -> Iterator[tuple[str, str]]:
 @pytest.mark.parametrize(("where", "key"), sorted(set(documented_keys())))
 def test_every_key_of_a_sequence_is_described(where: str, key: str) -> None:
     assert re.search(rf"`{key}`", SEQUENCES), f"docs/sequences.md says nothing about {key} of {where}"
+
+
+def test_the_example_of_a_model_file_is_valid(tmp_path: Path) -> None:
+    """And what `to_toml` writes of it is the same model."""
+    text = next(block for block in indented_blocks((ROOT / "docs" / "models.md").read_text())
+                if block.startswith("name ="))
+    (tmp_path / "unit.toml").write_text(text)
+    model = load_model(tmp_path / "unit.toml")
+    assert (model.name, set(model.effects)) == ("unit 7", {"null_bias", "quantisation"})
+    assert {name for name in model.list_changes() if name.startswith("jack.")} == {
+        "jack.static_friction", "jack.dynamic_friction"}
+    (tmp_path / "again.toml").write_text(model.to_toml())
+    assert load_model(tmp_path / "again.toml").values == model.values
 
 
 def test_the_example_of_a_sequence_is_valid() -> None:

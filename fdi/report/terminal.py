@@ -1,7 +1,7 @@
 """The terminal writer: verdict, tables and labelled lines, for a person at a console of 80 columns or more."""
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from io import StringIO
 
 from rich.cells import cell_len
@@ -41,7 +41,7 @@ def print_report(report: Report, console: Console) -> None:
         labels.append(Line("next", report.next_command, "neutral"))
     if report.conclusion:
         labels.append(Line("verdict", report.conclusion, report.mood))
-    _flush_lines(labels, console)
+    _flush_lines(labels, console, whole={"next", *(label for label, _ in report.files)})
 
 
 def format_report(report: Report, width: int = 100) -> str:
@@ -54,9 +54,9 @@ def format_report(report: Report, width: int = 100) -> str:
 def _print_headline(report: Report, console: Console) -> None:
     if report.verdict:
         verdict = Text(report.verdict, style_of(Cell("", report.mood, True)))
-        console.print(Text.assemble(verdict, f"  {report.sentence}"), soft_wrap=True)
+        console.print(Text.assemble(verdict, f"  {report.sentence}"), soft_wrap=not console.is_terminal)
     elif report.sentence:
-        console.print(Text(report.sentence, "bold"), soft_wrap=True)
+        console.print(Text(report.sentence, "bold"), soft_wrap=not console.is_terminal)
 
 
 def _print_item(item: Item, console: Console) -> None:
@@ -70,8 +70,12 @@ def _print_item(item: Item, console: Console) -> None:
         console.print(Text(item.text), soft_wrap=True)
 
 
-def _flush_lines(lines: list[Line], console: Console) -> None:
-    """Print labelled lines with their texts in one column; a console wraps a long text itself, so it can be copied."""
+def _flush_lines(lines: list[Line], console: Console, whole: Collection[str] = ()) -> None:
+    """Print labelled lines with their texts in one column.
+
+    A terminal shows a long text in several lines, between words and below each other; in a file or pipe it stays one
+    line. So do commands and paths, the lines with a label in `whole`, because they are copied.
+    """
     if not lines:
         return
     console.print()
@@ -79,7 +83,14 @@ def _flush_lines(lines: list[Line], console: Console) -> None:
     width = max(label_width, *(cell_len(line.label) + GAP for line in lines))
     for line in lines:
         label = Text(line.label + " " * (width - cell_len(line.label)), "dim")
-        console.print(Text.assemble(label, (line.text, STYLES[line.mood])), soft_wrap=True)
+        if console.is_terminal and line.label not in whole and console.width > 2 * width:
+            row = RichTable.grid()
+            row.add_column(width=width, no_wrap=True)
+            row.add_column(width=console.width - width, overflow="fold")
+            row.add_row(label, Text(line.text, STYLES[line.mood]))
+            console.print(row)
+        else:
+            console.print(Text.assemble(label, (line.text, STYLES[line.mood])), soft_wrap=True)
     lines.clear()
 
 

@@ -97,6 +97,26 @@ def test_terminal_shows_every_kind_of_item(whole: Report) -> None:
         assert words not in text
 
 
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_terminal_cuts_no_word_and_no_command(width: int) -> None:
+    text = ("the noise floor of the position is far above that of the sensor, and every repeat of the command differs "
+            "by more")
+    words = text.split()
+    command = "rig explain a_long_name_of_a_recording.csv --repeat another_long_name_of_a_recording.csv --signals xj,xs"
+    report = Report("compare", "x", "FAIL", "bad", text, notes=[text], next_command=command, conclusion=text)
+    for is_terminal in (True, False):
+        out = StringIO()
+        print_report(report, Console(file=out, width=width, force_terminal=is_terminal, highlight=False,
+                                     color_system=None))
+        lines = out.getvalue().splitlines()
+        assert any(line.endswith(command) for line in lines)  # it can be copied
+        others = [line for line in lines if command not in line]
+        assert " ".join(out.getvalue().split()).count(text) == 3
+        assert (max(map(len, others)) <= width) == is_terminal, others
+        if is_terminal:
+            assert {word for line in others for word in line.split()} <= {*words, "FAIL", "note", "verdict"}
+
+
 def test_terminal_never_draws() -> None:
     def draw() -> str:
         raise AssertionError("drawn for a terminal")
