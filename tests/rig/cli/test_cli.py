@@ -80,7 +80,6 @@ FILES = {
     "nan.csv": "t,com\n0,1\n0.001,nan\n", "trace.csv": "t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n",
 }
 BAD = {
-    "no command": ([], "required"),
     "unknown command": (["fly"], "'fly'"),
     "unknown option": (["run", "--fast"], "rig run: unrecognized arguments: --fast (rig run --help)"),
     "unknown sequence": (["run", "prefligth"], "'preflight'"),
