@@ -237,7 +237,11 @@ class Trace:
 
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
-        return find_sections(self.com, self.period)
+        return list(self._sections)
+
+    @cached_property
+    def _sections(self) -> tuple[Section, ...]:
+        return tuple(find_sections(self.com, self.period))  # once: every panel of a figure shades them
 
     def write_csv(self, path: str | Path) -> None:
         """Write t and the measured signals; missing cycles become gaps in t. Raises InputError."""

@@ -8,6 +8,7 @@ the second process cannot start or ends early: a run that was measured never lac
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import select
@@ -91,6 +92,7 @@ def main() -> None:
 
     A trace or file that cannot be used is answered by the fields of the InputError, as one line of JSON.
     """
+    gc.disable()  # this process ends with its page; looking through matplotlib's objects takes a tenth of its time
     import fdi.report.run_figures  # noqa: F401 - loads matplotlib
     from fdi.report.drawing import start_figure, to_svg
     from fdi.report.html import load_templates
