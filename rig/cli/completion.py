@@ -1,7 +1,7 @@
 """Completion in the shell by argcomplete: commands, options, and the names that options take.
 
 The shell calls `rig` with the line typed so far in its environment. Only the command on that line is imported. Without
-the package (extra `shell`) nothing happens.
+the package (extra "shell") nothing happens.
 """
 from __future__ import annotations
 
