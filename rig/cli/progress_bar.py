@@ -33,13 +33,13 @@ def show_progress(*, is_silent: bool, is_realtime: bool = False, delay: float = 
 @contextlib.contextmanager
 def _show_bar(delay: float) -> Iterator[Progress]:
     from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    bar = Bar(TextColumn("{task.description:<14}", markup=False), BarColumn(40),
+    bar = Bar(SpinnerColumn("line"), TextColumn("{task.description:<14}", markup=False), BarColumn(20),
               TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn(),
               console=Console(stderr=True), transient=True)
-    task = bar.add_task("", total=None)
+    task = bar.add_task("starting", total=None)
 
     def update(stage: str, share: float) -> None:
         bar.update(task, description=stage, completed=share, total=1.0 if share > 0.0 else None)

@@ -164,6 +164,8 @@ def _show_batch_progress(silent: bool, interval: float = 30.0) -> Iterator[Calla
 
     clock, printed = WallClock(), 0.0
     with show_progress(is_silent=silent) as update:
+        update("starting the workers", 0.0)
+
         def report_progress(progress: BatchProgress) -> None:
             nonlocal printed
             update(describe_progress(progress), progress.done / max(progress.total, 1))

@@ -24,6 +24,7 @@ def run_command(args: argparse.Namespace) -> int:
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
     from rig.cli.answer import show_answer
+    from rig.cli.progress_bar import show_progress
     from rig.view import rerun_log, viewer
 
     source = Path(args.trace)
@@ -37,13 +38,17 @@ def run_command(args: argparse.Namespace) -> int:
         rrd = (source if source.is_dir() else source.parent) / (source.name.split(".")[0] + ".rrd")
     if args.screenshot:
         require_writable(args.screenshot, "--screenshot", source=source)
-    rerun_log.write_rrd(trace, rrd)
-    answer: dict[str, object] = {"rrd": str(rrd)}
-    if args.screenshot:
-        answer["screenshot"] = args.screenshot
-        answer["pixels"] = viewer.take_screenshot(trace, rrd, Path(args.screenshot))
-    elif save is None:
-        viewer.open_viewer(rrd)
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        progress("writing the recording", 0.0)
+        rerun_log.write_rrd(trace, rrd)
+        answer: dict[str, object] = {"rrd": str(rrd)}
+        if args.screenshot:
+            progress("the viewer draws the picture", 0.0)
+            answer["screenshot"] = args.screenshot
+            answer["pixels"] = viewer.take_screenshot(trace, rrd, Path(args.screenshot))
+        elif save is None:
+            progress("opening the viewer", 0.0)
+            viewer.open_viewer(rrd)
     written = "\n".join(str(path) for path in (rrd, args.screenshot) if path)
     show_answer(Report("view", str(source), sentence=written, data=answer), args)
     return 0
