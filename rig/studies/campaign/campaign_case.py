@@ -152,5 +152,5 @@ def load_judgement(name: str) -> Judgement:
 
 def hash_campaign_sources() -> str:
     """A hash of all code and data that a row depends on."""
-    campaign = (f"rig/studies/campaign/{name}.py" for name in ("case", "judge", "matrix"))
+    campaign = (f"rig/studies/campaign/{name}.py" for name in ("campaign_case", "judge", "matrix"))
     return hash_sources("plant", "fdi", *campaign, "rig/studies/trial")
