@@ -122,7 +122,7 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
         baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
-    blind = tuple(_describe_blind(d) for d in e.detectable if not d.size <= d.usual)
+    blind = tuple(_describe_blind(d) for d in e.hidden)
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,

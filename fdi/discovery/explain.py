@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.detectable import Detectable, find_detectable_sizes
+from fdi.discovery.detectable import Detectable, find_hidden_effects
 from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
 from fdi.discovery.search import Hypothesis, Search
-from fdi.discovery.significance import Sensitivity, compute_sensitivity, find_smallest_visible
+from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.progress import Progress, ignore_progress
@@ -62,7 +62,7 @@ class Explanation:
     blind: Sensitivity
     search: Search = field(repr=False)
     unseen: Mapping[tuple[str, ...], HeldOut] = field(default_factory=dict)  # of the best hypotheses
-    detectable: tuple[Detectable, ...] = ()  # effects that hide in the tolerances; none where more than noise is left
+    hidden: tuple[Detectable, ...] = ()  # effects that tolerances make up for; none where more than noise is left
 
 
 def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
@@ -199,14 +199,13 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
         verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
-    detectable: tuple[Detectable, ...] = ()
+    hidden: tuple[Detectable, ...] = ()
     if verdict in NOISE_LEFT:
         progress("what this test cannot see", 0.9)
         hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
-        detectable = tuple(find_detectable_sizes(search.problem, explained.fit, hard_to_see,
-                                                 find_smallest_visible(blind)))
+        hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
-                       blind, search, unseen, detectable)
+                       blind, search, unseen, hidden)
 
 
 def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi.discovery.detectable import Detectable, find_detectable_sizes
+from fdi.discovery.detectable import Detectable, find_detectable_sizes, find_hidden_effects
 from fdi.discovery.significance import compute_sensitivity, find_smallest_visible
 from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
@@ -28,6 +28,7 @@ def sizes() -> tuple[dict[str, Detectable], dict[str, float]]:
     problem = Problem(complete_model(model), trace, noise, bare=silence_readings(model), workers=2)
     fit = fit_unknowns(problem, all_unknowns(model), rounds=3)
     linear = dict(find_smallest_visible(compute_sensitivity(problem, fit, EFFECTS)))
+    assert [d.effect for d in find_hidden_effects(problem, fit, EFFECTS)] == ["sensor_offset"]
     return {d.effect: d for d in find_detectable_sizes(problem, fit, EFFECTS, linear)}, linear
 
 
