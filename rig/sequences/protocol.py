@@ -264,17 +264,18 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
 
 def _judge_frozen(record: ProtocolRecord) -> CheckResult:
     """How far the position error moved while the current of the closed loop stood still."""
-    change = measure_frozen(record.run)
+    change = measure_frozen(record.run, record.current_limit if record.gains is not None else None)
     return _make_result("current follows the error", "current", change * 1e6, "um", high=LARGEST_FROZEN_CHANGE * 1e6)
 
 
-def measure_frozen(rows: Rows) -> float:
+def measure_frozen(rows: Rows, limit: float | None) -> float:
     """Largest change of the sensed position error, m, over cycles with one and the same current.
 
-    Only cycles in which control and status word say ACTIVE, and not those at the current limit, that is within 2 % of
-    the largest current of the run.
+    Only cycles in which control and status word say ACTIVE, and not those within 2 % of the current limit. `limit`:
+    what the controller says it is, A; None: it does not say, and the largest current of the run counts as the limit.
     """
-    is_limited = np.abs(rows.cor) >= 0.98 * np.nanmax(np.abs(rows.cor), initial=0.0)
+    largest = np.nanmax(np.abs(rows.cor), initial=0.0) if limit is None else limit
+    is_limited = np.abs(rows.cor) >= 0.98 * largest
     closed = (rows.control.astype(int) & rows.status.astype(int) & _LEVELS == _LEVELS) & ~is_limited
     error = rows.com - rows.xj
     stays = closed[1:] & closed[:-1] & (rows.cor[1:] == rows.cor[:-1]) & ~np.isnan(error[1:] + error[:-1])

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from rig.sequences.check import CheckResult
-from rig.sequences.protocol import Heartbeat, ProtocolLimits, ProtocolRecord, Rows, judge_protocol
+from rig.sequences.protocol import (
+    Heartbeat,
+    ProtocolLimits,
+    ProtocolRecord,
+    Rows,
+    judge_protocol,
+    measure_frozen,
+)
 
 ON_TIME = [Heartbeat(0.1 * k) for k in range(10)]
 SLOW = [Heartbeat(0.2 * k) for k in range(5)]
@@ -38,3 +45,20 @@ def test_a_rig_that_received_nothing_for_most_of_the_run_does_not_miss_heartbeat
     assert judge_heartbeats([], 1.0, deaf=0.8) is None
     check = judge_heartbeats([], 1.0, deaf=0.5)
     assert check is not None and not check.passed
+
+
+@pytest.mark.parametrize(("frozen", "limit", "is_found"), [
+    (2e-4, 8e-3, True),  # it is also the largest current of the run
+    (8e-3, 8e-3, False),  # at the limit it says it has
+    (2e-4, None, False),  # a controller that does not say its limit may have this one
+])
+def test_a_current_that_stands_still_below_the_limit_is_found(
+    frozen: float, limit: float | None, is_found: bool
+) -> None:
+    cycles = 100
+    error = np.linspace(0.0, 1e-3, cycles)
+    current = np.where(np.arange(cycles) < 50, 1e-5 * np.sin(np.arange(cycles)), frozen)
+    zero, words = np.zeros(cycles), np.full(cycles, 15.0)
+    rows = Rows(com=error, xj=zero, cor=current, control=words, status=words, flags=zero, response=zero,
+                on_time=np.ones(cycles, bool))
+    assert (measure_frozen(rows, limit) > 4e-4) == is_found
