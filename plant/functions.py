@@ -162,7 +162,7 @@ def hypot(x: float, y: float) -> float:
 
 
 def sin_of_turns(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """sin(2 pi `turns`) of an array, in whole turns; exactly zero after every half turn."""
+    """sin(2 pi `turns`) of an array of any shape, in whole turns; exactly zero after every half turn."""
     part = np.mod(turns, 1.0)
     quarter = np.rint(4.0 * part)
     r = (part - 0.25 * quarter) * (2.0 * np.pi)  # the difference is exact
@@ -171,7 +171,7 @@ def sin_of_turns(turns: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def exp_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """e^x of an array, the bits of `exp`."""
+    """e^x of an array of any shape, the bits of `exp`."""
     limited = np.clip(x, -746.0, 710.0)
     n = np.rint(limited * 1.4426950408889634)
     r = (limited - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10

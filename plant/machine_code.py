@@ -55,7 +55,11 @@ class StoredCode:
                 self._engine, self._entry = _link_object(code)
 
     def warm(self, flat: Array, record: Array) -> None:
-        """Compile with numba and store the machine code for the next process, unless it was stored already."""
+        """Compile with numba and store the machine code for the next process, unless it was stored already.
+
+        `flat` is a state of the plant, one number a field, and `record` its parameters as `Model.build_record` gives
+        them.
+        """
         if self._entry is None:
             run = self._compile()
             run(flat, 0.0, 0.0, 0.0, 0.0, record, 0)

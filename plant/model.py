@@ -170,7 +170,11 @@ def build_bare_model(plant: str, name: str = "") -> Model:
 
 
 def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> Model:
-    """The model from the tables of a model file."""
+    """The model from the tables of a model file; errors name `where` they are from.
+
+    Raises:
+        InputError: an unknown plant, effect or parameter, or a value that is none.
+    """
     tables = dict(tables)
     name, effects = tables.pop("name", name), tables.pop("effects", [])
     plant = tables.pop("plant", "eha")

@@ -81,7 +81,11 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
 
 @contextmanager
 def report_law_errors(model: Model) -> Iterator[None]:
-    """Report an error in a user's own law as bad input, whatever numba or Python raised."""
+    """Report an error in a user's own law as bad input, whatever numba or Python raised.
+
+    Raises:
+        InputError: the law, with its file and line where they are known. A model without effects raises what it raised.
+    """
     try:
         yield
     except Exception as error:

@@ -214,7 +214,11 @@ def _fade_in(t: Array, fade: float) -> Array:
 
 
 def require(holds: bool, key: str, expected: str) -> None:
-    """Refuse a segment; whoever read it knows the file and the line and adds them."""
+    """Refuse a segment; whoever read it knows the file and the line and adds them.
+
+    Raises:
+        InputError: unless it `holds`; `expected` says what `key` must be.
+    """
     if not holds:
         raise InputError("segment", key, expected)
 

@@ -57,7 +57,10 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None) -> tu
 
 
 def ensure_starts(name: str, command: Array, load: Array | None = None) -> Effect:
-    """The effect of that name; the catalogue has its start values from now on (see `find_starts`)."""
+    """The effect of that name; the catalogue has its start values from now on (see `find_starts`).
+
+    `command` in m and `load` in N, (n,) each, are those of the run that is to show the effect.
+    """
     effect = CATALOGUE[name]
     if not effect.starts:
         CATALOGUE[name] = effect = replace(effect, starts=find_starts(effect, command, load))
