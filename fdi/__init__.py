@@ -1,4 +1,4 @@
-"""Offline analysis of traces: compare, explain, add an effect, diagnose (docs/python.md). No CAN, no viewer."""
+"""Offline analysis of traces: compare, explain, add an effect, identify, diagnose (docs/python.md). No CAN."""
 from __future__ import annotations
 
 from importlib import import_module
@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import plant  # noqa: F401  selects the kernels of linear algebra before anything imports NumPy
 
 if TYPE_CHECKING:
-    from fdi.analysis import add_effect, compare, diagnose, explain, read_trace
+    from fdi.analysis import add_effect, compare, diagnose, explain, identify, read_trace
     from fdi.trace.trace import Trace
 
-__all__ = ["Trace", "add_effect", "compare", "diagnose", "explain", "read_trace"]
+__all__ = ["Trace", "add_effect", "compare", "diagnose", "explain", "identify", "read_trace"]
 
 # Imported at first use: the plant behind the analysis loads numba, which takes longer than `rig --help` may.
 _MODULE_OF = {"Trace": "fdi.trace.trace"} | {name: "fdi.analysis" for name in __all__ if name != "Trace"}

@@ -1,4 +1,4 @@
-"""The public Python interface: load a trace, compare, explain, add an effect, diagnose, plot (docs/python.md).
+"""The public Python interface: read a trace, compare, explain, add an effect, identify, diagnose (docs/python.md).
 
 Each function answers with a `Result`. It can be printed, shown in a notebook, written as an HTML page, plotted and
 turned into the dictionary that the command of the same name prints with --json.
@@ -6,7 +6,7 @@ turned into the dictionary that the command of the same name prints with --json.
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fdi.discovery.model_file import Provenance
     from fdi.discovery.runs import Runs
     from fdi.discovery.update_model import ModelUpdate
+    from fdi.identification.identify import Identification
 
 TraceOrPath = Trace | str | Path
 ModelOrPath = Model | str | Path
@@ -180,6 +181,28 @@ class ModelResult(Result):
 
 
 @dataclass(frozen=True, eq=False)
+class IdentificationResult(Result):
+    """The parameters of an actuator, from its runs."""
+
+    identification: Identification = field(repr=False)
+
+    @property
+    def model(self) -> Model:
+        """The identified model."""
+        return self.identification.model
+
+    def write_model(self, path: str | Path) -> None:
+        """Write the model file, with intervals and provenance; a file that was there before gets the suffix .bak.
+
+        Raises:
+            InputError: a path that cannot be written.
+        """
+        from fdi.identification.model_text import write_identified_model
+
+        write_identified_model(self.identification, path, "fdi.identify")
+
+
+@dataclass(frozen=True, eq=False)
 class DiagnosisResult(Result):
     """Levels and sizes of the two faults of a servovalve."""
 
@@ -274,6 +297,39 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     command = f"fdi.add_effect({', '.join(map(repr, effects))})"
     update = add_effects(effects, runs, own_model, known, command)
     return ModelResult(build_model_report(update), update)
+
+
+def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eha", *,
+             holdouts: Sequence[TraceOrPath] = (), signals: Sequence[str] | None = None,
+             free: Mapping[str, Any] | None = None, seed: int = 0, trust: bool = False) -> IdentificationResult:
+    """Find the parameters of an actuator from its runs.
+
+    Args:
+        runs: measured runs of any commands, or their files.
+        model: with the values of the data sheet: a `Model`, a model file, or the name of a nominal plant.
+        holdouts: runs that no fit sees.
+        signals: some of "xj", "p12", "xs"; default: all that every run has.
+        free: what is free, as the table [identify] of a model file: {"jack": {"area": 4.0}}; default: what the model
+            file, or that of the nominal model, says.
+        seed: of the scattered starts.
+        trust: whether effect files that a model file names may run; each is listed first, with its SHA-256.
+
+    Raises:
+        InputError: runs, a model, a signal or a range that cannot be used.
+    """
+    from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
+    from fdi.identification.identify import identify_model
+    from fdi.identification.runs import collect_identification_runs
+    from fdi.report.identify_report import build_identification_report
+
+    own_model = _load_model(model, trust)
+    source = None if isinstance(model, Model) else model
+    ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
+    fitted = [runs] if isinstance(runs, Trace | str | Path) else list(runs)
+    own = collect_identification_runs(own_model, ranges, [_load_trace(r) for r in fitted],
+                                      [_load_trace(r) for r in holdouts], signals)
+    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
+    return IdentificationResult(build_identification_report(found, own_model.name), found)
 
 
 def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None,

@@ -414,3 +414,21 @@ RESIDUAL_TEST_CONFIDENCE = 0.99
 
 DEPENDENCE_SHARE = 0.05
 """Share of the residual's variance that a dependence on a quantity must hold to be reported."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Identification of a user's actuator
+# ---------------------------------------------------------------------------------------------------------------------
+
+IDENTIFIED_INTERVAL_FACTOR = 1.6
+"""Factor on the standard deviation of an identified parameter: a fit ends somewhere in a rough valley.
+
+That of `EFFECT_INTERVAL_FACTOR`; with `IDENTIFIED_SYSTEMATIC_SD` it is checked by 20 trials (docs/identify.md)."""
+
+IDENTIFIED_SYSTEMATIC_SD = 0.001
+"""Standard deviation, relative, that the solver's step adds to an identified parameter (docs/identify.md)."""
+
+STATIC_FRICTION_SYSTEMATIC_SD = 0.012
+"""The same for the ram's static friction, which decides single stops: the fit may make one and miss the next."""
+
+IDENTIFIABLE_SHARE = 0.2
+"""Half the interval over half the range of the data sheet, up to which a parameter is identifiable from the runs."""

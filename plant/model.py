@@ -61,6 +61,12 @@ class Model:
     values: Mapping[str, float] = field(default_factory=lambda: dict(plants.find_plant("eha").nominal))
     effects: tuple[str, ...] = ()
     plant: str = "eha"
+    design: Mapping[str, float] = field(default_factory=dict)  # nominal values of an actuator of another size
+
+    @property
+    def nominal(self) -> Mapping[str, float]:
+        """The nominal values of this design, "group.field" to SI value: the plant's own where it is of usual size."""
+        return {**self.kind.nominal, **self.design}
 
     @property
     def kind(self) -> Plant:
@@ -86,7 +92,7 @@ class Model:
         """The model with the effects among `groups` added at their off values."""
         wanted = set(groups) | set(self.effects)
         effects = tuple(e.name for e in CATALOGUE.list_all().values() if e.name in wanted and not e.base)
-        usual = self.kind.nominal
+        usual = self.nominal
         off = {name: usual.get(name, value) for e in effects if e not in self.effects
                for name, value in CATALOGUE[e].off.items()}
         return replace(self, values={**self.values, **off}, effects=effects)
@@ -95,7 +101,7 @@ class Model:
         return self.values[name]
 
     def list_changes(self) -> dict[str, float]:
-        """The parameters that are not nominal, and all parameters of its effects."""
+        """The parameters that are not those of the plant's nominal model, and all parameters of its effects."""
         base = self.kind.nominal
         return {name: value for name, value in self.values.items() if base.get(name) != value}
 
@@ -105,15 +111,18 @@ class Model:
         name = json.dumps(self.name, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
         plant = [] if self.plant == "eha" else [f'plant = "{self.plant}"']
         lines = [f"name = {name}", *plant, f"effects = [{effects}]"]
-        group = ""
-        for name, value in self.list_changes().items():
-            head, _, tail = name.partition(".")
-            if head != group:
-                group = head
-                lines += ["", f"[{group}]"]
-            quantity = find_quantity(name, plant=self.plant)
-            word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
-            lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
+        usual = self.nominal
+        own = {name: value for name, value in self.values.items() if usual.get(name) != value}
+        for heading, values in (("design.", self.design), ("", own)):
+            group = ""
+            for name, value in values.items():
+                head, _, tail = name.partition(".")
+                if head != group:
+                    group = head
+                    lines += ["", f"[{heading}{group}]"]
+                quantity = find_quantity(name, plant=self.plant)
+                word = next((f'"{w}"' for w, number in quantity.words.items() if number == value), repr(value))
+                lines.append(f"{tail} = {word}" + (f"  # {quantity.unit}" if quantity.unit != "1" else ""))
         return "\n".join(lines) + "\n"
 
     def list_names(self) -> list[str]:
@@ -179,6 +188,8 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     name, effects = tables.pop("name", name), tables.pop("effects", [])
     plant = tables.pop("plant", "eha")
     tables.pop("provenance", None)
+    tables.pop("identify", None)
+    design = tables.pop("design", {})
     if not isinstance(name, str) or not name:
         raise InputError(where, "name", f"a text, not {name!r}")
     if plant not in plants.list_plants():
@@ -188,8 +199,14 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     if unknown:
         hint = suggest_name(str(unknown[0]), known)
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
+    if not isinstance(design, Mapping):
+        raise InputError(where, "design", "tables [design.GROUP] of nominal values")
     values = flatten_tables(where, tables, find_parameter_groups(plant=plant))
-    return build_bare_model(plant, name).with_effects(effects).replace(values, where)
+    usual = flatten_tables(where, design, find_parameter_groups((), plant))
+    bare = build_bare_model(plant, name)
+    sized = replace(bare, values={**bare.values, **usual}, design=usual)
+    check_combinations(where, sized.values)
+    return sized.with_effects(effects).replace(values, where)
 
 
 def check_exclusions(where: object, effects: Iterable[str], values: Mapping[str, float]) -> None:

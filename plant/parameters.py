@@ -232,7 +232,9 @@ def read_shipped_model(file: str, groups: Mapping[str, type[Any]]) -> dict[str, 
         InputError: an unknown group or field, or a value out of range.
     """
     source = files("plant").joinpath("models", file)
-    return flatten_tables(f"plant/models/{file}", tomllib.loads(source.read_text(encoding="utf-8")), groups)
+    tables = tomllib.loads(source.read_text(encoding="utf-8"))
+    tables.pop("identify", None)  # which parameters rig identify fits
+    return flatten_tables(f"plant/models/{file}", tables, groups)
 
 
 def check_combinations(where: object, values: Mapping[str, float]) -> None:

@@ -129,6 +129,8 @@ def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats,
     direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
     turned = _flag_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
     turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
+    pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > OWN["force"] * model["jack.area"]
+    turned |= _flag_within(pushed, size)  # a step of the known load: the speed changes within a sample
     out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
     return np.where((direction == 0.0) | turned, np.nan, out)
 

@@ -23,7 +23,8 @@ from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estima
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import descend_valley, guess_covariance
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, limit_dynamic_friction
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
 from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import all_unknowns, effect_unknowns, silence_readings
 from fdi.thresholds import (
@@ -76,45 +77,9 @@ SUSPECTS = (
 )
 
 
-class LogFree(Free):
-    """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
-
-    __slots__ = ()
-
-    def value(self, x: float) -> float:
-        """The parameter in SI units."""
-        return math.exp(super().value(x))
-
-
-class LogFrictionRatio(LogFree):
-    """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it."""
-
-    __slots__ = ()
-
-
-class LogOpenFilter(Free):
-    """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
-
-    __slots__ = ()
-
-    def value(self, x: float) -> float:
-        """Kintas."""
-        return 1.0 - math.exp(super().value(x))
-
-
-def compute_values(free: Sequence[Free], x: Floats) -> Floats:
-    """Parameters in SI units, (p,), of scaled unknowns (p,)."""
-    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
-    names = [f.name for f in free]
-    for k, f in enumerate(free):
-        if isinstance(f, LogFrictionRatio):
-            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
-    return limit_dynamic_friction(names, found)
-
-
 def get_positive(model: Model, name: str) -> float:
     """A parameter of the model, bounded below by 0.1 % of its nominal value, as a logarithm needs it."""
-    return max(model[name], 1e-3 * model.kind.nominal[name])
+    return max(model[name], 1e-3 * model.nominal[name])
 
 
 def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]:
@@ -198,13 +163,10 @@ class Refinement:
 
 
 @dataclass
-class CountedProblem(Problem):
+class CountedProblem(LogProblem):
     """A problem that counts the runs it makes, and knows static friction by its ratio."""
 
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
-
-    def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
-        return np.array([compute_values(free, row) for row in x])
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))

@@ -136,7 +136,7 @@ def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Val
     for f in fit.free:
         if f.name in entry.fitted:
             value = values[f.name]
-            size = abs(value - entry.off.get(f.name, model.kind.nominal.get(f.name, 0.0)))
+            size = abs(value - entry.off.get(f.name, model.nominal.get(f.name, 0.0)))
             half = INTERVAL_95_SD * math.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(f.name), EFFECT_SYSTEMATIC_SD * size)
             found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
                                   entry.parameters[f.name].unit)

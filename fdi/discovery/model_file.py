@@ -50,6 +50,7 @@ class Provenance:
     floor: Mapping[str, float] | None = None
     before: Mapping[str, float] | None = None  # parameters that the fits changed, as they were
     ledger: tuple[Row, ...] = ()
+    identification: Mapping[str, str | list[str]] | None = None  # of the nominal values, by rig identify
 
     def same_data(self, sources: Sequence[Source], repeats: int, signals: Sequence[str]) -> bool:
         """Whether the ledger goes on: the same runs, told by their content, and the same signals."""
@@ -72,7 +73,7 @@ def read_provenance(path: Path) -> Provenance:
                                             ("history", "effects", "effect_files", "signals"))
         trace, holdout = _read_source(said, "trace"), _read_source(said, "holdout")
         return Provenance(said.get("software", ""), history, effects, files, signals, trace, tuple(runs), holdout,
-                          said.get("floor"), said.get("before"), tuple(rows))
+                          said.get("floor"), said.get("before"), tuple(rows), said.get("identification"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(path, "provenance", f"what rig add writes there ({error})") from error
 
@@ -115,8 +116,8 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
     if not entry.base and name in model.effects:
         values = {n: v for n, v in model.values.items() if n not in entry.off}
         found = replace(model, values=values, effects=tuple(e for e in model.effects if e != name))
-    elif entry.base and (name in p.effects or any(model[n] != model.kind.nominal[n] for n in entry.fitted)):
-        usual = {n: (p.before or {}).get(n, model.kind.nominal[n]) for n in entry.fitted}
+    elif entry.base and (name in p.effects or any(model[n] != model.nominal[n] for n in entry.fitted)):
+        usual = {n: (p.before or {}).get(n, model.nominal[n]) for n in entry.fitted}
         found = replace(model, values=limit_friction_values({**model.values, **usual}))
     else:
         has = [*dict.fromkeys([*p.effects, *model.effects])]
@@ -133,7 +134,7 @@ def _with_intervals(lines: Iterable[str], intervals: Mapping[str, Value]) -> Ite
     group = ""
     for line in lines:
         if line.startswith("["):
-            group = line.strip("[]")
+            group = line.strip("[]").removeprefix("design.")
         found = intervals.get(f"{group}.{line.partition(' = ')[0]}")
         if found:
             mark = "," if "#" in line else "  #"
@@ -154,6 +155,10 @@ def _format_provenance(p: Provenance) -> list[str]:
     lines += [f"floor = {_format_inline_table(p.floor)}"] if p.floor else []
     if p.before:
         lines += ["", "[provenance.before]", *(f"{_quote_text(name)} = {value!r}" for name, value in p.before.items())]
+    if p.identification:
+        lines += ["", "[provenance.identification]"]
+        lines += [f"{name} = {_quote_text(x) if isinstance(x, str) else _format_list(x)}"
+                  for name, x in p.identification.items()]
     for row in p.ledger:
         lines += ["", "[[provenance.ledger]]", *([f"effect = {_quote_text(row.effect)}"] if row.effect else []),
                   *(["removed = true"] if row.removed else []), f"error = {_format_inline_table(row.error)}",

@@ -30,7 +30,7 @@ class Sensitivity(NamedTuple):
 
 def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
-    usual = problem.model.kind.nominal
+    usual = problem.model.nominal
     starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]

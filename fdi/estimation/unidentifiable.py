@@ -118,13 +118,17 @@ def relax_fit(problem: Problem, found: Fit) -> Fit:
     return replace(found, x=x, cost=cost, misfit=held, residuals=residuals[0], white=white[0])
 
 
-def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats) -> Floats:
-    """Directions of `FLAT_BY_RATIO` that hold at `x` (p,) of scaled unknowns in logarithms, as columns (p, k)."""
+def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
+                         others: Sequence[Mapping[str, float]] = ()) -> Floats:
+    """Directions of `FLAT_BY_RATIO` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k)."""
     law = problem.model["filter.law"]
     load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
     said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
             {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT_BY_RATIO]
-    ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in said])
+    every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
+    ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
+    if not len(ways):
+        return ways.T
     trials = np.array([cut_at_bounds(free, x, TRIED * way) for way in ways])
     full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)
     white = problem.compute_white_residuals(free, np.vstack([x, x + trials]))
@@ -134,9 +138,18 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats) -> F
 
 
 def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
-    """Places of the unknowns that, with the flat directions (p, k), span all: one of each direction is left out."""
-    left_out = {int(np.argmax(np.abs(column) * [f.name in [next(iter(v)) for v in FLAT_BY_RATIO] for f in free]))
-                for column in flat.T}
+    """Places of the unknowns that, with the flat directions (p, k), span all: one of each direction is left out.
+
+    It is the first that the direction names in `FLAT_BY_RATIO`, else the one that moves furthest.
+    """
+    leading = np.array([f.name in [next(iter(v)) for v in FLAT_BY_RATIO] for f in free])
+    left = flat.copy()
+    left_out: list[int] = []
+    for i in range(left.shape[1]):  # elimination, so that directions with the same parameters leave out different ones
+        size = np.abs(left[:, i])
+        k = int(np.argmax(size * leading if (size * leading).max() > 1e-6 * size.max() else size))
+        left_out.append(k)
+        left[:, i + 1:] -= np.outer(left[:, i], left[k, i + 1:] / left[k, i])
     return np.array([k for k in range(len(free)) if k not in left_out])
 
 

@@ -35,7 +35,7 @@ def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
 
     The tolerance is a fraction of the nominal value, so that it does not depend on the model's own.
     """
-    usual = model.kind.nominal
+    usual = model.nominal
     free = []
     for name, tolerance in relative_tolerances(model, model.values).items():
         value, q = model.values[name], find_quantity(name, plant=model.plant)
@@ -50,7 +50,7 @@ def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tupl
 
     `turning`, Hz, is the first difference of a frequency: a small part of a turn over a test.
     """
-    usual, free = model.kind.nominal, []
+    usual, free = model.nominal, []
     for name in effect.fitted:
         q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
         sizes = sorted(abs(start[name] - off) for start in effect.starts)
@@ -80,7 +80,7 @@ def all_unknowns(model: Model) -> tuple[Free, ...]:
 
 
 def _off_nominal(e: Effect, model: Model) -> bool:
-    usual = model.kind.nominal
+    usual = model.nominal
     tolerance = model.kind.find_tolerance
     return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])
                for name, q in e.parameters.items())

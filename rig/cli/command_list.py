@@ -16,6 +16,7 @@ HELP_OF_COMMAND = {
     "explain": "find the physical effects that a model lacks, and rank the candidates",
     "export": "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
     "fdi": "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
+    "identify": "find the parameters of your actuator from its runs, with intervals, and what the runs do not show",
     "import": "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
     "list": "list parameters, signals, sequences, effects, checks or models, with unit, range and default",
     "node": "run one node (plant or controller) on a bus, for example with real hardware",

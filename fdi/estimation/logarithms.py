@@ -1,0 +1,60 @@
+"""Unknowns by their logarithms: gains, areas, forces and frictions of a plant scale.
+
+What may be scaled together without changing a signal is a straight line in logarithms.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.likelihood import Free, Problem, limit_dynamic_friction
+
+Floats = NDArray[np.float64]
+
+
+class LogFree(Free):
+    """A parameter by its logarithm: centre, scale and bounds are those of the logarithm."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """The parameter in SI units."""
+        return math.exp(super().value(x))
+
+
+class LogFrictionRatio(LogFree):
+    """Static friction by the logarithm of its ratio to the dynamic one of the same body, which comes before it."""
+
+    __slots__ = ()
+
+
+class LogOpenFilter(Free):
+    """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
+
+    __slots__ = ()
+
+    def value(self, x: float) -> float:
+        """Kintas."""
+        return 1.0 - math.exp(super().value(x))
+
+
+def compute_values(free: Sequence[Free], x: Floats) -> Floats:
+    """Parameters in SI units, (p,), of scaled unknowns (p,)."""
+    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
+    names = [f.name for f in free]
+    for k, f in enumerate(free):
+        if isinstance(f, LogFrictionRatio):
+            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
+    return limit_dynamic_friction(names, found)
+
+
+@dataclass
+class LogProblem(Problem):
+    """A problem whose unknowns may be logarithms, the jack's static friction by its ratio to the dynamic one."""
+
+    def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        return np.array([compute_values(free, row) for row in x])

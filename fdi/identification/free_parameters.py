@@ -1,0 +1,152 @@
+"""Which parameters an identification fits, and how widely: the table [identify] of a model file.
+
+A parameter there has a factor, within which the data sheet's value may be wrong either way, or a range in SI units:
+
+    [identify.jack]
+    area = 4                  # between a quarter of the model's value and four times it
+    leakage = [1e-14, 1e-10]  # m3/s/Pa
+
+A parameter that is not there keeps the model's value, within the tolerance by which healthy units differ.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fdi.estimation.likelihood import Free
+from fdi.estimation.logarithms import LogFree, LogFrictionRatio
+from fdi.estimation.unknowns import tolerance_unknowns
+from fdi.thresholds import IDENTIFIED_SYSTEMATIC_SD, STATIC_FRICTION_SYSTEMATIC_SD
+from plant.errors import InputError
+from plant.model import Model, find_quantity, find_shipped_model
+from plant.parameters import read_toml
+
+STATIC, DYNAMIC = "jack.static_friction", "jack.dynamic_friction"
+
+
+class Range(NamedTuple):
+    """How widely a parameter is free: the data sheet's value and the bounds of the fit, SI."""
+
+    name: str
+    centre: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether the fit works on the logarithm: the parameter cannot be zero or negative."""
+        return self.low > 0.0
+
+    @property
+    def half_width(self) -> float:
+        """Half the range: of the logarithm if the range is relative, else SI."""
+        return 0.5 * (math.log(self.high / self.low) if self.is_relative else self.high - self.low)
+
+
+def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range, ...]:
+    """The free parameters of a model: those of its file, or those of the nominal model where that lists none.
+
+    Args:
+        model: with the values of the data sheet.
+        source: the model's file; None for the nominal model.
+
+    Raises:
+        InputError: a table [identify] with an unknown parameter, or with a factor or range that cannot be; or no such
+            table for a plant that the nominal model is not of.
+    """
+    path = find_shipped_model(str(source)) or Path(str(source))
+    named = read_toml(path).get("identify") if source is not None and path.is_file() else None
+    if named is None and model.plant != "eha":
+        raise InputError(source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    usual = Path(str(files("plant").joinpath("models", "nominal.toml")))
+    return parse_free_parameters(read_toml(usual)["identify"] if named is None else named, model,
+                                 source if named is not None else usual.name)
+
+
+def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[Range, ...]:
+    """The ranges that the tables of [identify] describe, in the model's order.
+
+    Raises:
+        InputError: an unknown parameter, or a factor or range that cannot be.
+    """
+    if not isinstance(tables, Mapping):
+        raise InputError(where, "identify", "a table [identify.GROUP] of factors and ranges")
+    found = {}
+    for group, fields in tables.items():
+        if not isinstance(fields, Mapping):
+            raise InputError(where, f"identify.{group}", "a table of factors and ranges, such as area = 4")
+        for field, width in fields.items():
+            name = f"{group}.{field}"
+            find_quantity(name, where, model.plant)
+            if name not in model.values:
+                raise InputError(where, f"identify.{name}", f"a parameter that the model has; add {group} to its "
+                                                            "effects")
+            found[name] = _parse_range(name, width, model, where)
+    if not found:
+        raise InputError(where, "identify", "at least one free parameter")
+    return tuple(found[name] for name in model.list_names() if name in found)
+
+
+def _parse_range(name: str, width: Any, model: Model, where: object) -> Range:
+    q, value = find_quantity(name, where, model.plant), model[name]
+    possible_low, possible_high = max(q.low, q.above), min(q.high, q.below)
+    field = f"identify.{name}"
+    if _is_number(width):
+        if not width > 1.0 or math.isinf(width):
+            raise InputError(where, field, f"a factor above 1, not {width:g}")
+        if value <= 0.0:
+            raise InputError(where, field, f"a range [low, high]: a factor says nothing of {value:g}")
+        low, high = max(value / width, possible_low), min(value * width, possible_high)
+    elif isinstance(width, list) and len(width) == 2 and all(map(_is_number, width)) and width[0] < width[1]:
+        low, high = map(float, width)
+        if low < possible_low or high > possible_high:
+            raise InputError(where, field, f"a range within {possible_low:g} .. {possible_high:g} {q.unit}")
+    else:
+        raise InputError(where, field, f"a factor above 1, or a range [low, high] in {q.unit}, not {width!r}")
+    if low <= value <= high:
+        centre = value
+    else:
+        centre = math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high)
+    return Range(name, centre, low, high, q.unit)
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, (int, float)) and not isinstance(x, bool)
+
+
+def get_systematic_sd(name: str) -> float:
+    """The relative standard deviation that solver and stick-slip add to a parameter beside that of the fit."""
+    return STATIC_FRICTION_SYSTEMATIC_SD if name == STATIC else IDENTIFIED_SYSTEMATIC_SD
+
+
+def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
+    """What the fit may change: the free parameters, and the tolerances of the others."""
+    free = {r.name: _make_free(r) for r in ranges}
+    free |= {f.name: _take_logarithm(f) for f in tolerance_unknowns(model) if f.name not in free}
+    if STATIC in free and DYNAMIC in free:
+        usual = math.log(max(model[STATIC] / model[DYNAMIC], 1.0))
+        is_free = STATIC in {r.name for r in ranges}
+        spread, highest = (0.5, math.log(20.0)) if is_free else (0.03, usual + 1.0)
+        ratio = LogFrictionRatio(STATIC, usual, spread, 1.0, 0.0, max(highest, usual), 0.3)
+        del free[STATIC]
+        free[STATIC] = ratio
+    return tuple(free.values())
+
+
+def _make_free(r: Range) -> Free:
+    """The parameter, known beforehand to lie within half its range of the data sheet's value."""
+    if r.is_relative:
+        return LogFree(r.name, math.log(r.centre), r.half_width, 1.0, math.log(r.low), math.log(r.high), 0.02)
+    return Free(r.name, r.centre, r.half_width, 1.0, r.low, r.high, 0.02)
+
+
+def _take_logarithm(f: Free) -> Free:
+    """A tolerance as one of the logarithm; unchanged if the parameter may be zero."""
+    if f.low <= 0.0:
+        return f
+    return LogFree(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
+

@@ -1,0 +1,168 @@
+"""A fit that begins far from the answer: several starts, noise taken for larger at first, scans along each unknown.
+
+A replay of a model that is far off meets every stop of the ram at another time, so the misfit has many valleys. Three
+things find the right one. Starts are scattered about the regressions' values. The noise counts for a hundred times its
+size at first, so that small stops count late. And before each stage every unknown is tried on a grid with the others
+held: runs side by side cost little, and a grid steps over ridges at which slopes point the wrong way.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.final_rounds import descend_valley, guess_covariance
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Free, compute_misfit, scaled_bounds
+from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogProblem, compute_values
+from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.progress import Progress, ignore_progress
+from plant.threads import map_in_threads
+
+Floats = NDArray[np.float64]
+
+# factor on the noise, fits that go on, rounds of each, solver steps a cycle
+FIT_STAGES = ((100.0, 3, 3, 10), (30.0, 2, 4, 10), (6.0, 1, 5, 20), (1.0, 1, 8, 20))
+RESTART_STAGES = ((30.0, 4), (6.0, 4), (1.0, 8))  # factor on the noise, rounds
+FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no restart is needed
+SCATTERED = 48  # starts beside the regressions' values and the data sheet's
+GRID = (-0.3, -0.15, -0.07, -0.03, -0.01, 0.01, 0.03, 0.07, 0.15, 0.3)  # of the logarithm, or of half a range
+
+
+def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
+    """Scaled unknowns, (p,), of parameters by name, SI, within the bounds; the centre for what is not named."""
+    x = np.zeros(len(free))
+    for k, f in enumerate(free):
+        if f.name not in values:
+            continue
+        value = values[f.name]
+        if isinstance(f, LogFrictionRatio):
+            value = max(value / values[f.name.replace("static", "dynamic")], 1.0)
+        place = math.log(value) if isinstance(f, LogFree) else value
+        x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
+    return x
+
+
+def draw_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], seed: int, count: int = SCATTERED
+                ) -> Floats:
+    """Starts (m, p): `begin` (p,), the data sheet, and some scattered about `begin`.
+
+    Those that are `known` from regressions are scattered by a tenth, tolerances not at all, the rest by 0.4 of what
+    is known of them.
+    """
+    spread = np.array([0.0 if not is_wide(f) else 0.1 / f.scale if f.name in known else 0.4 for f in free])
+    rng = np.random.default_rng(seed)
+    scattered = begin + spread * rng.standard_normal((count, len(free)))
+    low, high = scaled_bounds(free)
+    return np.clip(np.vstack([begin, np.zeros(len(free)), scattered]), low, high)
+
+
+def is_wide(f: Free, tolerance: float = 0.04) -> bool:
+    """Whether an unknown is more than a tolerance of healthy units."""
+    return f.scale * f.prior > tolerance if isinstance(f, LogFree) else f.prior * f.scale > tolerance * abs(f.centre)
+
+
+def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, progress: Progress = ignore_progress
+                  ) -> Fit:
+    """The best fit from some starts (m, p), scaled."""
+    factor = FIT_STAGES[0][0]
+    costs = compute_misfit(make_loud(problem, factor).compute_white_residuals(free, starts))
+    chosen = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
+    fits = [start_fit(free, x) for x in chosen]
+    for number, (factor, count, rounds, steps) in enumerate(FIT_STAGES):
+        progress(f"fitting, {len(fits[:count])} starts", 0.1 + 0.15 * number)
+        stage = replace(problem, workers=1, steps=steps)
+
+        def advance(fit: Fit, stage: LogProblem = stage, rounds: int = rounds, factor: float = factor) -> Fit:
+            alone = replace(stage, _lanes={})
+            return descend(alone, scan_unknowns(make_loud(alone, factor), fit), rounds, factor)
+
+        fits = sorted(map_in_threads(advance, fits[:count], problem.workers), key=lambda fit: fit.cost)
+    return fits[0]
+
+
+def restart_fit(problem: LogProblem, found: Fit) -> Fit:
+    """The best of a fit and some that begin elsewhere on the line to a unit whose tolerances are nominal.
+
+    Stops of the ram make ridges: what lies behind one of them is found from the other side, or never.
+    """
+    best = found
+    for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
+        if is_fitted(best):
+            break
+        home = np.where([is_wide(f) for f in best.free], best.x, 0.0)
+
+        def fit_from(part: float, home: Floats = home, best: Fit = best) -> Fit:
+            alone = replace(problem, workers=1, _lanes={})
+            fit = start_fit(best.free, best.x + part * (home - best.x))
+            for factor, rounds in RESTART_STAGES:
+                fit = descend(alone, scan_unknowns(make_loud(alone, factor), fit), rounds, factor)
+            return fit
+
+        best = min(best, *map_in_threads(fit_from, parts, problem.workers), key=lambda fit: fit.cost)
+    return best
+
+
+def is_fitted(fit: Fit) -> bool:
+    """Whether only noise is left, by its known size."""
+    return bool(fit.misfit <= FITTED_SQUARE * np.count_nonzero(fit.white))
+
+
+def start_fit(free: Sequence[Free], x: Floats) -> Fit:
+    """A fit at `x` (p,) before its first round."""
+    none = np.empty((0, 0))
+    return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
+
+
+def make_loud(problem: LogProblem, factor: float) -> LogProblem:
+    """The problem with its noise taken for `factor` times as large."""
+    return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise), _lanes={})
+
+
+def descend(problem: LogProblem, fit: Fit, rounds: int, factor: float = 1.0) -> Fit:
+    """A fit after so many rounds from where it is, with a covariance that begins anew; the noise `factor` times as
+    large.
+    """
+    begun = replace(fit, covariance=guess_covariance(fit.free))
+    return descend_valley(make_loud(problem, factor), begun, rounds, find_flat(problem, fit.free, fit.x))
+
+
+def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
+    """The fit at the best place of a grid along each free unknown, one after the other; tolerances are left alone."""
+    free, x = fit.free, fit.x
+    low, high = scaled_bounds(free)
+    prior = np.array([f.prior**-2 for f in free])
+    for _ in range(rounds):
+        trials = [x]
+        for k, f in enumerate(free):
+            if is_wide(f):
+                for way in GRID:
+                    trial = x.copy()
+                    trial[k] += way / f.scale if isinstance(f, LogFree) else way
+                    trials.append(np.clip(trial, low, high))
+        tried = np.array(trials)
+        costs = compute_misfit(problem.compute_white_residuals(free, tried)) + tried**2 @ prior
+        best = int(np.argmin(costs))
+        if best == 0 or costs[best] > costs[0] - 1.0:
+            break
+        x = tried[best]
+    return replace(fit, x=x)
+
+
+def find_flat(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
+    """Directions (p, k) of scaled unknowns at `x` (p,) along which no signal changes."""
+    names = [f.name for f in free]
+    v = {**problem.model.values, **dict(zip(names, compute_values(free, x).tolist(), strict=True))}
+    if problem.model.plant != "eha":
+        return np.empty((len(free), 0))
+    leaking = {"valve.pressure_gain": 1.0}
+    if v["jack.leakage"] > 0.0:  # only 1/GP + CLK/GQ counts
+        leaking["jack.leakage"] = v["valve.flow_gain"] / (v["valve.pressure_gain"] * v["jack.leakage"])
+    flapper = {"flapper.travel": -1.0, "flapper.stiffness": 1.0, "flapper.damping": 1.0,
+               "flapper.inertia": 1.0, "pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0}
+    sticking = {"pilot.pressure_gain": 1.0, "spool.static_friction": 1.0, "spool.dynamic_friction": 1.0}
+    turning = {"flapper.inertia": 1.0}  # its time constant, JF/BF, is 25 us: slopes by it are the solver's
+    return find_flat_directions(problem, free, x, (leaking, flapper, sticking, turning))

@@ -1,0 +1,374 @@
+"""The nominal model of a user's actuator: its parameters from measured runs, and what these runs cannot tell.
+
+The data sheet says where each parameter is about (`free_parameters`). Regressions on the signals give first values
+(`closed_form`), a fit that begins far away goes on from there (`global_fit`), and the last rounds have fine steps and
+the noise that is left. A parameter whose interval stays wide is not identifiable from these runs: it keeps the data
+sheet's value, and `experiments` says which run would show it. Held-out runs judge the result.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.runs import Source
+from fdi.estimation import noise as noises
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, limit_friction_values
+from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
+from fdi.estimation.noise import sensor_floors
+from fdi.estimation.unknowns import silence_readings
+from fdi.identification.closed_form import estimate_by_regressions
+from fdi.identification.controller import ControllerGains, read_controller
+from fdi.identification.experiments import Advice, advise_experiments
+from fdi.identification.free_parameters import Range, get_systematic_sd, list_unknowns
+from fdi.identification.global_fit import (
+    descend,
+    draw_starts,
+    fit_from_afar,
+    is_fitted,
+    restart_fit,
+    scale_values,
+)
+from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import (
+    IDENTIFIABLE_SHARE,
+    IDENTIFIED_INTERVAL_FACTOR,
+    INTERVAL_95_SD,
+    MOVING_RAM,
+    RESIDUAL_HELD_OUT,
+    RESIDUAL_WORST,
+)
+from fdi.trace.signals import SIGNALS
+from fdi.trace.trace import Trace, rms
+from plant.model import Model
+from plant.threads import count_threads
+
+Floats = NDArray[np.float64]
+
+LAST_STEPS, RESTART_STEPS = 50, 20  # solver steps a cycle, of the last rounds and of further starts
+OPEN_MISFIT = 4.0  # -2 log likelihood by which a parameter may go to the end of its range and still not be seen
+
+
+class Estimate(NamedTuple):
+    """A free parameter, SI: the data sheet's value and range, the value found and its 95 % interval."""
+
+    name: str
+    unit: str
+    before: float
+    least: float
+    most: float
+    value: float
+    low: float
+    high: float
+    is_identifiable: bool
+    share: float  # of the range that the interval takes up; of logarithms where the range is relative
+
+    @property
+    def is_at_bound(self) -> bool:
+        """Whether the value is at an end of the range: the data want to go further."""
+        return self.is_identifiable and not 1.0001 * self.least < self.value < 0.9999 * self.most
+
+
+class RunError(NamedTuple):
+    """RMS residual of each signal in one run, SI, with the data sheet's model and with the identified one."""
+
+    source: Source
+    is_held_out: bool
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    typical: Mapping[str, float]  # after, without the worst blocks
+    floor: Mapping[str, float]
+
+    @property
+    def ratio(self) -> float:
+        """Error of the worst signal over its noise floor, after."""
+        return max(self.after[s] / self.floor[s] for s in self.after)
+
+
+class Correlation(NamedTuple):
+    """Two parameters whose errors go together."""
+
+    first: str
+    second: str
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What an identification found."""
+
+    verdict: str  # IDENTIFIED, PARTLY, UNEXPLAINED, CANNOT_TELL
+    reason: str  # why, where the verdict is not IDENTIFIED
+    before: Model  # of the data sheet
+    model: Model  # with what was found as its design
+    estimates: tuple[Estimate, ...]
+    controller: ControllerGains | None
+    correlations: tuple[Correlation, ...]  # of identifiable parameters, the strongest first
+    advice: tuple[Advice, ...]
+    errors: tuple[RunError, ...]
+    floor: Mapping[str, float]
+    runs: tuple[Trace, ...]  # prepared; the held-out ones last
+    residuals: tuple[tuple[Floats, Floats], ...]  # of each run, (s, n) SI: before and after, model minus measured
+    sources: tuple[Source, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def holdouts(self) -> tuple[RunError, ...]:
+        """The errors on held-out runs."""
+        return tuple(e for e in self.errors if e.is_held_out)
+
+
+def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace], held_out: Sequence[Trace],
+                   sources: Sequence[Source], seed: int = 0, progress: Progress = ignore_progress,
+                   workers: int | None = None) -> Identification:
+    """Fit the free parameters of a model to runs of one actuator.
+
+    Args:
+        model: with the values of the data sheet.
+        ranges: of the free parameters.
+        fitted: runs, prepared for replay, with the same outputs.
+        held_out: runs that no fit sees, prepared.
+        sources: of all of them, in this order.
+        seed: of the scattered starts.
+        progress: called with each stage and the share done, 0 to 1.
+        workers: threads; default one a core.
+    """
+    runs, notes = (*fitted, *held_out), _collect_notes([*fitted, *held_out], sources)
+    floor = {s: float(np.median([f[s].value for f in (sensor_floors(t, model) for t in fitted)]))
+             for s in fitted[0].outputs}
+    if not any(_moves(t) for t in fitted):
+        reason = f"no run to fit moves the ram by {1e3 * MOVING_RAM:g} mm: at rest nothing can be identified"
+        return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
+    gains = read_controller(fitted) if model.kind.controller else None
+    problem = make_problem(model, fitted, floor, workers or count_threads())
+    free = list_unknowns(model, tuple(ranges))
+    progress("regressions", 0.02)
+    names = frozenset(f.name for f in free)
+    begun = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
+    begun = {name: value for name, value in begun.items() if name in names}
+    starts = draw_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
+    fit = fit_from_afar(problem, free, starts, progress)
+    progress("which parameters the runs show", 0.65)
+    hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
+    problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
+    progress("last fits, with finer steps", 0.7)
+    problem, fit = finish(problem, fit)
+    progress("judging", 0.92)
+    found = build_model(model, problem, fit, gains)
+    estimates, covariance = estimate_parameters(model, ranges, fit, hidden)
+    errors, residuals = measure_errors(model, found, runs, sources, len(fitted), floor)
+    verdict, reason = decide_verdict(estimates, errors)
+    progress("which runs would show more", 0.95)
+    unseen = [e.name for e in estimates if not e.is_identifiable]
+    advice = advise_experiments(found, list_unknowns(model, tuple(ranges)), problem, fit, unseen) if unseen else ()
+    return Identification(verdict, reason, model, found, estimates, gains, list_correlations(estimates, covariance),
+                          tuple(advice), errors, floor, runs, residuals, tuple(sources), tuple(notes))
+
+
+def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
+    """The runs to fit with white noise of the floor's size."""
+    noise = tuple(noises.white_noise(floor[s]) for s in fitted[0].outputs)
+    return LogProblem(silence_readings(model), fitted[0], noise, workers=workers, also=tuple(fitted[1:]))
+
+
+def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
+                ) -> dict[str, tuple[float, float, float]]:
+    """Free parameters that no run shows, with the value nearest to the data sheet's, and the values that fit as well.
+
+    An end stop that the ram never met may be anywhere beyond the furthest position.
+    """
+    places = [(k, r) for k, f in enumerate(fit.free) if (r := ranges.get(f.name)) is not None
+              and type(f) is not LogFrictionRatio]
+    trials = [fit.x]
+    for k, _ in places:
+        f = fit.free[k]
+        trials += [_put(fit.x, k, (end - f.centre) / f.scale) for end in (f.low, f.high)]
+    costs = compute_misfit(problem.compute_white_residuals(fit.free, np.array(trials)))
+    found = {}
+    for i, (k, r) in enumerate(places):
+        f = fit.free[k]
+        below, above = (costs[1 + 2 * i + side] - costs[0] < OPEN_MISFIT for side in (0, 1))
+        if below or above:
+            low = r.low if below else _find_edge(problem, fit, k, f.low)
+            high = r.high if above else _find_edge(problem, fit, k, f.high)
+            found[f.name] = (min(max(r.centre, low), high), low, high)
+    return found
+
+
+def _put(x: Floats, k: int, value: float) -> Floats:
+    moved = x.copy()
+    moved[k] = value
+    return moved
+
+
+def _find_edge(problem: LogProblem, fit: Fit, k: int, end: float, rounds: int = 3, parts: int = 15) -> float:
+    """The value of unknown k, SI, between a fit that is well and the `end` of its range where it is not, that divides
+    both."""
+    f = fit.free[k]
+    good, bad = float(fit.x[k]), (end - f.centre) / f.scale
+    for _ in range(rounds):
+        line = np.linspace(good, bad, parts + 1)
+        costs = compute_misfit(problem.compute_white_residuals(
+            fit.free, np.array([fit.x, *(_put(fit.x, k, place) for place in line)])))
+        seen = np.flatnonzero(costs[1:] - costs[0] >= OPEN_MISFIT)
+        if not len(seen):
+            break
+        first = max(int(seen[0]), 1)
+        good, bad = float(line[first - 1]), float(line[first])
+    return f.value(good)
+
+
+def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) -> tuple[LogProblem, Fit]:
+    """The problem and the fit without some unknowns, which keep the values in `held`."""
+    if not held:
+        return problem, fit
+    values = {**problem.model.values, **held}
+    kept = [k for k, f in enumerate(fit.free) if f.name not in held]
+    x = fit.x[kept]
+    free = tuple(fit.free[k] for k in kept)
+    none = np.empty((0, 0))
+    fixed = replace(problem, model=replace(problem.model, values=limit_friction_values(values)), _lanes={})
+    return fixed, Fit(free, x, np.inf, np.inf, fit.covariance[np.ix_(kept, kept)], none, none, none)
+
+
+def finish(problem: LogProblem, fit: Fit) -> tuple[LogProblem, Fit]:
+    """The last rounds, with finer steps; then with the noise that is left, where only noise is left."""
+    fine = replace(problem, steps=LAST_STEPS, _lanes={})
+    fit = descend(fine, fit, 8)
+    if not is_fitted(fit):
+        other = restart_fit(replace(problem, steps=RESTART_STEPS, _lanes={}), descend(problem, fit, 1))
+        fit = min(fit, descend(fine, other, 8), key=lambda each: each.cost)
+    size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
+    level = np.array([n.level for n in fine.noise])
+    if (size <= RESIDUAL_HELD_OUT * level).all():
+        learnt = tuple(noises.fit_noise(r) for r in fit.residuals)
+        fine = replace(fine, noise=learnt, _lanes={})
+        fit = descend(fine, fit, 5)
+    return fine, fit
+
+
+def build_model(model: Model, problem: Problem, fit: Fit, gains: ControllerGains | None) -> Model:
+    """The model whose nominal values are those that were found."""
+    names = [f.name for f in fit.free]
+    values = dict(zip(names, compute_values(fit.free, fit.x).tolist(), strict=True))
+    held = {n: v for n, v in problem.model.values.items() if v != model.values.get(n) and not n.startswith("sensors.")
+            and n not in values}
+    noise = {}
+    for s, n in zip(problem.trace.outputs, problem.noise, strict=True):
+        noise[SIGNALS[s].noise] = n.level
+    read = {} if gains is None else gains.values
+    found = {n: float(f"{v:.6g}") for n, v in {**held, **values, **read, **noise}.items() if n in model.values}
+    base = {n for n in found if n.partition(".")[0] in model.kind.groups}
+    complete = limit_friction_values({**model.values, **found})
+    own = {**{n: model.values[n] for n in model.kind.nominal if n in model.values
+              and model.values[n] != model.kind.nominal[n]}, **{n: complete[n] for n in base}}
+    design = {n: own[n] for n in model.list_names() if n in own}
+    return replace(model, values=complete, design=design)
+
+
+def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
+                        hidden: Mapping[str, tuple[float, float, float]]) -> tuple[tuple[Estimate, ...], Floats]:
+    """The free parameters with their intervals, and the correlation matrix of them; hidden ones have no correlation."""
+    free = fit.free
+    names = [f.name for f in free]
+    values = dict(zip(names, compute_values(free, fit.x).tolist(), strict=True))
+    slopes = np.zeros((len(ranges), len(free)))  # of the logarithm, or of the value, by scaled unknowns
+    for i, r in enumerate(ranges):
+        if r.name in names:
+            k = names.index(r.name)
+            slopes[i, k] = free[k].scale
+            if isinstance(free[k], LogFrictionRatio):
+                dynamic = names.index(r.name.replace("static", "dynamic"))
+                slopes[i, dynamic] = free[dynamic].scale
+    covariance = slopes @ fit.covariance @ slopes.T
+    spread = np.sqrt(np.diag(covariance))
+    found = []
+    for i, r in enumerate(ranges):
+        if r.name in hidden:
+            value, low, high = hidden[r.name]
+            found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, False, 1.0))
+            continue
+        value = values[r.name]
+        factor, systematic = IDENTIFIED_INTERVAL_FACTOR * float(spread[i]), get_systematic_sd(r.name)
+        if not r.is_relative:
+            systematic *= abs(value)
+        half = INTERVAL_95_SD * float(np.hypot(factor, systematic))
+        low, high = (value * np.exp(-half), value * np.exp(half)) if r.is_relative else (value - half, value + half)
+        low, high = max(float(low), r.low), min(float(high), r.high)
+        share = half / r.half_width
+        seen = share <= IDENTIFIABLE_SHARE
+        found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, seen, min(share, 1.0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.nan_to_num(covariance / np.outer(spread, spread))
+    return tuple(found), correlation
+
+
+def list_correlations(estimates: Sequence[Estimate], matrix: Floats, least: float = 0.9) -> tuple[Correlation, ...]:
+    """The pairs of parameters, but for hidden ones, that go together by at least so much."""
+    pairs = [Correlation(a.name, b.name, float(matrix[i, j])) for i, a in enumerate(estimates)
+             for j, b in enumerate(estimates[:i]) if abs(matrix[i, j]) >= least]
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair.value)))
+
+
+def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
+                   floor: Mapping[str, float]) -> tuple[tuple[RunError, ...], tuple[tuple[Floats, Floats], ...]]:
+    """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI."""
+    errors, residuals = [], []
+    for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
+        left = [_compute_residuals(m, trace) for m in (before, after)]
+        first, last = ({s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left)
+        typical = dict(zip(trace.outputs, compute_typical_rms(left[1]).tolist(), strict=True))
+        own = {s: floor[s] for s in trace.outputs}
+        errors.append(RunError(source, number >= fitted, first, last, typical, own))
+        residuals.append((left[0], left[1]))
+    return tuple(errors), tuple(residuals)
+
+
+def _compute_residuals(model: Model, trace: Trace) -> Floats:
+    noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
+    problem = Problem(silence_readings(model), trace, noise, steps=LAST_STEPS)
+    none: tuple[Free, ...] = ()
+    residuals: Floats = problem.compute_residuals(none, np.empty((1, 0)))[0]
+    return residuals
+
+
+def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) -> tuple[str, str]:
+    """The verdict, and the reason for any but IDENTIFIED."""
+    worse = [e for e in errors if any(e.typical[s] > RESIDUAL_HELD_OUT * e.floor[s] for s in e.typical)
+             or e.ratio > RESIDUAL_WORST]
+    if worse:
+        worst = max(worse, key=lambda e: e.ratio)
+        kind = "held-out run" if worst.is_held_out else "run"
+        left = f"{worst.ratio:.3g} noise floors of the {kind} {worst.source.file}"
+        return "UNEXPLAINED", f"the best parameters leave {left}"
+    unseen = [e.name for e in estimates if not e.is_identifiable]
+    if len(unseen) == len(estimates):
+        return "CANNOT_TELL", "these runs show none of the free parameters"
+    if unseen:
+        return "PARTLY", f"these runs do not show {len(unseen)} of {len(estimates)} free parameters"
+    return "IDENTIFIED", ""
+
+
+def _moves(trace: Trace) -> bool:
+    return float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) >= MOVING_RAM
+
+
+def _collect_notes(runs: Sequence[Trace], sources: Sequence[Source]) -> list[str]:
+    return [f"{source.file}: {note}" for trace, source in zip(runs, sources, strict=True) for note in trace.notes]
+
+
+def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
+                  floor: Mapping[str, float], reason: str, notes: Sequence[str]) -> Identification:
+    """The answer where no run to fit moves the ram."""
+    estimates = tuple(Estimate(r.name, r.unit, model[r.name], r.low, r.high, r.centre, r.low, r.high, False, 1.0)
+                      for r in ranges)
+    errors, residuals = measure_errors(model, model, runs, sources, fitted, floor)
+    problem = make_problem(model, runs[:1], floor, 1)
+    free = list_unknowns(model, tuple(ranges))
+    advice = advise_experiments(model, free, problem, None, [r.name for r in ranges])
+    return Identification("CANNOT_TELL", reason, model, model, estimates, None, (), tuple(advice), errors, floor,
+                          tuple(runs), residuals, tuple(sources), tuple(notes))

@@ -1,0 +1,1 @@
+"""Trials of `rig identify` on actuators of another size, simulated in C."""

@@ -1,0 +1,192 @@
+"""`rig identify`: an actuator of twice the size, what its runs do not show, and inputs that cannot be used."""
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdi.discovery.model_file import read_provenance
+from fdi.identification.closed_form import estimate_by_regressions
+from fdi.identification.controller import read_controller
+from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
+from fdi.identification.identify import Identification, identify_model
+from fdi.identification.model_text import write_identified_model
+from fdi.identification.runs import collect_identification_runs
+from fdi.report.identify_report import build_identification_report
+from fdi.report.terminal import print_report
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from plant.model import Model, load_model
+from rig.cli.main import main
+from rig.studies.identification.actuators import draw_actuator
+from rig.studies.trial.truth import SYMBOLS, has_compiler, simulate_truth
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="no gcc for the independent simulator")
+
+FREE = {"valve": {"flow_gain": 6.0}, "supply": {"pressure": 3.0}, "jack": {"area": 5.0, "mass": 8.0, "travel": 6.0}}
+SIZED = ("AJ", "XJM", "GQ", "PSR", "MJ", "GAP")  # what differs from nominal in these tests, beside no scatter
+MM = 1e-3
+
+
+def draw_plant() -> dict[str, float]:
+    drawn = draw_actuator(5, scatter=0.0)
+    return {symbol: drawn[symbol] for symbol in SIZED}
+
+
+def measure(com: np.ndarray, load: np.ndarray, seed: int, name: str) -> Trace:
+    rng, n = np.random.default_rng(seed), len(com)
+    run = simulate_truth(com, draw_plant(), 2e-6 * rng.standard_normal(n), load)
+    noise = {"p12": 2e4 * rng.standard_normal(n), "xs": 1e-6 * rng.standard_normal(n)}
+    columns = run._asdict() | {"p12": run.p12 + noise["p12"], "xs": run.xs + noise["xs"]}
+    return Trace.from_columns(columns, 1e-3, {"source": name})
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Trace, Trace, Trace]:
+    """Without load; against both end stops with a known load; held out."""
+    t = np.arange(2500) * 1e-3
+    wave = np.where(t < 0.3, 0.0, 4 * MM * np.sin(2 * np.pi * (t + t**2)))
+    stop = 1.05 * draw_plant()["XJM"]
+    stops = np.repeat([0.0, stop, -stop, 0.0], [200, 1400, 2000, 400])
+    load = np.where((np.arange(4000) > 600) & (np.arange(4000) < 2600), 6e3, 0.0)
+    last = np.repeat([0.0, 3 * MM, -5 * MM, 1 * MM], [200, 600, 600, 600])
+    return (measure(wave, np.zeros(2500), 1, "wave"), measure(stops, load, 2, "stops"),
+            measure(last, np.where(np.arange(2000) > 900, -4e3, 0.0), 3, "held"))
+
+
+def identify(fitted: list[Trace], held_out: list[Trace], free: object = FREE) -> Identification:
+    model = load_model()
+    ranges = parse_free_parameters(free, model, "test")
+    own = collect_identification_runs(model, ranges, fitted, held_out)
+    return identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+
+
+@pytest.fixture(scope="module")
+def found(runs: tuple[Trace, Trace, Trace]) -> Identification:
+    return identify(list(runs[:2]), [runs[2]])
+
+
+def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None:
+    truth = {SYMBOLS[symbol]: value for symbol, value in draw_plant().items()}
+    assert found.verdict == "IDENTIFIED", found.reason
+    assert all(e.low <= truth[e.name] <= e.high for e in found.estimates)
+    assert all((e.high - e.low) < 0.1 * e.value for e in found.estimates)
+    assert max(e.ratio for e in found.holdouts) <= 1.1
+    assert max(e.before["p12"] / e.floor["p12"] for e in found.holdouts) > 5.0
+    assert found.model["controller.proportional_gain"] == pytest.approx(draw_plant()["GAP"], rel=1e-5)
+
+
+def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace], tmp_path: Path,
+                                             capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.toml"
+    write_identified_model(replace(found, model=replace(found.model, name="mine")), path, "rig identify", "2026-01-01")
+    model = load_model(path)
+    assert model == replace(found.model, name="mine")
+    assert model.nominal["jack.area"] == found.model["jack.area"]
+    origin = read_provenance(path).identification
+    assert origin is not None and origin["runs"] == ["wave", "stops"] and origin["holdouts"] == ["held"]
+    assert "95 %" in path.read_text()
+    runs[2].write_csv(tmp_path / "held.csv")
+    assert main(["compare", str(tmp_path / "held.csv"), "--model", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "WITHIN_FLOOR"
+    assert main(["fdi", str(tmp_path / "held.csv"), "--model", str(path), "--json"]) in (0, 1)
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"] == "ACCEPTABLE"
+    assert any("no bands" in note for note in answer["notes"])
+
+
+def test_report_shows_every_parameter_and_run(found: Identification, capsys: pytest.CaptureFixture[str]) -> None:
+    from rich.console import Console
+
+    report = build_identification_report(found, "eha", "rig identify")
+    print_report(report, Console(width=100))
+    text = capsys.readouterr().out
+    assert all(e.name in text for e in found.estimates)
+    assert set(report.data["parameters"]) == {e.name for e in found.estimates}
+    assert [run["held_out"] for run in report.data["runs"]] == [False, False, True]
+
+
+def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
+    found = identify([runs[0]], [], {"jack": {"area": 5.0, "mass": 8.0, "static_friction": 8.0,
+                                               "dynamic_friction": 8.0, "damping": 8.0, "leakage": 10.0},
+                                     "valve": {"flow_gain": 6.0}})
+    area = next(e for e in found.estimates if e.name == "jack.area")
+    assert found.verdict in ("PARTLY", "CANNOT_TELL")
+    assert not area.is_identifiable and area.high / area.low > 3.0
+    assert {a.parameter: a.experiment for a in found.advice}["jack.area"] == "load"
+
+
+def test_run_at_rest_identifies_nothing() -> None:
+    still = measure(np.zeros(800), np.zeros(800), 4, "still")
+    found = identify([still], [])
+    assert found.verdict == "CANNOT_TELL" and "at rest" in found.reason
+    assert not any(e.is_identifiable for e in found.estimates)
+    assert found.model == load_model()
+    assert {a.parameter for a in found.advice} == {e.name for e in found.estimates}
+
+
+def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) -> None:
+    model = load_model()
+    own = collect_identification_runs(model, parse_free_parameters(FREE, model, "test"), runs[:2], [])
+    begun, truth = estimate_by_regressions(own.fitted, model), draw_plant()
+    for name, symbol in (("jack.area", "AJ"), ("valve.flow_gain", "GQ"), ("jack.travel", "XJM")):
+        assert begun[name] == pytest.approx(truth[symbol], rel=0.15), name
+    gains = read_controller(own.fitted)
+    assert gains is not None and gains.is_proportional
+    assert gains.limit == pytest.approx(model["controller.current_limit"])
+
+
+def test_controller_of_another_law_is_left_alone(runs: tuple[Trace, Trace, Trace]) -> None:
+    lagged = np.convolve(runs[0].cor, np.full(40, 1.0 / 40.0))[:len(runs[0])]
+    gains = read_controller([replace(runs[0], cor=lagged)])
+    assert gains is not None and not gains.is_proportional and not gains.values
+
+
+@pytest.mark.parametrize(("table", "field"), [
+    ({"jack": {"area": 0.5}}, "identify.jack.area"), ({"jack": {"area": [2.0, 1.0]}}, "identify.jack.area"),
+    ({"jack": {"area": "wide"}}, "identify.jack.area"), ({"filter": {"clogging": 3}}, "identify.filter.clogging"),
+    ({"jack": 4}, "identify.jack"), ({"jack": {"aera": 4}}, "jack.aera"), ({}, "identify"), (4, "identify"),
+    ({"jack": {"area": [0.0, 1.0]}}, "identify.jack.area"), ({"null_bias": {"current": [-1e-4, 1e-4]}}, "null_bias")])
+def test_ranges_that_cannot_be_are_refused(table: object, field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_free_parameters(table, load_model(), "m.toml")
+    assert field in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_ranges_of_a_model_file(tmp_path: Path) -> None:
+    path = tmp_path / "sheet.toml"
+    path.write_text("[jack]\narea = 3e-3\n[identify.jack]\narea = 1.5\nleakage = [1e-13, 1e-11]\n")
+    model = load_model(path)
+    area, leakage = read_free_parameters(model, path)
+    assert (area.centre, area.low, area.high) == pytest.approx((3e-3, 2e-3, 4.5e-3))
+    assert (leakage.low, leakage.high) == (1e-13, 1e-11)
+    assert len(read_free_parameters(load_model(), None)) > 10
+
+
+def test_design_survives_the_model_file(tmp_path: Path) -> None:
+    sized = replace(Model(), values={**Model().values, "jack.area": 3e-3}, design={"jack.area": 3e-3})
+    changed = sized.replace({"jack.mass": 150.0, "null_bias.current": 5e-5})
+    path = tmp_path / "m.toml"
+    path.write_text(changed.to_toml())
+    again = load_model(path)
+    assert again.values == changed.values and again.design == sized.design
+    path.write_text("design = 3\n")
+    with pytest.raises(InputError, match="design"):
+        load_model(path)
+
+
+def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
+                                  capsys: pytest.CaptureFixture[str]) -> None:
+    model = load_model()
+    ranges = parse_free_parameters(FREE, model, "test")
+    with pytest.raises(InputError, match="--holdout"):
+        collect_identification_runs(model, ranges, [runs[0]], [runs[0]])
+    with pytest.raises(InputError, match="other runs"):
+        collect_identification_runs(model, ranges, [runs[0], runs[0]], [])
+    with pytest.raises(InputError, match="--signals"):
+        collect_identification_runs(model, ranges, [runs[0]], [], ["speed"])
+    assert main(["identify", str(tmp_path / "none.csv")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
