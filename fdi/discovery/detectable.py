@@ -103,7 +103,7 @@ def _list_directions(effect: str, model: Model, linear: Mapping[str, float]) -> 
     """One for each sign of the first parameter."""
     entry = CATALOGUE[effect]
     first = entry.fitted[0]
-    off = entry.off.get(first, model.kind.nominal.get(first, 0.0))
+    off = entry.off.get(first, model.nominal.get(first, 0.0))
     found: dict[bool, Direction] = {}
     for start in entry.starts:
         reach = start[first] - off
@@ -261,7 +261,7 @@ class _VirtualTest:
         for way, size in zip(ways, sizes, strict=True):
             entry, at = CATALOGUE[way.effect], {}
             for name, start in way.start.items():
-                off = entry.off.get(name, model.kind.nominal.get(name, 0.0))
+                off = entry.off.get(name, model.nominal.get(name, 0.0))
                 moved = values[name] + (start - off) * size / way.reach
                 at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
             rows.append([at.get(name, values[name]) for name in names])
