@@ -2,12 +2,13 @@
 
     python tests/robustness/attribution_trials.py --trials 100 --out trials
     python tests/robustness/attribution_trials.py --trials 100 --mixed --out trials
+    python tests/robustness/attribution_trials.py --trials 100 --mixed --pace lockstep --out trials
 
 Each trial is one `rig run` on the UDP bus with plant and controller as processes of their own. At a random cycle one of
 the three processes is stopped (SIGSTOP) for 2, 10 or 50 ms, or one of the nodes is killed (SIGKILL). A stall of the rig
 or of the plant must never be held against the controller; a killed node must be named, and its run must end within 2 s.
 The table has a line per case: the verdicts, whom the first cause names, and how many trials were attributed wrongly.
-With `--mixed` the three processes are stopped by turns in real time, each time for one of the three times at random,
+With `--mixed` the three processes are stopped by turns in one pace, each time for one of the three times at random,
 and the table has a line per process. A trial that came too late, after the run, is repeated.
 """
 from __future__ import annotations
@@ -164,14 +165,14 @@ def format_case(case: object, trials: list[Trial]) -> str:
             f"{longest:.2f} s, exit {last:.2f} s")
 
 
-def run_mixed(trials: int, folder: Path, group: str) -> Iterator[Trial]:
-    """Stop the three processes by turns in real time, for times at random, and print a line per process at the end."""
+def run_mixed(trials: int, pace: str, folder: Path, group: str) -> Iterator[Trial]:
+    """Stop the three processes by turns, for times at random, and print a line per process at the end."""
     sequence = folder / "stall.toml"
     sequence.write_text(SEQUENCE)
     done: dict[str, list[Trial]] = {process: [] for process in PROCESSES}
     for number, process in product(range(trials), PROCESSES):
         stall = random.Random(f"{process} {number}").choice((0.002, 0.010, 0.050))
-        case = Case("realtime", process, stall)
+        case = Case(pace, process, stall)
         for attempt in range(3):
             trial = run_trial(case, number + attempt * trials, sequence, folder, group)
             if trial.seconds > 0:
@@ -181,7 +182,7 @@ def run_mixed(trials: int, folder: Path, group: str) -> Iterator[Trial]:
             print(f"    {case}: {trial.verdict} after {trial.seconds:.2f} s: {trial.text}", flush=True)
         yield trial
     for process, group_of_trials in done.items():
-        print(format_case(f"realtime, {process} stopped for 2, 10 or 50 ms", group_of_trials), flush=True)
+        print(format_case(f"{pace}, {process} stopped for 2, 10 or 50 ms", group_of_trials), flush=True)
 
 
 def run_cases(cases: list[Case], trials: int, folder: Path, group: str) -> Iterator[Trial]:
@@ -202,6 +203,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--trials", type=int, default=3, help="trials per case (default 3)")
     parser.add_argument("--mixed", action="store_true", help="stop the processes by turns for times at random")
+    parser.add_argument("--pace", choices=("realtime", "lockstep"), default="realtime", help="of --mixed")
     parser.add_argument("--case", default="", help="only the cases whose description has these words")
     parser.add_argument("--group", default="239.74.163.200", help="multicast group of the bus")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: a temporary one)")
@@ -210,7 +212,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = args.out or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        runs = (run_mixed(args.trials, folder, args.group) if args.mixed
+        runs = (run_mixed(args.trials, args.pace, folder, args.group) if args.mixed
                 else run_cases(cases, args.trials, folder, args.group))
         wrong = [trial.is_wrong for trial in runs]
     print(f"{sum(wrong)} of {len(wrong)} trials attributed wrongly")
