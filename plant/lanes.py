@@ -29,6 +29,7 @@ from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
 from plant.flat import list_state_values, make_lane_packers
 from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
+from plant.part import Part
 from plant.plants import find_plant
 from plant.ports import at_reading
 from plant.state import Input
@@ -41,6 +42,15 @@ FEW = 6  # effects that a model may have and still get one kernel for all its ru
 WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
 # two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
 NARROW, WIDE = 16, 32
+TURN = 20_000  # samples that a kernel makes in one call
+
+
+class Block(NamedTuple):
+    """Runs side by side: the kernel, the buffer at the start, and the row of the output for each lane."""
+
+    run: Function
+    buffer: Array
+    rows: NDArray[np.uint64]
 
 
 class Lanes:
@@ -56,7 +66,7 @@ class Lanes:
         self._rungs = list_kernel_variants(model)
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
-               anchor: float = 0.0) -> Array:
+               anchor: float = 0.0, parts: Sequence[Part] = ()) -> Array:
         """The plant without its controller, driven by a measured current.
 
         Args:
@@ -65,6 +75,7 @@ class Lanes:
             load: (n,) N, external force on the ram, positive against extension.
             position: (n,) m, measured, NaN where missing: runs start at rest where it shows position[0].
             anchor: 1/s, how fast the ram is pulled to the measured position; 0 is a free run.
+            parts: pieces of a longer recording that the rows consist of: each begins anew; none: one piece.
 
         Returns:
             (m, n, 3): XJ as sensed m, P12 Pa, XS m at each sample, without noise; `[..., i]` has contiguous rows.
@@ -73,7 +84,30 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         where = np.empty(0) if position is None else position
-        return self._run(values, current, load, where, anchor, False)
+        return self._run(values, current, load, where, anchor, False, parts)
+
+    def replay_in_turns(self, values: Array, current: Array, load: Array, position: Array | None = None,
+                        anchor: float = 0.0, rows: int = TURN) -> Iterator[tuple[int, Array]]:
+        """The same replay, so many `rows` at a time: the first row of each piece, and its (m, k, 3).
+
+        Memory does not grow with the recording. The numbers are those of `replay`, to the last bit.
+
+        Raises:
+            InputError: shapes that do not fit.
+        """
+        where = np.empty(0) if position is None else position
+        values, driven, load, where = self._check(values, current, load, where)
+        work = self._make_blocks(values)
+        inputs = driven, load, where, float(anchor), False, float(self.model["controller.period"]), self.steps
+        for first in range(0, len(driven), rows):
+            stop = min(first + rows, len(driven))
+            out = np.empty((len(values) + 1, 3, stop - first))
+
+            def go_on(block: Block, first: int = first, stop: int = stop, out: Array = out) -> None:
+                block.run(block.buffer, *inputs, first, stop, first, 0, first == 0, block.rows, out)
+
+            map_in_threads(go_on, work, self.workers)
+            yield first, out[:-1].transpose(0, 2, 1)
 
     def closed_loop(self, values: Array, com: Array, load: Array) -> Array:
         """The plant with its own controller over a command.
@@ -91,24 +125,40 @@ class Lanes:
         """
         return self._run(values, com, load, np.empty(0), 0.0, True)
 
-    def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool) -> Array:
+    def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
+             parts: Sequence[Part] = ()) -> Array:
+        values, driven, load, position = self._check(values, driven, load, position)
+        out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
+        inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
+        work = [(block, part) for block in self._make_blocks(values) for part in parts or (Part(0, len(driven), 0),)]
+
+        def do(task: tuple[Block, Part]) -> None:
+            block, part = task
+            buffer = block.buffer.copy() if parts else block.buffer
+            for first in range(part.first, part.stop, TURN):  # so that Ctrl-C is heard in between
+                stop = min(first + TURN, part.stop)
+                block.run(buffer, *inputs, first, stop, 0, part.later, first == part.first, block.rows, out)
+
+        map_in_threads(do, work, self.workers)
+        return out[:-1].transpose(0, 2, 1)
+
+    def _check(self, values: Array, driven: Array, load: Array, position: Array) -> tuple[Array, Array, Array, Array]:
+        """The inputs of runs as contiguous arrays.
+
+        Raises:
+            InputError: shapes that do not fit.
+        """
         values, driven, load, position = (np.ascontiguousarray(x, float) for x in (values, driven, load, position))
         if values.ndim != 2 or values.shape[1] != len(self.names):
             raise InputError("lanes", "values", f"one row a run of {len(self.names)} values, not shape {values.shape}")
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")
-        out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
-        inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
-        work = [(run, buffer, rows) for rung, members in self._assign_runs(values)
-                for run, buffer, rows in rung.build_blocks(self.names, values, members)]
+        return values, driven, load, position
 
-        def do(task: tuple[Function, Array, NDArray[np.uint64]]) -> None:
-            run, buffer, rows = task
-            run(buffer, *inputs, rows, out)
-
-        map_in_threads(do, work, self.workers)
-        return out[:-1].transpose(0, 2, 1)
+    def _make_blocks(self, values: Array) -> list[Block]:
+        return [block for rung, members in self._assign_runs(values)
+                for block in rung.build_blocks(self.names, values, members)]
 
     def _assign_runs(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones."""
@@ -144,9 +194,8 @@ class KernelVariant:
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
 
-    def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]
-               ) -> Iterator[tuple[Function, Array, NDArray[np.uint64]]]:
-        """The runs `members` in blocks: the kernel, the buffer at the start, and the row of the output for each lane.
+    def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]) -> Iterator[Block]:
+        """The runs `members` in blocks.
 
         Idle lanes repeat the last run; their rows come after all others.
         """
@@ -166,7 +215,7 @@ class KernelVariant:
                     place = buffer[plan.parameters + self._names.index(name)]
                     place[:len(lanes)], place[len(lanes):] = values[lanes, column], values[lanes[-1], column]
             rows = np.r_[lanes, np.full(width - len(lanes), len(values))]
-            yield run, buffer.reshape(-1), rows.astype(np.uint64)  # unsigned: no test for counting from the end
+            yield Block(run, buffer.reshape(-1), rows.astype(np.uint64))  # unsigned: no test for counting from the end
 
 
 def list_kernel_variants(model: Model) -> list[KernelVariant]:
@@ -193,7 +242,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
         progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
         for run, buffer, rows in rung.build_blocks((), np.zeros((1, 0)), np.arange(1)):
             none = np.empty(0)
-            run(buffer, none, none, none, 0.0, False, 1.0, 1, rows, np.empty((2, 3, 0)))
+            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, np.empty((2, 3, 0)))
     progress("", 1.0)
 
 
@@ -259,8 +308,10 @@ def compile_block_kernel(plan: Layout) -> Function:
 
 
 def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
-        rows: Any, out: Any) -> None:
-    """Simulates a block of runs; fills out[rows[lane], :, k] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
+              first: int, stop: int, origin: int, later: int, begins: bool, rows: Any, out: Any) -> None:
+    """Simulates a block of runs over the samples k = first..stop-1.
+
+    Fills out[rows[lane], :, k - origin] = XJ as sensed, (Cor in closed loop,) P12, XS at sample k.
 
     Args:
         a: the block's buffer: state at the start and parameters in place, the rest zero. Used up.
@@ -271,21 +322,27 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
         closed: with the model's own controller.
         period: of a cycle, s.
         steps: steps a cycle.
+        first: the first sample.
+        stop: the sample after the last one.
+        origin: the sample of the first column of `out`.
+        later: samples by which the time is later than k says.
+        begins: lanes begin at rest at the first sample; else they go on from where the buffer left them.
         rows: (WIDTH,) where in `out` each lane goes.
         out: (m, 3 or 4, n), written.
     """
     h, columns = period / steps, out.shape[1]
-    for lane in range(WIDTH):
-        begin_lane(a, lane, position, steps, h)
-    for k in range(len(com)):
-        t = k * period
+    if begins:
+        for lane in range(WIDTH):
+            begin_lane(a, lane, position[first:], steps, h)
+    for k in range(first, stop):
+        t, column = (k + later) * period, k - origin
         for lane in range(WIDTH):
             row = rows[lane]
-            out[row, 0, k], out[row, columns - 2, k], out[row, columns - 1, k] = sample_lane(a, lane, t)
-        given = com[k - 1] if k else 0.0
+            out[row, 0, column], out[row, columns - 2, column], out[row, columns - 1, column] = sample_lane(a, lane, t)
+        given = com[k - 1] if k > first or not begins else 0.0
         for lane in range(WIDTH):
             if closed:
-                out[rows[lane], 1, k] = control_lane(a, lane, t, com[k], out[rows[lane], 0, k])
+                out[rows[lane], 1, column] = control_lane(a, lane, t, com[k], out[rows[lane], 0, column])
             else:
                 keep_drive(Drive(given, 0.0), a, lane)
         if len(position):

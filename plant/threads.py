@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+THREAD_NAME = "side_by_side"  # how the names of these threads begin
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -21,5 +22,11 @@ def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> li
     work = list(items)
     if min(workers, len(work)) < 2:
         return [do(item) for item in work]
-    with ThreadPoolExecutor(min(workers, len(work))) as pool:
-        return list(pool.map(do, work))
+    pool = ThreadPoolExecutor(min(workers, len(work)), THREAD_NAME)
+    try:
+        found = list(pool.map(do, work))
+    except BaseException:  # Ctrl-C: nobody waits for what is still at work
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
+    return found

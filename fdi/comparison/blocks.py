@@ -178,11 +178,14 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
 def _measure_remainders(y: Floats, columns: list[Floats], first: int
                         ) -> tuple[float, tuple[float, float, float, float]]:
     """RMS of y, and of what the `first` columns, the others, the first of the others, and all of them leave of it."""
-    z = np.column_stack([*columns, y])
-    size = np.sqrt((z**2).mean(axis=0))
-    z = z / np.where(size > 0.0, size, 1.0)
-    # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
-    gram = np.einsum("ki,kj->ij", z, z) / len(y)
+    every = [*columns, y]
+    size = np.sqrt([np.mean(c**2) for c in every])
+    scale, gram = np.where(size > 0.0, size, 1.0), np.zeros((len(every), len(every)))
+    rows = 100_000  # at a time
+    for k in range(0, len(y), rows):
+        z = np.column_stack([c[k:k + rows] for c in every]) / scale
+        # not z.T @ z, here and elsewhere: the threads of BLAS wait for a busy core, and 1 ms becomes 0.9 s
+        gram += np.einsum("ki,kj->ij", z, z) / len(y)
 
     def measure_remainder(pick: slice) -> float:
         inverse = np.linalg.pinv(gram[pick, pick], rcond=1e-9, hermitian=True)
@@ -355,13 +358,15 @@ def measure_resolution(x: Floats) -> float:
     return float(np.sqrt(np.mean(np.maximum(steps, 10.0**-places) ** 2)))
 
 
-def find_lags(trace: Trace, limit: float) -> tuple[int, int, float]:
+def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int, int, float]:
     """Trace that Com and XJ are late in Cor = g (Com - XJ), the two that fit best; and the gain g, A/m."""
     inside = trace.usable & (np.abs(trace.cor) < 0.98 * min(limit, float(np.abs(trace.cor).max())))
     inside[:max(LAGS)], inside[min(LAGS):] = False, False
     xj = hold_last(trace.xj)
-    columns = [shift_rows(x, lag)[inside] for x in (trace.com, xj) for lag in LAGS]
-    whole = np.column_stack([*columns, trace.cor[inside]])
+    rows = np.flatnonzero(inside)
+    rows = rows[::max(1, len(rows) // most_rows)]
+    columns = [x[rows - lag] for x in (trace.com, xj) for lag in LAGS]
+    whole = np.column_stack([*columns, trace.cor[rows]])
     gram = np.einsum("ki,kj->ij", whole, whole)
     n, target = len(LAGS), gram[-1, -1]
     best = (math.inf, 0, 0, math.nan)

@@ -261,9 +261,24 @@ def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
 
     With numpy: scipy.signal has the same and takes 1 s to import, a third of the time that the whole command has.
     """
+    piece = 1 << 17  # rows; the transform of a long recording would take its memory ten times
+    if len(x) > piece:
+        padded = np.concatenate([np.zeros(-first), x, np.zeros(last)])
+        sums = np.zeros(last - first + 1)
+        for k in range(0, len(y), piece):
+            sums += _correlate_piece(padded[k:k + piece + last - first], y[k:k + piece], last - first)
+        return sums
     n = len(x) + len(y)
     whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
     out: Floats = whole[np.arange(first, last + 1) % n]
+    return out
+
+
+def _correlate_piece(x: Floats, y: Floats, last: int) -> Floats:
+    """Sums of x_{k + lag} y_k for lags 0..last."""
+    n = 1 << int(len(x) + last).bit_length()
+    whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
+    out: Floats = whole[:last + 1]
     return out
 
 

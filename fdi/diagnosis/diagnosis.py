@@ -21,8 +21,17 @@ from fdi.diagnosis.bands import (
 from fdi.diagnosis.bands_file import load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
 from fdi.diagnosis.precursors import Precursor, measure_precursors
-from fdi.diagnosis.refine import COARSE_STARTS, LARGEST_FSS, LARGEST_KINTAS, Refinement, get_positive, refine_sizes
+from fdi.diagnosis.refine import (
+    COARSE_STARTS,
+    LARGEST_FSS,
+    LARGEST_KINTAS,
+    Refinement,
+    choose_size_excerpt,
+    get_positive,
+    refine_sizes,
+)
 from fdi.diagnosis.rms_grid import Grid, search_grid
+from fdi.estimation.excerpt import cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
@@ -111,10 +120,15 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         notes += band_verdict.notes
     precursors = measure_precursors(trace, bands)
     progress("grid", 0.5)
-    grid = _search_grid(trace, model, notes)
-    progress("refinement", 0.75)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
-    refinement = refine_sizes(model, trace, (*_list_starts(grid), *COARSE_STARTS), floor, workers)
+    fitted = trace
+    if is_long(trace):
+        excerpt = choose_size_excerpt(model, trace, floor, progress)
+        fitted = cut_excerpt(trace, excerpt)
+        notes.append(excerpt.describe(trace))
+    grid = _search_grid(fitted, model, notes)
+    progress("refinement", 0.75)
+    refinement = refine_sizes(model, fitted, (*_list_starts(grid), *COARSE_STARTS), floor, workers, whole=trace)
     sizes = _widen_intervals(refinement)
     levels = _judge_sizes(sizes, refinement)
     progress("done", 1.0)

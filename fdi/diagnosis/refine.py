@@ -21,16 +21,20 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
+from fdi.estimation.excerpt import Excerpt, choose_excerpt
 from fdi.estimation.final_rounds import descend_valley, guess_covariance
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.judgement import judge_on_all
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, span_all_rows
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
 from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import all_unknowns, effect_unknowns, silence_readings
+from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
     INTERVAL_95_SD,
+    RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
     RESIDUAL_IS_NOISE,
     RESIDUAL_WORST,
@@ -148,6 +152,7 @@ class Refinement:
     floor: Mapping[str, float]  # RMS noise by signal, SI
     simulations: int
     method: str = "least squares"
+    everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -159,6 +164,7 @@ class Refinement:
         """Whether only noise is left, except for a few stops of the ram that the model makes or misses."""
         usual = compute_typical_rms(self.fit.residuals)
         near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
+        near &= all(ratio <= RESIDUAL_HELD_OUT for ratio in self.everywhere.values())
         return near and max(self.ratio.values()) <= RESIDUAL_WORST
 
 
@@ -182,8 +188,19 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
     return CountedProblem(ready, trace, noise, workers=workers)
 
 
+def choose_size_excerpt(model: Model, trace: Trace, floor: Mapping[str, float], progress: Progress = ignore_progress
+                        ) -> Excerpt:
+    """The part of a long recording that says most about the faults, the suspects and the tolerances."""
+    problem = make_problem(model, trace, floor)
+    sliding = FRICTION.middle / STATIC_OVER_DYNAMIC
+    changes = [{CLOGGING.parameter: CLOGGING.middle},
+               {FRICTION.parameter: FRICTION.middle, "spool.dynamic_friction": sliding},
+               *({f.name: f.value(1.0)} for f in (_make_suspect(s, model) for s in SUSPECTS))]
+    return choose_excerpt(trace, problem.model, floor, changes, progress)
+
+
 def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
-                 floor: Mapping[str, float] | None = None, workers: int = 2) -> Refinement:
+                 floor: Mapping[str, float] | None = None, workers: int = 2, whole: Trace | None = None) -> Refinement:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
@@ -192,12 +209,17 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float
         starts: (Kintas, FSS in N) each.
         floor: RMS noise by signal, SI; default the model's sensors.
         workers: threads.
+        whole: the recording that `trace` was cut from: the fit is judged on it.
     """
     problem = make_problem(model, trace, floor, workers)
     free = list_unknowns(model)
     first = _fit_coarsely(problem, free, starts)
     problem = _learn_noise(problem, first)
-    return _report_fit(_fit_finely(problem, first), problem)
+    found = _report_fit(last := _fit_finely(problem, first), problem)
+    if whole is None or whole is trace:
+        return found
+    judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
+    return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
 
 
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
@@ -327,8 +349,12 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
     The mean pressure carries the load.
     """
     trace, p = problem.trace, problem.model.values
-    x = trace.xj[~np.isnan(trace.xj)]
-    speed = (x[-1] - x[0]) / (len(trace) * p["controller.period"])
+    way = 0.0
+    for part in trace.parts or (span_all_rows(trace),):
+        x = trace.xj[part.first:part.stop]
+        x = x[~np.isnan(x)]
+        way += float(x[-1] - x[0])
+    speed = way / (len(trace) * p["controller.period"])
     per_speed = p["jack.area"] / p["valve.flow_gain"] * p["feedback_spring.stiffness"] / p["torque_motor.gain"]
     found = {"null_bias.current": per_speed * speed - float(trace.cor.mean())}
     if "p12" in trace.outputs:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.trace.signals import OUTPUTS
+from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
 
@@ -64,17 +65,29 @@ def compute_balances(search: Search, h: Hypothesis) -> tuple[list[Balance], Stat
     level = [search.estimate_floor(h).get(s, 0.0) for s in OUTPUTS]
     rng = np.random.default_rng(0)
     draws = 4  # simulated runs without anything missing
+    kept = find_smooth_rows(trace)
     noisy = [_compute_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load,
                             values, period) for _ in range(draws)]
     found = []
     for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
-        missing = seen[place] - own[place]
-        noise = float(np.sqrt(np.mean([_mean_square(n[place] - own[place]) for n in noisy])))
+        missing = (seen[place] - own[place])[kept]
+        noise = float(np.sqrt(np.mean([_mean_square((n[place] - own[place])[kept]) for n in noisy])))
         rms = float(np.sqrt(_mean_square(missing)))
         found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0))
-    states = States(replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW),
+    states = (replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW),
                     _measure_speed(measured[0], period), measured[1], measured[2], before, trace.t)
-    return sorted(found, key=lambda b: -b.ratio), states
+    return sorted(found, key=lambda b: -b.ratio), States(*(x[kept] for x in states))
+
+
+def find_smooth_rows(trace: Trace) -> NDArray[np.bool_]:
+    """All rows; of an excerpt those that smoothing does not carry across a joint, and that are compared at all."""
+    if not trace.parts:
+        return np.ones(len(trace), bool)
+    kept = trace.usable.copy()
+    for part in trace.parts:
+        kept[part.first:part.first + EDGE] = False
+        kept[part.stop - EDGE:part.stop] = False
+    return kept
 
 
 def _mean_square(x: Floats) -> float:

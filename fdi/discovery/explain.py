@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from fdi.discovery.detectable import Detectable, find_hidden_effects
 from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
-from fdi.discovery.search import Hypothesis, Search
+from fdi.discovery.search import Hypothesis, Search, WholeRuns
 from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.discovery.undecided import find_undecided_rows
+from fdi.estimation.excerpt import is_long
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -63,10 +64,12 @@ class Explanation:
     search: Search = field(repr=False)
     unseen: Mapping[tuple[str, ...], HeldOut] = field(default_factory=dict)  # of the best hypotheses
     hidden: tuple[Detectable, ...] = ()  # effects that tolerances make up for; none where more than noise is left
+    excerpt: str = ""  # which part of a long recording was fitted
 
 
 def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
-            progress: Progress = ignore_progress, workers: int | None = None) -> Explanation:
+            progress: Progress = ignore_progress, workers: int | None = None, whole: WholeRuns | None = None
+            ) -> Explanation:
     """The verdict on a model and a measured run.
 
     Args:
@@ -76,13 +79,15 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         holdout: a run of another command: it tells physics from luck.
         progress: called with each stage and the share done, 0 to 1.
         workers: threads; default one a core.
+        whole: the recordings that `est` and `repeats` were cut from, where they were: what is found is judged on them.
     """
-    controller, prints = find_firmware_marks(model, [est, *repeats])
-    tooth = find_quantisation(est)
+    controller, prints = find_firmware_marks(model, [whole.est, *whole.repeats] if whole else [est, *repeats])
+    tooth = find_quantisation(whole.est if whole else est)
     found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
     candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, workers)
+    search.whole = whole
     if tooth:
         search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
     progress("fitting the tolerances", 0.05)
@@ -189,6 +194,9 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
         search.refine_steps(finest_fit_steps, TRUEST)
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
+    base, *close = search.judge_on_all([base, *close], FINE)
+    if search.whole and close:
+        ledger = [base, *ledger[1:-1], close[0]]
     held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
     unseen = {h.effects: _judge_unseen_run(search, h, holdout, floor) for h in close} if holdout else {}
     holding = [h for h in close if not holdout or unseen[h.effects].holds]
@@ -295,4 +303,4 @@ def _compute_unseen_residuals(search: Search, h: Hypothesis, trace: Trace) -> Fl
 
 
 def _make_unseen_problem(search: Search, trace: Trace) -> Problem:
-    return replace(search.problem, trace=trace, steps=TRUEST, also=(), _lanes={})
+    return replace(search.problem, trace=trace, steps=FINE if is_long(trace) else TRUEST, also=(), _lanes={})

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ from fdi.discovery.candidates import Answer, assess_explanation
 from fdi.discovery.explain import Explanation, explain
 from fdi.discovery.refit import lean_model
 from fdi.discovery.runs import Runs
+from fdi.discovery.search import WholeRuns, choose_search_excerpt
+from fdi.estimation.excerpt import PIECE, can_be_cut, cut_excerpt, make_excerpt
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from plant.effects import CATALOGUE
@@ -41,12 +44,38 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
         InputError: a user's effect that cannot be compiled and run, or a file that cannot be written.
     """
     prepare_effects(runs, progress=progress)
-    explanation = explain(runs.model, runs.est, runs.repeats, runs.holdout, progress)
+    explanation = explain_recording(runs, progress)
     progress("writing the answer", 0.95)
     shape = look_for_pattern(explanation, effect_file)
     is_pattern_reported = shape is not None and explanation.verdict in PATTERN_VERDICTS
     pattern = str(shape) if is_pattern_reported else ""
     return assess_explanation(explanation, seed, pattern, discriminate(explanation)), shape
+
+
+def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:
+    """The verdict on the runs; of a long recording the part is fitted that says most, and the result is judged on all.
+
+    Where what holds on the part does not hold on all, the pieces that it leaves most of join the part, and the search
+    is made once more, `rounds` times in all at most.
+    """
+    if not can_be_cut(runs.est, runs.model):
+        return explain(runs.model, runs.est, runs.repeats, runs.holdout, progress)
+    searched = [e.name for e in list_searched_effects(runs.model.plant) if e.port not in UNREPLAYED]
+    excerpt = choose_search_excerpt(runs.model, runs.est, searched, progress)
+    whole = WholeRuns(runs.est, runs.repeats)
+    for _ in range(rounds):
+        est, *repeats = (cut_excerpt(run, excerpt) for run in (runs.est, *runs.repeats))
+        found = explain(runs.model, est, repeats, runs.holdout, progress, whole=whole)
+        said = found.ledger[-1]
+        more = None
+        if said.judgement is not None and not said.judgement.holds(found.floor):
+            more = said.judgement.find_worst_piece(found.floor, round(PIECE / runs.est.period), excerpt.pieces)
+        if more is None:
+            break
+        fitted, excerpt = excerpt, make_excerpt([*excerpt.pieces, more])
+    else:
+        excerpt = fitted
+    return replace(found, excerpt=excerpt.describe(runs.est))
 
 
 def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: Progress = ignore_progress) -> None:

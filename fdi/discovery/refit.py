@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from fdi.discovery.explain import measure_gain, measure_holdout
 from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
 from fdi.discovery.scan import Prospect, scan_effects
-from fdi.discovery.search import Hypothesis, Search
+from fdi.discovery.search import Hypothesis, Search, WholeRuns, choose_search_excerpt
+from fdi.estimation.excerpt import can_be_cut, cut_excerpt
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, linearise
 from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
@@ -56,6 +57,7 @@ class Refit:
     marks: Mapping[str, tuple[float, float, float]]  # parameters read off without noise: value, low, high
     floor: Mapping[str, float]
     search: Search
+    excerpt: str = ""  # which part of a long recording was fitted
 
     @property
     def last(self) -> Step:
@@ -98,8 +100,15 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     marks = _read_marks(original, effects, [est, *repeats])
     replayed = [e for e in effects if CATALOGUE[e].port not in UNREPLAYED]
     first = [e for e in effects[:done] if e in replayed]
+    whole, said = None, ""
+    if can_be_cut(est, original):
+        whole = WholeRuns(est, tuple(repeats))
+        excerpt = choose_search_excerpt(original, est, replayed, progress)
+        est, *repeats = (cut_excerpt(run, excerpt) for run in (est, *repeats))
+        said = excerpt.describe(whole.est)
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
                     workers)
+    search.whole = whole
     model = lean_model(search.model, replayed)
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
@@ -109,9 +118,9 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
         progress(f"adding {name}", 0.25 + 0.4 * number / (len(replayed) - len(first)))
         chain.append(_add_effect(search, chain[-1], name))
     progress("last fits, with finer steps", 0.65)
-    chain = _finish_chain(search, chain)
+    chain = search.judge_on_all(_finish_chain(search, chain), LAST_FIT_STEPS)
     steps = _list_steps(search, effects, done, chain, holdout)
-    return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search)
+    return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search, said)
 
 
 def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:

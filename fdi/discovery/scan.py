@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scaled_bounds
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scaled_bounds, span_all_rows
 from fdi.estimation.unidentifiable import list_powers, scale_together
 from fdi.estimation.unknowns import effect_unknowns
 from plant.effects import CATALOGUE
@@ -113,8 +113,10 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
     white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, at)))
-    answer = white[1] - white[0]
-    product = fit.white * answer
+    longest = max(problem.trace.parts or (span_all_rows(problem.trace),), key=lambda part: part.stop - part.first)
+    rows = slice(longest.first, longest.stop)  # a line has one phase within a piece alone
+    answer = (white[1] - white[0])[:, rows]
+    product = fit.white[:, rows] * answer
     period = problem.model.values["controller.period"]
     spectra = np.fft.rfft(product - product.mean(axis=1, keepdims=True), FINER * product.shape[1])
     hertz = np.fft.rfftfreq(FINER * product.shape[1], period)
@@ -122,11 +124,12 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     height = (_measure_prominence(np.abs(spectra), round(surroundings / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
     line = spectra.sum(axis=0) * 2.0 / max(float((answer**2).sum()), 1e-300)  # in sizes of the start
     found = []
+    before = 2.0 * np.pi * period * (longest.first + longest.later)  # s times 2 pi, from the clock's 0 to the piece
     distance = 1.0  # Hz, between lines
     for _ in range(LINES):
         k = int(np.argmax(height))
         found += [{size: still[size] * larger * float(np.abs(line[k])), named["Hz"]: float(hertz[k]),
-                   named["rad"]: float(np.angle(line[k])) + turn * np.pi}
+                   named["rad"]: float(np.angle(line[k])) + turn * np.pi - before * float(hertz[k])}
                   for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
         height[np.abs(hertz - hertz[k]) < distance] = 0.0
     return found

@@ -4,17 +4,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
+from fdi.estimation.excerpt import Excerpt, choose_excerpt
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
+from fdi.estimation.judgement import Judgement, judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import all_unknowns, complete_model, silence_readings
+from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
@@ -41,6 +45,7 @@ class Hypothesis:
     ratio: dict[str, float] = field(default_factory=dict)  # error that repeats, over the floor; 1 = only noise
     repeat_cost: float = 0.0
     others: tuple[Floats, ...] = ()  # residuals (s, n) on the repeats
+    judgement: Judgement | None = None  # on all of the recording, where the fit's run is cut from a longer one
 
     @property
     def is_at_floor(self) -> bool:
@@ -53,8 +58,26 @@ class Hypothesis:
         return self.fit.cost
 
 
+class WholeRuns(NamedTuple):
+    """The recordings that the runs of a search were cut from."""
+
+    est: Trace
+    repeats: tuple[Trace, ...]
+
+
+def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], progress: Progress = ignore_progress
+                          ) -> Excerpt:
+    """The part of a long recording that says most about the tolerances and these effects at a usual size."""
+    starts = [CATALOGUE[name].starts for name in effects]
+    changes = [each[len(each) // 2] for each in starts if each]
+    floor = {name: f.value for name, f in noises.sensor_floors(trace, model).items()}
+    return choose_excerpt(trace, complete_model(model), floor, changes, progress)
+
+
 class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
+
+    whole: WholeRuns | None = None  # None: the runs of the search are whole recordings
 
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
                  workers: int | None = None) -> None:
@@ -182,6 +205,27 @@ class Search:
         repeated = {s: float(np.sqrt(np.mean([_measure_rms(r, signals)[s] ** 2 for r in others]))) for s in signals}
         ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
+
+    def judge_on_all(self, hypotheses: Sequence[Hypothesis], steps: int) -> list[Hypothesis]:
+        """The hypotheses with their errors on all of the recordings that the runs were cut from.
+
+        Its ratio is that of all of the recording, or that of the part where it holds on all of the recording.
+        """
+        if self.whole is None:
+            return list(hypotheses)
+        floor = self.estimate_floor(hypotheses[-1])
+        fits = [h.fit for h in hypotheses]
+        runs = [judge_on_all(self.problem, fits, run, steps) for run in (self.whole.est, *self.whole.repeats)]
+        out = []
+        for h, own, *others in zip(hypotheses, *runs, strict=True):
+            errors = own.errors
+            repeated = {s: float(np.sqrt(np.mean([o.errors[s] ** 2 for o in others]))) for s in errors if others}
+            ratio = {s: min(x, errors[s] / floor[s]) for s, x in h.ratio.items()}
+            if not all(j.holds(floor) for j in (own, *others)):
+                left = [j.typical_ratio(floor) for j in (own, *others)]
+                ratio = {s: max(x, *(each[s] for each in left)) for s, x in h.ratio.items()}
+            out.append(replace(h, errors=errors, repeated=repeated, ratio=ratio, judgement=own))
+        return out
 
     def learn_noise(self, best: Hypothesis) -> None:
         """Take the noise from what differs between the runs under the best hypothesis."""

@@ -111,7 +111,7 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     r = refit_effects(runs.model, every, runs.est, runs.repeats, runs.holdout, progress, model.values, done)
     rows = [Row(s.effect, s.error, s.holdout) for s in r.steps]
     kept = list(known.ledger) if continues else []
-    notes = runs.notes
+    notes = (*runs.notes, *([r.excerpt] if r.excerpt else []))
     if known.ledger and not continues:
         notes = (*notes, "these are other runs than those of the ledger: it begins again")
     return _make_update(r, runs, known, every, [*kept, *rows[bool(kept):]], notes, command, added=tuple(effects))

@@ -6,6 +6,8 @@ drive and the model's forces. So no signal is predicted from itself.
 """
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from plant.lanes import Lanes
 
 Floats = NDArray[np.float64]
 
+SENSOR_MEMORY = 2000  # rows after which a sensor has forgotten what it was shown
 # the flow under given pressures; the preload is in the measured ones already
 GIVEN = {"pump.pressure_given": 1.0, "undissolved_air.preload": 0.0}
 
@@ -30,10 +33,30 @@ def replay_measured(lanes: Lanes, values: Floats, trace: Trace, current: Floats,
         position: (n,) m, to which the ram is pulled; None for a run from the middle.
         anchor: 1/s, how fast.
     """
-    out = lanes.replay(values, current, trace.load, position, anchor)
+    out = lanes.replay(values, current, trace.load, position, anchor, trace.parts)
     if not is_driven_by_pressure(trace, lanes):
         return out
     return np.concatenate([_replay_flow(lanes, values, trace, current, position, anchor), out[..., 1:]], axis=-1)
+
+
+def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats | None, anchor: float,
+                    rows: int = 20_000) -> Iterator[tuple[int, Floats]]:
+    """The same, as the sensors of the trace show it, so many `rows` at a time: the first row, and (m, k, 3).
+
+    Memory does not grow with the recording, unless the position is predicted from measured pressures.
+    """
+    if is_driven_by_pressure(trace, lanes):
+        whole = trace.pass_sensors(replay_measured(lanes, values, trace, trace.cor, position, anchor))
+        yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
+        return
+    before = np.empty((len(values), 0, 3))  # what a filtering sensor remembers
+    for first, out in lanes.replay_in_turns(values, trace.cor, trace.load, position, anchor, rows):
+        if not trace.sensors:
+            yield first, out
+            continue
+        known = np.concatenate([before, out], axis=1)
+        yield first, trace.pass_sensors(known)[:, before.shape[1]:]
+        before = known[:, -SENSOR_MEMORY:]
 
 
 def is_driven_by_pressure(trace: Trace, lanes: Lanes) -> bool:

@@ -20,6 +20,7 @@ from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model
+from plant.part import Part
 from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
@@ -125,14 +126,32 @@ class Problem:
         parts, start = [], 0
         for trace in (self.trace, *self.also):
             residuals = predicted[..., start:start + len(trace)] - trace.measurements
-            lines = mains_waves(len(trace), self.model.values["controller.period"])
-            parts.append(residuals - (np.nan_to_num(residuals) @ lines) @ lines.T)
+            period = self.model.values["controller.period"]
+            pieces = trace.parts or _cut_rows(len(trace))
+            parts += [remove_mains(residuals[..., p.first:p.stop], period) for p in pieces]
             start += len(trace)
-        return np.concatenate(parts, axis=-1) if self.also else parts[0]
+        return np.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
 
     def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
         return np.stack([n.whiten(residuals[:, i]) for i, n in enumerate(self.noise)], axis=1)
+
+
+def span_all_rows(trace: Trace) -> Part:
+    """All rows of a trace as its only part."""
+    return Part(0, len(trace), 0)
+
+
+def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
+    """All rows in pieces of at most so many: the lines of the mains keep their phase no longer."""
+    return [Part(first, min(first + most, rows), 0) for first in range(0, rows, most)]
+
+
+def remove_mains(residuals: Floats, period: float) -> Floats:
+    """Residuals (.., n) without the steady lines of the mains."""
+    lines = mains_waves(residuals.shape[-1], period)
+    left: Floats = residuals - (np.nan_to_num(residuals) @ lines) @ lines.T
+    return left
 
 
 @cache

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi.estimation.replay import measure_misfit
 from fdi.thresholds import SAME_COMMAND_POSITION
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from fdi.trace.trace import Trace, bridge_gaps, hold_last, hold_next
+from fdi.trace.trace import PER_ROW, Trace, bridge_gaps, hold_last, hold_next
 from plant.errors import InputError
 from plant.model import Model
 from plant.plants import MODULES
@@ -33,7 +33,6 @@ STILL = 5e-5  # m; a ram that moves further than that moves every sensor
 LIMITS = (("xj", 3.0, "jack.travel"), ("com", 5.0, "jack.travel"), ("xs", 3.0, "spool.travel"),
           ("p12", 3.0, "supply.pressure"), ("cor", 20.0, "controller.current_limit"))  # signal, times, parameter
 FAINT = {"p12": 1e3, "xs": 1e-9}  # a signal whose range is smaller is in another unit
-COLUMNS = ("t", "com", "cor", "load", *OUTPUTS, "phase", "usable", "filled", "incomplete")
 
 
 def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
@@ -197,7 +196,7 @@ def _find_new_current(cor: Floats, rows: int) -> int | None:
 
 def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
     """Every so many rows, from row `phase` on."""
-    columns: dict[str, Any] = {name: getattr(trace, name)[phase::rows] for name in COLUMNS}
+    columns: dict[str, Any] = {name: getattr(trace, name)[phase::rows] for name in PER_ROW}
     columns["incomplete"] = np.isnan(columns["xj"])
     return replace(trace, **columns, period=trace.period * rows)
 
@@ -369,6 +368,6 @@ def align_repeat(repeat: Repeat, rows: int) -> Trace:
     trace = repeat.trace
     wanted = np.arange(rows) - repeat.late
     place = np.clip(wanted, 0, len(trace) - 1)
-    columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in COLUMNS}
+    columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in PER_ROW}
     usable = (wanted == place) & trace.usable[place]
     return replace(trace, **columns | {"usable": usable, "incomplete": np.isnan(columns["xj"]) | ~usable})

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.driven import replay_measured
+from fdi.estimation.driven import replay_in_turns, replay_measured
+from fdi.estimation.excerpt import choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.noise import WINDOW
 from fdi.estimation.unknowns import WITHOUT_NOISE, tolerance_sizes
@@ -91,29 +93,56 @@ def has_known_start(trace: Trace) -> bool:
 
 def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
+    coarse, undecided, blind = _replay_with_other_frictions(trace, model, floor)
+    checked = trace
+    if is_long(trace):
+        checked = cut_excerpt(trace, choose_excerpt(trace, model.replace(WITHOUT_NOISE), floor))
+    steps, error = _choose_steps(checked, model, floor, undecided if checked is trace else ~checked.usable)
+    if checked is trace or steps > 2 * REPLAY_STEPS:  # else the replay that is there will do
+        coarse = replay_current(trace, model, steps)
+    else:
+        steps = REPLAY_STEPS
+    return Replay(coarse, compute_residuals(trace, coarse), steps, error, undecided, blind)
+
+
+def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str, float]
+                                 ) -> tuple[Columns, Flags, dict[str, float]]:
+    """The replay, the rows that hang on a knife's edge, and by how much a guessed current moves it elsewhere, RMS."""
     values = vary_frictions(model)
     lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), REPLAY_STEPS)
-    others = [replay_lanes(lanes, values[:1], trace, current) for current in guess_current(trace)]
-    runs = np.concatenate([replay_lanes(lanes, values, trace), *others])
+    position = trace.unlagged_position if has_known_start(trace) else None
+    turns = [replay_in_turns(lanes, values, trace, position, ANCHOR_RATE)]
+    turns += [replay_in_turns(lanes, values[:1], replace(trace, cor=current), position, ANCHOR_RATE)
+              for current in guess_current(trace)]
+    found = np.empty((len(OUTPUTS), len(trace)))
     undecided = np.zeros(len(trace), bool)
-    for i, name in enumerate(OUTPUTS):
-        if name in floor:
-            moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
-            large = find_large_windows(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
-            undecided |= large & ~np.isnan(trace.mask_unusable(name))
-    coarse, steps = runs[0], REPLAY_STEPS
+    power, count = np.zeros(len(OUTPUTS)), 0
+    for (first, own), *others in zip(*turns, strict=True):
+        runs = np.concatenate([own, *(other for _, other in others)])
+        rows = slice(first, first + runs.shape[1])
+        found[:, rows] = runs[0].T
+        for i, name in enumerate(OUTPUTS):
+            if name in floor:
+                moved = np.abs(runs[1:, :, i] - runs[:1, :, i])
+                large = find_large_windows(moved, max(floor[name], UNDECIDED_SMALLEST[name]))
+                undecided[rows] |= large & ~np.isnan(trace.mask_unusable(name)[rows])
+        guessed = (runs[len(values):] - runs[:1])[:, ~undecided[rows]]
+        power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
+    blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(OUTPUTS)}
+    return {name: found[i] for i, name in enumerate(OUTPUTS)}, undecided, blind
+
+
+def _choose_steps(trace: Trace, model: Model, floor: Mapping[str, float], undecided: Flags
+                  ) -> tuple[int, dict[str, float]]:
+    """The steps a cycle that the floors ask for, and what half as many change, RMS."""
+    coarse, steps = replay_current(trace, model), REPLAY_STEPS
+    judged = ~undecided
     while True:
-        finer = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), 2 * steps)
-        fine = replay_lanes(finer, values[:1], trace)[0]
-        error = {name: rms((fine - coarse)[:, i][~undecided]) for i, name in enumerate(OUTPUTS) if name in floor}
-        small = all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error)
-        coarse, steps = fine, 2 * steps
-        if small or steps >= FINEST_REPLAY_STEPS:
-            break
-    found = {name: coarse[:, i] for i, name in enumerate(OUTPUTS)}
-    guessed = runs[len(values):] - runs[:1]
-    blind = {name: rms(guessed[:, ~undecided, i]) if len(guessed) else 0.0 for i, name in enumerate(OUTPUTS)}
-    return Replay(found, compute_residuals(trace, found), steps, error, undecided, blind)
+        fine, steps = replay_current(trace, model, 2 * steps), 2 * steps
+        error = {name: rms((fine[name] - coarse[name])[judged]) for name in OUTPUTS if name in floor}
+        if all(error[name] <= SOLVER_ERROR_SHARE * floor[name] for name in error) or steps >= FINEST_REPLAY_STEPS:
+            return steps, error
+        coarse = fine
 
 
 def guess_current(trace: Trace) -> list[Floats]:
@@ -218,6 +247,9 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
         left: Floats = np.nan_to_num((trace.measurements - out) / scale)
         return left.reshape(len(x), -1)
 
+    whole = trace
+    if is_long(whole):
+        trace = cut_excerpt(whole, choose_excerpt(whole, model.replace(WITHOUT_NOISE), floor))
     x = np.zeros(len(base))
     now = compute_scaled_residuals(x[None])[0]
     for _ in range(2):
@@ -231,9 +263,18 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
         costs = 2 * large**2 * (np.sqrt(1 + (found / large) ** 2) - 1).sum(axis=1) / ALIKE
         best = int(np.argmin(costs + (tried**2).sum(axis=1)))
         x, now = tried[best], found[best]
+    if whole is not trace:
+        trace, now = whole, _replay_scaled(lanes, limit_dynamic_friction(list(known), base + x * size), whole, scale)
     rows = now.reshape(len(scale), -1)
     ratio = {name: rms(np.where(np.isnan(y), np.nan, r))
              for name, r, y in zip(trace.outputs, rows, trace.measurements, strict=True)}
     error = {name: ratio[name] * floor[name] for name in ratio}
     moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
     return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)
+
+
+def _replay_scaled(lanes: Lanes, values: Floats, trace: Trace, scale: Floats) -> Floats:
+    """Residuals (signals, n) of one run in floors."""
+    out = replay_lanes(lanes, values[None], trace)[0].T[trace.output_columns]
+    left: Floats = np.nan_to_num((trace.measurements - out) / scale)
+    return left

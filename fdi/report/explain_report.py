@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from fdi.discovery.balance import find_smooth_rows
 from fdi.discovery.candidates import Answer, Candidate, Suspicious, Value
 from fdi.discovery.model_file import Row
 from fdi.discovery.runs import Source
@@ -58,6 +59,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("What this test cannot detect", [_tabulate_blind(a)] if a.blind else [], medium=Medium.PAGE),
         Section("Provenance", [Listing(command, medium=Medium.PAGE)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
+    notes = [*notes, *([a.explanation.excerpt] if a.explanation.excerpt else [])]
     return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
                   next_command, files, collect_data(a))
 
@@ -281,7 +283,7 @@ def _show_figures(a: Answer, pattern: Pattern | None) -> list[Section]:
         sections.append(Section("Shape of the residual", [Figure(
             "Left: the missing quantity over the state that it follows best, with two standard errors. Right: over "
             "time.",
-            partial(explain_figures.draw_pattern, pattern, trace.t))]))
+            partial(explain_figures.draw_pattern, pattern, trace.t[find_smooth_rows(trace)]))]))
     if len(a.ledger) > 2:
         rows = [Row(*row) for row in a.ledger]
         sections.append(Section("Error after each effect", [Figure(
@@ -317,6 +319,8 @@ def collect_data(a: Answer) -> dict[str, Any]:
     held = e.unseen.get(a.best.effects)
     if held is not None and held.decided:
         data["undecided"] = {"share": held.undecided, "holdout": dict(held.decided)}
+    if e.excerpt:
+        data["excerpt"] = e.excerpt
     if len(e.effects) > 1 and e.verdict != "AMBIGUOUS":
         data["ledger"] = [{"effect": effect, "error": error, "holdout": holdout} for effect, error, holdout in a.ledger]
     return data

@@ -18,6 +18,7 @@ from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, escape_control_characters
+from plant.part import Part
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -25,6 +26,7 @@ Messages = list[tuple[int, Any]]  # (time ns, protobuf message)
 
 REQUIRED = ("t", "com", "xj", "cor")
 OPTIONAL = ("p12", "xs", "load")
+PER_ROW = ("t", "com", "cor", "load", *OUTPUTS, "phase", "usable", "filled", "incomplete")  # columns of a trace
 UNITS = {name: signal.unit for name, signal in SIGNALS.items()}
 SETUP, MAIN, CLEANUP = 0, 1, 2
 MOST_MESSAGES = 100_000  # events of a log that are read: a node can send a thousand emergencies a second
@@ -130,6 +132,7 @@ class Trace:
     attachments: Mapping[str, bytes] = field(default_factory=dict)  # enough to repeat the run
     units: Mapping[str, str] = field(default_factory=lambda: dict(UNITS))
     sensors: Mapping[str, SensorDynamics] = field(default_factory=dict)  # by signal, of those that are not ideal
+    parts: tuple[Part, ...] = ()  # pieces of a longer recording that the rows are; none: one piece
 
     def __len__(self) -> int:
         return len(self.t)

@@ -9,6 +9,7 @@ import errno
 import gc
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -105,8 +106,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         gc.set_threshold(50_000)  # 0.05 s less: most objects are made while modules load, and stay
         leave_out_reader(sys.argv[1:])
-        return leave_quickly()(run_command_line(sys.argv[1:]))
+        leave = leave_quickly()
+        status = leave(run_command_line(sys.argv[1:]))
+        if status == INTERRUPTED and _are_fits_at_work():
+            sys.stderr.flush()
+            os._exit(status)  # Python would wait for the threads
+        return status
     return run_command_line(argv)
+
+
+def _are_fits_at_work() -> bool:
+    """Whether threads are left that compute for a command that was interrupted."""
+    from plant.threads import THREAD_NAME
+
+    return any(t.name.startswith(THREAD_NAME) for t in threading.enumerate())
 
 
 def leave_out_reader(words: Sequence[str]) -> None:

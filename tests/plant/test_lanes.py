@@ -23,6 +23,7 @@ from plant.compile import interpret_function
 from plant.effects import CATALOGUE, load_effects
 from plant.lanes import Lanes, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
+from plant.part import Part
 from plant.solve import read_sensors, step_cycle
 from plant.state import State
 
@@ -215,8 +216,34 @@ def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     plan = plan_layout((), "eha")
     run = compile_block_kernel(plan)
     run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
-        np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
+        0, len(CURRENT), 0, 0, True, np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
     step = max((body for _, body in loops), key=len)
     assert len(re.findall("%[yz]mm", step)) > 100 and not re.search(r"v(add|sub|mul|div|min|max)sd", step)
+
+
+def test_replay_in_turns_has_the_bits_of_a_whole_replay() -> None:
+    """The state goes on from piece to piece."""
+    lanes = Lanes(QUIET.with_effects(["supply_ripple", "coil_lag"]), ["supply_ripple.amplitude"], 5)
+    values = np.array([[0.0], [0.05]])
+    position = np.where(np.arange(len(CURRENT)) % 7, 1e-4, np.nan)
+    position[0] = 1e-4
+    whole = lanes.replay(values, CURRENT, FORCE, position, 20.0)
+    turns = list(lanes.replay_in_turns(values, CURRENT, FORCE, position, 20.0, rows=37))
+    assert [first for first, _ in turns] == list(range(0, len(CURRENT), 37))
+    assert (np.concatenate([out for _, out in turns], axis=1) == whole).all()
+
+
+def test_parts_begin_anew_at_their_own_time() -> None:
+    """A part is a replay of its rows alone, with the clock of the recording it was cut from."""
+    model = QUIET.with_effects(["supply_ripple"])
+    lanes = Lanes(model, ["supply_ripple.amplitude"], 5)
+    values, half = np.array([[0.05]]), len(CURRENT) // 2
+    cut = lanes.replay(values, CURRENT, FORCE, CURRENT, 20.0, [Part(0, half, 0), Part(half, len(CURRENT), 40)])
+    first = lanes.replay(values, CURRENT[:half], FORCE[:half], CURRENT[:half], 20.0)
+    rest = [x[half:] for x in (CURRENT, FORCE, CURRENT)]
+    second = lanes.replay(values, *rest, 20.0, [Part(0, len(CURRENT) - half, half + 40)])
+    assert (cut[:, :half] == first).all()
+    assert (cut[:, half:] == second).all()
+    assert (second != lanes.replay(values, *rest, 20.0)).any()

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from plant.threads import count_threads, map_in_threads
+from plant.threads import THREAD_NAME, count_threads, map_in_threads
 
 
 def test_answers_come_in_the_order_of_the_questions() -> None:
@@ -28,6 +28,29 @@ def test_one_worker_or_one_item_stays_in_this_thread() -> None:
 def test_an_error_reaches_who_asked() -> None:
     with pytest.raises(ZeroDivisionError):
         map_in_threads(lambda i: 1 / i, [1, 0, 2], 2)
+
+
+def test_an_error_leaves_what_is_still_at_work() -> None:
+    """Ctrl-C answers at once: work that has begun goes on by itself, work that has not is dropped."""
+    begun, go_on, done = threading.Event(), threading.Event(), []
+
+    def do(i: int) -> None:
+        if i == 0:
+            begun.wait(10.0)
+            raise KeyboardInterrupt
+        begun.set()
+        go_on.wait(10.0)
+        done.append(i)
+
+    with pytest.raises(KeyboardInterrupt):
+        map_in_threads(do, range(40), 2)
+    assert len(done) == 0
+    left = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
+    go_on.set()
+    for thread in left:
+        thread.join(10.0)
+    assert 1 in done
+    assert len(done) < 4  # of 39
 
 
 def test_a_cluster_tells_its_workers_how_many(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
     parser.add_argument("what", nargs="?", default="plant",
-                        choices=("plant", "realtime", "explain", "robustness", "faults"),
+                        choices=("plant", "realtime", "explain", "robustness", "faults", "recordings"),
                         help="plant: speed of the plant (default); realtime: lateness and response of the cycle beside "
                              "cyclictest and C; explain: how often rig explain is right; "
                              "robustness: invented frames, killed processes, full disks, long work; "
-                             "faults: every fault on the bus in every phase of a motion, a matrix")
+                             "faults: every fault on the bus in every phase of a motion, a matrix; "
+                             "recordings: CPU time and memory of compare, explain and fdi by length of the recording")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
     add = parser.add_argument_group("rig bench realtime").add_argument
@@ -33,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seed of the first case; each case uses the next seed (default: 0)")
     add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
     add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
+    add = parser.add_argument_group("rig bench recordings").add_argument
+    add("--lengths", default="13.5,60,300,1800", metavar="S,S,..",
+        help="lengths of the recordings, s (default: 13.5,60,300,1800)")
     add = parser.add_argument_group("rig bench robustness", "hours with the figures of docs/robustness.md").add_argument
     add("--frames", type=parse_whole_number, default=100_000, metavar="N",
         help="invented frames for each node (default: 100000; 0: none)")
@@ -52,6 +56,8 @@ def run_command(args: argparse.Namespace) -> int:
         return _run_realtime(args)
     if args.what == "faults":
         return _study_bus_faults(args)
+    if args.what == "recordings":
+        return _measure_recordings(args)
     from fdi.output import write_text
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
@@ -99,6 +105,33 @@ def _run_realtime(args: argparse.Namespace) -> int:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_realtime_report(figures), args)
     return 0 if all(target["is_met"] for target in figures["targets"] if target["value"] is not None) else 1
+
+
+def _measure_recordings(args: argparse.Namespace) -> int:
+    """The cost of an analysis by length of the recording; exit status 0.
+
+    Raises:
+        InputError: lengths that are no numbers, or too small.
+    """
+    from fdi.output import write_text
+    from plant.errors import InputError
+    from rig.cli.answer import show_answer
+    from rig.cli.progress_bar import show_progress
+    from rig.studies.benchmarks.long_recordings import measure_long_recordings
+    from rig.studies.benchmarks.long_recordings_report import build_long_recordings_report
+
+    try:
+        lengths = [float(word) for word in args.lengths.split(",")]
+    except ValueError:
+        lengths = []
+    if not lengths or not all(5.0 <= length <= 7200.0 for length in lengths):
+        raise InputError("--lengths", args.lengths, "seconds from 5 to 7200, separated by commas")
+    with show_progress(is_silent=args.json or args.quiet) as progress:
+        figures = measure_long_recordings(lengths, args.seed, progress)
+    if args.out is not None:
+        write_text(args.out, json.dumps(figures, indent=1) + "\n")
+    show_answer(build_long_recordings_report(figures), args)
+    return 0
 
 
 def _run_trial(args: argparse.Namespace) -> int:

@@ -42,7 +42,8 @@ def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at
            **fields: Any) -> Answer:
     base = SimpleNamespace(is_at_floor=is_at_floor, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, controller=1.0,
-                                  ledger=[base], unseen={}, search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
+                                  ledger=[base], unseen={}, excerpt="",
+                                  search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
              Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))

@@ -18,6 +18,8 @@ from rig.studies.benchmarks import (
     single_run,
     whole_process,
 )
+from rig.studies.benchmarks.long_recordings import make_command, record_unit
+from rig.studies.benchmarks.long_recordings_report import build_long_recordings_report
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {rivals.GET_GCC}")
 
@@ -119,3 +121,23 @@ def test_every_rival_makes_the_same_map() -> None:
     reference = found[grid_runs.REFERENCE]
     assert reference.ratio is not None and reference.ratio > 2.0  # 13 on a quiet machine
     assert reference.difference is not None and 1e-6 < reference.difference < 3e-3
+
+
+def test_cost_of_recordings(capsys: pytest.CaptureFixture[str]) -> None:
+    """The table names length, CPU time and memory of each command; lengths that nobody can mean are refused."""
+    costs = [{"command": "compare", "length": 1800.0, "cpu": 46.7, "memory": 1_350_000_000, "verdict": "WITHIN_FLOOR",
+              "interrupted": 0.4}]
+    report = build_long_recordings_report({"seed": 0, "cpus": 2, "costs": costs})
+    assert report.sentence == "1800 s of recording at 1 kHz take 1.35 GB at most."
+    assert main.main(["bench", "recordings", "--lengths", "60,x"]) == 2
+    assert "--lengths" in capsys.readouterr().err
+
+
+def test_recordings_repeat_by_their_seed() -> None:
+    """A recording is as long as asked for, holds what a bench measures, and is the same for the same seed."""
+    com = make_command(15.0, 3)
+    assert len(com) == 15_000
+    once, again = (record_unit(com[:2000], 3) for _ in range(2))
+    assert once.signals == ("com", "xj", "cor", "p12", "xs", "load")
+    assert (once.xs == again.xs).all()
+    assert (record_unit(com[:2000], 4).xs != once.xs).any()

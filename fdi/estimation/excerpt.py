@@ -1,0 +1,188 @@
+"""The excerpt of a long recording that fits are made with: the pieces that say most about what is unknown.
+
+A fit makes hundreds of replays. Thirty minutes of recording say little more than the best fifteen seconds of them, so
+fits are made with these and their result is judged on all of the recording (`fdi.estimation.judgement`).
+
+Which seconds are best is asked of the model: one replay of the whole recording with a few steps a cycle, and one more
+for each unknown, side by side, tell how far each unknown moves each signal in each piece. Pieces are taken one after
+the other, each time the one with which the determinant of the information matrix grows most (a D-optimal design: V. V.
+Fedorov, "Theory of Optimal Experiments", 1972). One more piece is taken where the model fits worst: what is missing may
+act there alone.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.driven import is_driven_by_pressure, replay_in_turns
+from fdi.estimation.likelihood import limit_dynamic_friction
+from fdi.estimation.unknowns import tolerance_sizes
+from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import ANCHOR_RATE
+from fdi.trace.trace import PER_ROW, Trace
+from plant.lanes import Lanes
+from plant.model import Model
+from plant.part import Part
+
+Floats = NDArray[np.float64]
+
+LONGEST_WHOLE = 20.0  # s; a shorter recording is fitted whole
+PIECE = 3.0  # s
+PIECES = 3  # for information
+LEAD_IN = 1.0  # s before a piece, in which a replay that is drawn to the measured position forgets how it began
+SHORT_LEAD_IN = 3.0  # s; pieces that need a longer one are taken only where there are no others
+INFORMATION_STEPS = 5  # a cycle: what matters is where an unknown acts, not how much exactly
+LARGEST_SHIFT = 10.0  # floors: more is a single stop of the ram, made or missed
+
+
+class Excerpt(NamedTuple):
+    """Pieces of a recording as rows (first, stop), in order of time, without their lead-ins."""
+
+    pieces: tuple[tuple[int, int], ...]
+
+    def seconds(self, period: float) -> float:
+        """Length in all."""
+        return sum(stop - first for first, stop in self.pieces) * period
+
+    def describe(self, trace: Trace) -> str:
+        """In words, for the recording `trace` that it was chosen from."""
+        times = [f"{trace.t[first]:.4g} to {trace.t[stop - 1] + trace.period:.4g} s" for first, stop in self.pieces]
+        whole = len(trace) * trace.period
+        return (f"fitted to {self.seconds(trace.period):.3g} s of {whole:.4g} s, the part that says most about the "
+                f"unknowns ({', '.join(times)}); judged on all of it")
+
+
+def is_long(trace: Trace) -> bool:
+    """Whether a recording is longer than fits need."""
+    return len(trace) * trace.period > LONGEST_WHOLE
+
+
+def choose_excerpt(trace: Trace, model: Model, floor: Mapping[str, float], changes: Iterable[Mapping[str, float]] = (),
+                   progress: Progress = ignore_progress) -> Excerpt:
+    """The pieces of a prepared recording to fit.
+
+    Args:
+        trace: a prepared recording.
+        model: with every effect that `changes` name, at off values, without sensor noise.
+        floor: RMS noise of each output, SI.
+        changes: parameters of what is unknown beside the tolerances, a mapping for each unknown.
+        progress: called with the stage and the share done.
+    """
+    rows = round(PIECE / trace.period)
+    starts = np.arange(0, len(trace) - rows + 1, rows)
+    information, misfit, measured = _measure_information(trace, model, floor, list(changes), rows, len(starts),
+                                                         progress)
+    full = measured >= 0.5
+    leads = np.array([first - _find_lead_in(trace, first) for first in starts.tolist()])
+    is_near = leads <= SHORT_LEAD_IN / trace.period
+    if (full & is_near).sum() > 2 * PIECES:
+        full &= is_near
+    chosen = _choose_pieces(information, full)
+    rest = np.where(full, misfit, -np.inf)
+    rest[chosen] = -np.inf
+    if np.isfinite(rest).any():
+        chosen.append(int(np.argmax(rest)))
+    return make_excerpt((int(starts[k]), int(starts[k]) + rows) for k in chosen)
+
+
+def make_excerpt(pieces: Iterable[tuple[int, int]]) -> Excerpt:
+    """An excerpt of these rows; pieces that touch are joined."""
+    joined: list[tuple[int, int]] = []
+    for first, stop in sorted(set(pieces)):
+        if joined and first <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(stop, joined[-1][1]))
+        else:
+            joined.append((first, stop))
+    return Excerpt(tuple(joined))
+
+
+def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float], changes: Sequence[Mapping[str, float]],
+                         rows: int, count: int, progress: Progress) -> tuple[Floats, Floats, Floats]:
+    """Information of the unknowns in each piece (q, d, d), the model's squared misfit (q,), share measured (q,)."""
+    tolerances = tolerance_sizes(model)
+    names = list(dict.fromkeys([*tolerances, *(name for change in changes for name in change)]))
+    base = np.array([model[name] for name in names])
+    moved = [{name: model[name] + size} for name, size in tolerances.items()] + list(changes)
+    table = np.array([base, *([change.get(n, v) for n, v in zip(names, base, strict=True)] for change in moved)])
+    lanes = Lanes(model, names, INFORMATION_STEPS)
+    scale = 1.0 / np.array([floor[name] for name in trace.outputs])
+    information, misfit = np.zeros((count, len(moved), len(moved))), np.zeros(count)
+    measured = np.zeros(count)
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, trace.position, ANCHOR_RATE, rows)
+    for k, (first, out) in enumerate(turns):
+        if k >= count:
+            break
+        progress("choosing the part to fit", k / count)
+        seen = trace.measurements[:, first:first + rows]
+        there = ~np.isnan(seen)
+        shown = out.transpose(0, 2, 1)[:, trace.output_columns]
+        shift = np.where(there, (shown[1:] - shown[0]) * scale[:, None], 0.0)
+        shift = np.clip(shift, -LARGEST_SHIFT, LARGEST_SHIFT)[:, :, ::2].reshape(len(moved), -1)
+        information[k] = shift @ shift.T
+        left = np.where(there, (shown[0] - seen) * scale[:, None], 0.0)
+        misfit[k] = float(np.minimum(left**2, LARGEST_SHIFT**2).sum()) / max(int(there.sum()), 1)
+        measured[k] = there.mean()
+    return information, misfit, measured
+
+
+def _choose_pieces(information: Floats, full: NDArray[np.bool_]) -> list[int]:
+    """The pieces that together say most, the first first."""
+    alike = 20.0  # neighbouring samples that say the same thing
+    total, chosen = np.eye(information.shape[1]), list[int]()
+    for _ in range(min(PIECES, int(full.sum()))):
+        gains = np.full(len(information), -np.inf)
+        for k in np.flatnonzero(full):
+            if k not in chosen:
+                gains[k] = np.linalg.slogdet(total + information[k] / alike)[1]
+        chosen.append(int(np.argmax(gains)))
+        total = total + information[chosen[-1]] / alike
+    return chosen
+
+
+def cut_excerpt(trace: Trace, excerpt: Excerpt) -> Trace:
+    """The pieces of a prepared recording one after the other, each with a lead-in that is not compared with anything.
+
+    A piece keeps its times. Rows that the recording does not have, as of a shorter repeat, are left out.
+    """
+    ranges, parts, rows = list[tuple[int, int, int]](), [], 0
+    for first, stop in excerpt.pieces:
+        begin, stop = max(_find_lead_in(trace, first), ranges[-1][2] if ranges else 0), min(stop, len(trace))
+        known = np.flatnonzero(~np.isnan(trace.xj[begin:stop]))
+        if not len(known):
+            continue
+        begin += int(known[0])  # a replay starts where the ram was seen
+        ranges.append((begin, max(first, begin), stop))
+        parts.append(Part(rows, rows + stop - begin, begin - rows))
+        rows += stop - begin
+    kept = np.concatenate([np.arange(begin, stop) for begin, _, stop in ranges])
+    leading = np.concatenate([np.arange(begin, stop) < first if begin else np.zeros(stop, bool)
+                              for begin, first, stop in ranges])
+    columns: dict[str, Any] = {name: getattr(trace, name)[kept] for name in PER_ROW}
+    columns["usable"], columns["incomplete"] = columns["usable"] & ~leading, columns["incomplete"] | leading
+    chambers = None if trace.chambers is None else trace.chambers[kept]
+    return replace(trace, **columns, chambers=chambers, parts=tuple(parts))
+
+
+def _find_lead_in(trace: Trace, first: int, wide: float = 0.5, longest: float = 20.0) -> int:
+    """The row at which the lead-in of a piece begins: so far back that the valve has moved widely by the `first` row.
+
+    A spool that friction holds remembers where it came to rest until the next wide movement. The current must have
+    gone through the `wide` part of its usual range, within the `longest` time, s.
+    """
+    usual = float(np.subtract(*np.percentile(trace.cor[::10], (99.0, 1.0))))
+    step = round(LEAD_IN / trace.period)
+    begin = first
+    while begin > 0 and (first - begin) * trace.period < longest:
+        begin = max(begin - step, 0)
+        if float(np.ptp(trace.cor[begin:first])) >= wide * usual:
+            return max(begin - step, 0) if first - begin < 2 * step else begin
+    return begin
+
+
+def can_be_cut(trace: Trace, model: Model) -> bool:
+    """Whether fits of a recording may be made with an excerpt: it is long, and no forces are computed from its rows."""
+    return is_long(trace) and not is_driven_by_pressure(trace, Lanes(model, (), 1))
