@@ -1,6 +1,7 @@
 """Shared by all tests."""
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,11 @@ from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
 pytest_plugins = ["plugin_bus_summary"]
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell script starts what it puts in the background with Ctrl-C ignored, and children inherit that. The tests of
+    # Ctrl-C need it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(params=["embedded", "virtual", "udp_multicast", "socketcan"])

@@ -236,7 +236,7 @@ class _VirtualTest:
         x = np.array([(values[f.name] - f.centre) / f.scale for f in self.fit.free])
         for way in (*list_powers(self.problem), VISCOSITY):
             first = next(iter(way))
-            if first in self.names or values.get(first, held[first]) == held[first]:
+            if first in self.names or values.get(first, held.get(first)) == held.get(first):
                 continue
             ratio = (1.0 - values[first]) / (1.0 - held[first]) if first == "filter.clogging" else \
                 values[first] / held[first]
