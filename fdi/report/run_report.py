@@ -113,8 +113,8 @@ def _show_diagnosis(trace: Trace) -> list[Item]:
     word, sentence = (trace.provenance.get(f"fdi.{key}", "") for key in ("verdict", "sentence"))
     if not word:
         return []
-    mood: Mood = "good" if word == "ACCEPTABLE" else "doubtful" if word == "CANNOT_TELL" else "bad"
-    return [Line(word, sentence, mood)]
+    moods: dict[str, Mood] = {"ACCEPTABLE": "good", "CANNOT_TELL": "doubtful"}  # all others fail the run
+    return [Line(word, sentence, moods.get(word, "bad"))]
 
 
 def _list_notes(trace: Trace) -> list[str]:
