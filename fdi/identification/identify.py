@@ -35,6 +35,7 @@ from fdi.identification.global_fit import (
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
+    FITTED_RUN_WORST,
     IDENTIFIABLE_SHARE,
     IDENTIFIED_INTERVAL_FACTOR,
     INTERVAL_95_SD,
@@ -350,6 +351,11 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
         return "CANNOT_TELL", "these runs show none of the free parameters"
     if unseen:
         return "PARTLY", f"these runs do not show {len(unseen)} of {len(estimates)} free parameters"
+    worst = max((e for e in errors if not e.is_held_out), key=lambda e: e.ratio)
+    if worst.ratio > FITTED_RUN_WORST:
+        return "PARTLY", (f"single stops of the ram in {worst.source.file} come at the wrong moment "
+                          f"({worst.ratio:.3g} noise floors over all of the run), so frictions and gains may be off by "
+                          "more than their intervals")
     return "IDENTIFIED", ""
 
 

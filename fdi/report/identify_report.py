@@ -60,7 +60,10 @@ def describe_identification(found: Identification) -> str:
     count = f"{len(seen)} of {len(found.estimates)} free parameters are identified"
     if found.verdict == "IDENTIFIED":
         count = f"All {len(seen)} free parameters are identified"
-    return f"{count}: {_describe_change(found)}."
+    sentence = f"{count}: {_describe_change(found)}."
+    if found.verdict == "PARTLY" and len(seen) == len(found.estimates):
+        sentence += f" But {found.reason}."
+    return sentence
 
 
 def _describe_change(found: Identification) -> str:

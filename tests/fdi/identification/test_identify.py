@@ -12,10 +12,10 @@ from fdi.discovery.model_file import read_provenance
 from fdi.identification.closed_form import estimate_by_regressions
 from fdi.identification.controller import read_controller
 from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
-from fdi.identification.identify import Identification, identify_model
+from fdi.identification.identify import Identification, decide_verdict, identify_model
 from fdi.identification.model_text import write_identified_model
 from fdi.identification.runs import collect_identification_runs
-from fdi.report.identify_report import build_identification_report
+from fdi.report.identify_report import build_identification_report, describe_identification
 from fdi.report.terminal import print_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -77,6 +77,16 @@ def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None
     assert max(e.ratio for e in found.holdouts) <= 1.1
     assert max(e.before["p12"] / e.floor["p12"] for e in found.holdouts) > 5.0
     assert found.model["controller.proportional_gain"] == pytest.approx(draw_plant()["GAP"], rel=1e-5)
+
+
+def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identification) -> None:
+    first, *others = found.errors
+    late = first._replace(after={s: 2.5 * first.floor[s] for s in first.after})
+    verdict, reason = decide_verdict(found.estimates, [late, *others])
+    assert verdict == "PARTLY" and "2.5 noise floors" in reason and first.source.file in reason
+    assert "wrong moment" in describe_identification(replace(found, verdict=verdict, reason=reason))
+    held = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()})
+    assert held.is_held_out and decide_verdict(found.estimates, [first, *others[:-1], held])[0] == "IDENTIFIED"
 
 
 def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace], tmp_path: Path,
