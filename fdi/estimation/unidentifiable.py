@@ -133,8 +133,19 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     full = np.abs(trials).max(axis=1) >= 0.9 * TRIED * np.abs(ways).max(axis=1)
     white = problem.compute_white_residuals(free, np.vstack([x, x + trials]))
     moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
-    found: Floats = ways[full & (moved < FLAT_DIRECTION_MISFIT)].T
+    flat_ways = ways[full & (moved < FLAT_DIRECTION_MISFIT)]
+    found: Floats = flat_ways[_find_independent(flat_ways)].T
     return found
+
+
+def _find_independent(ways: Floats) -> list[int]:
+    """Places of the directions (k, p) that are not sums of directions before them; without leakage two are alike."""
+    places: list[int] = []
+    for k in range(len(ways)):
+        rows = ways[[*places, k]]
+        if np.linalg.matrix_rank(rows / np.linalg.norm(rows, axis=1, keepdims=True), tol=1e-6) > len(places):
+            places.append(k)
+    return places
 
 
 def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:

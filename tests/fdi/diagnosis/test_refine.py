@@ -88,6 +88,16 @@ def test_flat_directions_change_no_signal() -> None:
     assert moved[:4].max() < 100 and moved[4 + [f.name for f in free].index("pilot.flow_gain")] > 1000
 
 
+def test_flat_directions_that_are_sums_of_others_count_once() -> None:
+    problem, free = make_problem(MODEL, hold_inputs(record_plant({}))), list_unknowns(MODEL)
+    x = make_start(free, 0.2, 20.0)
+    flat = find_flat_directions(problem, free, x)
+    both = {f.name: float((first + second) * f.scale)
+            for f, first, second in zip(free, flat[:, 0], flat[:, 1], strict=True) if first or second}
+    again = find_flat_directions(problem, free, x, [both, both])
+    assert np.linalg.matrix_rank(again / np.linalg.norm(again, axis=0)) == again.shape[1] == flat.shape[1]
+
+
 def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refinement) -> None:
     problem, found = make_problem(MODEL, hold_inputs(record_plant({}))), off_grid.fit
     flat = find_flat_directions(problem, found.free, found.x)
