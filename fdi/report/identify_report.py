@@ -37,7 +37,7 @@ def build_identification_report(found: Identification, title: str, command: str 
     facts += [("held-out run" if e.is_held_out else "run", e.source.file) for e in found.errors]
     notes = [*found.notes] if found.holdouts else [*found.notes, "no held-out run: overfitting is not excluded"]
     sections = [
-        Section("Parameters", [_tabulate_parameters(found.estimates), Figure(
+        Section("Parameters", [_tabulate_parameters(found), Figure(
             "Each free parameter over its data sheet value: grey the range of the data sheet, blue the 95 % interval "
             "that the runs leave, orange where the runs do not show the parameter.",
             partial(identify_figures.draw_estimates, found.estimates))]),
@@ -75,10 +75,10 @@ def _describe_change(found: Identification) -> str:
             f"{format_signal(chosen.after[s], s)}, noise floor {format_signal(chosen.floor[s], s)}")
 
 
-def _tabulate_parameters(estimates: Sequence[Estimate]) -> Table:
+def _tabulate_parameters(found: Identification) -> Table:
     rows: list[list[Cell | str]] = []
-    for e in estimates:
-        word, mood = _judge_estimate(e)
+    for e in found.estimates:
+        word, mood = _judge_estimate(e, found.verdict)
         value = format_interval(e.value, e.low, e.high, e.unit)
         if not e.is_identifiable:
             value = f"not identifiable: {format_amount(e.low, e.unit)} .. {format_amount(e.high, e.unit)}"
@@ -87,14 +87,19 @@ def _tabulate_parameters(estimates: Sequence[Estimate]) -> Table:
                      f"{e.value / e.before:.3f}" if e.before else "", Cell(word, mood)])
     columns = [Column("parameter"), Column("data sheet", align="right"), Column("found (95 % interval)"),
                Column("over data sheet", align="right", medium=Medium.PAGE), Column("result", medium=Medium.PAGE)]
-    return Table(columns, rows, "The model file has these values as its nominal ones. What is not identifiable has a "
-                                "value within its range, and a remark.")
+    note = ("The model file has these values as its nominal ones. What is not identifiable has a value within its "
+            "range, and a remark.")
+    if found.verdict == "UNEXPLAINED":
+        note = "The model does not explain the runs, so these values and intervals may be wrong. " + note
+    return Table(columns, rows, note)
 
 
-def _judge_estimate(e: Estimate) -> tuple[str, Mood]:
+def _judge_estimate(e: Estimate, verdict: str) -> tuple[str, Mood]:
     if not e.is_identifiable:
         return "not identifiable", "doubtful"
-    return ("at the end of its range", "bad") if e.is_at_bound else ("identified", "good")
+    if e.is_at_bound:
+        return "at the end of its range", "bad"
+    return ("not to be trusted", "doubtful") if verdict == "UNEXPLAINED" else ("identified", "good")
 
 
 def _tabulate_errors(errors: Sequence[RunError]) -> Table:

@@ -16,7 +16,7 @@ from fdi.identification.identify import Identification, decide_verdict, identify
 from fdi.identification.model_text import write_identified_model
 from fdi.identification.runs import collect_identification_runs
 from fdi.report.identify_report import build_identification_report, describe_identification
-from fdi.report.terminal import print_report
+from fdi.report.terminal import format_report, print_report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
@@ -87,6 +87,13 @@ def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identifica
     assert "wrong moment" in describe_identification(replace(found, verdict=verdict, reason=reason))
     held = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()})
     assert held.is_held_out and decide_verdict(found.estimates, [first, *others[:-1], held])[0] == "IDENTIFIED"
+
+
+def test_no_value_counts_as_identified_where_the_model_fails(found: Identification) -> None:
+    failed = replace(found, verdict="UNEXPLAINED", reason="too much is left")
+    words = " ".join(format_report(build_identification_report(failed, "eha")).split())
+    assert "these values and intervals may be wrong" in words
+    assert "may be wrong" not in format_report(build_identification_report(found, "eha"))
 
 
 def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace], tmp_path: Path,
