@@ -182,7 +182,7 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     """The model from the tables of a model file; errors name `where` they are from.
 
     Raises:
-        InputError: an unknown plant, effect or parameter, or a value that is none.
+        InputError: an unknown plant, effect or parameter, or a value that the parameter cannot have.
     """
     tables = dict(tables)
     name, effects = tables.pop("name", name), tables.pop("effects", [])

@@ -74,8 +74,9 @@ def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int
     turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.position, problem.anchor, TURN)
     for first, out in turns:
         seen = trace.measurements[:, first:first + TURN]
-        left = remove_mains(out.transpose(0, 2, 1)[:, outputs] - seen, period) if seen.shape[1] > BLOCK else \
-            out.transpose(0, 2, 1)[:, outputs] - seen
+        left = out.transpose(0, 2, 1)[:, outputs] - seen
+        if seen.shape[1] > BLOCK:
+            left = remove_mains(left, period)
         squares.append(sum_blocks(np.nan_to_num(left)))
         counts.append(sum_blocks((~np.isnan(seen)).astype(float)))
     blocks, count = np.concatenate(squares, axis=-1), np.concatenate(counts, axis=-1)

@@ -144,8 +144,10 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
     for name in unseen:
         best = min(shares, key=lambda experiment: shares[experiment][name])
         share = shares[best][name]
-        is_enough = share <= IDENTIFIABLE_SHARE
-        advice.append(Advice(name, best if is_enough else None, what[best] if is_enough else "", share))
+        if share <= IDENTIFIABLE_SHARE:
+            advice.append(Advice(name, best, what[best], share))
+        else:
+            advice.append(Advice(name, None, "", share))
     return advice
 
 

@@ -53,11 +53,17 @@ def draw_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], seed
     Those that are `known` from regressions are scattered by a tenth, tolerances not at all, the rest by 0.4 of what
     is known of them.
     """
-    spread = np.array([0.0 if not is_wide(f) else 0.1 / f.scale if f.name in known else 0.4 for f in free])
+    spread = np.array([_choose_spread(f, f.name in known) for f in free])
     rng = np.random.default_rng(seed)
     scattered = begin + spread * rng.standard_normal((count, len(free)))
     low, high = scaled_bounds(free)
     return np.clip(np.vstack([begin, np.zeros(len(free)), scattered]), low, high)
+
+
+def _choose_spread(f: Free, is_known: bool) -> float:
+    if not is_wide(f):
+        return 0.0
+    return 0.1 / f.scale if is_known else 0.4
 
 
 def is_wide(f: Free, tolerance: float = 0.04) -> bool:

@@ -111,8 +111,9 @@ def _tabulate_errors(errors: Sequence[RunError]) -> Table:
         kind = "held-out" if e.is_held_out else "fitted"
         for number, s in enumerate(e.after):
             ratio = e.after[s] / e.floor[s]
-            rows.append([e.source.file if number == 0 else "", Cell(kind if number == 0 else "", "muted"),
-                         SIGNAL_NAMES[s], Cell(format_signal(e.before[s], s), "muted"), format_signal(e.after[s], s),
+            file, role = (e.source.file, kind) if number == 0 else ("", "")  # once for the rows of a run
+            rows.append([file, Cell(role, "muted"), SIGNAL_NAMES[s],
+                         Cell(format_signal(e.before[s], s), "muted"), format_signal(e.after[s], s),
                          Cell(format_signal(e.floor[s], s), "muted"),
                          Cell(format_ratio(ratio), "good" if ratio <= RESIDUAL_HELD_OUT else "bad")])
     return Table(columns, rows, "RMS error of each signal with the data sheet's values (before) and with those found.")
