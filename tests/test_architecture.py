@@ -41,6 +41,7 @@ FOLDER_MAY_IMPORT = {
     "fdi.foreign_code": set(),
     "fdi.analysis": {"fdi.foreign_code", *ESTIMATOR, "fdi.discovery", "fdi.identification", "fdi.diagnosis",
                      "fdi.prognosis", "fdi.report"},
+    "rig.junit": set(),
     "rig.network": set(),
     "rig.device": {"rig.network"},
     "rig.firmware": {"rig.device"},
@@ -50,9 +51,9 @@ FOLDER_MAY_IMPORT = {
     "rig.run": BENCH - {"rig.run", "rig.view", "rig.doctor"},
     "rig.view": {"rig.sequences"},
     "rig.doctor": {"rig.network", "rig.run"},
-    "rig.conformance": {"rig.network"},  # independent of rig.device, which it tests
-    "rig.studies": BENCH,
-    "rig.cli": {*BENCH, "rig.conformance", "rig.studies"},
+    "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
+    "rig.studies": {*BENCH, "rig.junit"},
+    "rig.cli": {*BENCH, "rig.conformance", "rig.junit", "rig.studies"},
 }
 # Modules of others that only some files may import (prefixes of paths).
 ONLY_IN = {

@@ -18,16 +18,17 @@ import pytest
 from rig_command import rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
-from plant import Model, load_model, segments, simulate
+from plant import Model, load_model, simulate
 from plant.effects import CATALOGUE, effect, load_effects
 from plant.parameters import GROUPS
 from plant.quantity import list_quantities
 from plant.state import Input, Ports, State
 from rig.cli import main
 from rig.cli.command_list import HELP_OF_COMMAND
-from rig.sequences import checks, faults
+from rig.sequences import faults
 from rig.sequences.guards import Guard
-from rig.sequences.sequence import Sequence, parse_sequence
+from rig.sequences.python_parts import Step
+from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, Sequence, parse_sequence
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -42,12 +43,13 @@ def indented_blocks(text: str) -> list[str]:
 
 
 def documented_keys() -> Iterator[tuple[str, str]]:
-    for kinds in (segments.KINDS, faults.KINDS, checks.KINDS):
+    for kinds in (SEGMENT_KINDS, faults.KINDS, CHECK_KINDS):
         for kind, cls in kinds.items():
             yield kind, kind
             yield from ((kind, f.name) for f in fields(cls) if f.metadata.get("key", True))
     yield from (("sequence", f.name) for f in fields(Sequence) if f.metadata.get("key", True))
     yield from (("guard", f.name) for f in fields(Guard))
+    yield from (("step", f.name) for f in fields(Step) if f.metadata.get("key", True))
 
 
 @pytest.mark.parametrize(("where", "key"), sorted(set(documented_keys())))

@@ -157,6 +157,9 @@ def _tabulate_checks(checks: tuple[Check, ...]) -> list[Item]:
         [check.name, Cell(_name_measure(check), "muted"), Cell("pass", "good") if check.passed else Cell("FAIL", "bad"),
          Cell(_format_value(check), is_strong=True), format_limits(check.low, check.high),
          "" if check.unit == "1" else check.unit, Cell(_format_window(check), "muted")] for check in checks]
+    if any(check.requirement for check in checks):
+        columns.append(Column("requirement"))
+        rows = [[*row, check.requirement] for row, check in zip(rows, checks, strict=True)]
     if any(check.detail for check in checks):
         columns.append(Column("remark"))
         rows = [[*row, Cell(check.detail, "muted")] for row, check in zip(rows, checks, strict=True)]

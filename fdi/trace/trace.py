@@ -72,6 +72,7 @@ class Check(NamedTuple):
     t0: float  # s
     t1: float  # s
     detail: str
+    requirement: str = ""  # ids of the requirements that it verifies, with commas between them
 
     @property
     def is_protocol(self) -> bool:
@@ -345,7 +346,8 @@ def _list_records(log: Log, topic: str, kind: type[R], rest: Mapping[str, Messag
     for time_ns, message in rest[topic]:
         values: list[Any] = []
         for name, expected in fields.items():
-            value = seconds(time_ns) if name == "t" else getattr(message, name, None)
+            absent = kind._field_defaults.get(name)  # logs of earlier versions lack a field that has a default
+            value = seconds(time_ns) if name == "t" else getattr(message, name, absent)
             if not isinstance(value, str | int | float) or isinstance(value, str) != (expected is str):
                 raise InputError(log.path, f"{topic}.{name}", f"a field of this name with a {expected.__name__}")
             values.append(escape_control_characters(value) if isinstance(value, str) else value)

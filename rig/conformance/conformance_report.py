@@ -1,13 +1,12 @@
 """The answer of a conformance test: a report for terminal and page, JSON values, and JUnit XML for build servers."""
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 from fdi.report.numbers import count_nouns
 from fdi.report.report import Cell, Column, Line, Medium, Mood, Report, Section, Table
+from rig import junit
 from rig.conformance.conformance_case import CHAPTERS, Result, Verdict
 from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import Outcome
@@ -42,33 +41,21 @@ def build_conformance_report(outcome: Outcome, subject: Subject, files: Sequence
 
 def write_junit(outcome: Outcome, subject: Subject) -> str:
     """The results as JUnit XML: a suite for each chapter, a test case for each case."""
-    root = ElementTree.Element("testsuites", name=f"conformance of node {subject.sheet.node}",
-                               tests=str(len(outcome.results)), failures=str(outcome.count(Verdict.FAIL)))
-    for chapter, results in _by_chapter(outcome.results):
-        suite = ElementTree.SubElement(
-            root, "testsuite", name=f"{chapter} {CHAPTERS[chapter]}", tests=str(len(results)), errors="0",
-            failures=str(_count(results, Verdict.FAIL)),
-            skipped=str(_count(results, Verdict.SKIPPED) + _count(results, Verdict.NOT_APPLICABLE)),
-            time=f"{sum(result.seconds for result in results):.3f}")
-        for result in results:
-            case = ElementTree.SubElement(suite, "testcase", name=f"{result.number} {result.name}",
-                                          classname=f"node{subject.sheet.node}.chapter{chapter}",
-                                          time=f"{result.seconds:.3f}")
-            measured = _clean(result.measured)
-            if result.verdict is Verdict.FAIL:
-                failure = ElementTree.SubElement(case, "failure", message=measured)
-                failure.text = f"CiA 301 {_clean(result.section)}: expected {_clean(result.expected)}"
-            elif result.verdict is Verdict.PASS:
-                ElementTree.SubElement(case, "system-out").text = measured
-            else:
-                ElementTree.SubElement(case, "skipped", message=f"{result.verdict.value}: {measured}")
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+    node = subject.sheet.node
+    suites = [junit.TestSuite(f"{chapter} {CHAPTERS[chapter]}",
+                              [_make_test_case(result, f"node{node}.chapter{chapter}") for result in results])
+              for chapter, results in _by_chapter(outcome.results)]
+    return junit.write_junit(f"conformance of node {node}", suites)
 
 
-def _clean(text: str) -> str:
-    """Without the control characters that XML does not allow."""
-    return re.sub(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD]", "?", text)
+def _make_test_case(result: Result, classname: str) -> junit.TestCase:
+    case = junit.TestCase(f"{result.number} {result.name}", classname, result.seconds)
+    if result.verdict is Verdict.FAIL:
+        return case._replace(problem="failure", message=result.measured,
+                             detail=f"CiA 301 {result.section}: expected {result.expected}")
+    if result.verdict is Verdict.PASS:
+        return case._replace(output=result.measured)
+    return case._replace(problem="skipped", message=f"{result.verdict.value}: {result.measured}")
 
 
 def _describe(outcome: Outcome) -> str:

@@ -110,6 +110,7 @@ class Check:
     signal: str = _describe_field("what was looked at")
     unit: str = _describe_field("of value, low and high")
     detail: str = _describe_field("why, in words", default="")
+    requirement: str = _describe_field("ids of the requirements that it verifies, with commas between them", default="")
 
 
 Record = Signals | Timing | Event | NmtState | Check

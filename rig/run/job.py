@@ -92,12 +92,15 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     bundle = _select_attachments(attachments, _SEQUENCE_FOLDER)
     if "model.toml" not in attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
-    codes = [ForeignCode(name, content) for name, content in attachments.items() if name.startswith(_EFFECT_FOLDER)]
+    effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
+                    if name.startswith(_EFFECT_FOLDER)]
+    codes = [*effect_codes, *(ForeignCode(_SEQUENCE_FOLDER + name, content) for name, content in bundle.items()
+                              if name.endswith(".py"))]
     for name in (*(code.name for code in codes), *(_SEQUENCE_FOLDER + name for name in bundle if name[-5:] == ".toml")):
         _require_file_name(path, name)
     settings = _read_settings(path, said)
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
-    effects = _load_effect_files(codes)
+    effects = _load_effect_files(effect_codes)
     model = parse_model(parse_toml(_decode(path, "model.toml", attachments["model.toml"]), f"{path}: model.toml"),
                         f"{path}: model.toml")
     require_bench_cycle(model, f"{path}: model.toml")

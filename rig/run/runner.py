@@ -41,6 +41,7 @@ from rig.run.soft_time import explain_soft_time
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
+from rig.sequences.python_parts import StepRun
 
 Diagnose = Callable[[Trace], dict[str, Any]]
 
@@ -59,19 +60,49 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
             for.
 
     Raises:
-        RigError: bad input, a missing bus or node, or a log that cannot be written. The log is closed first.
+        RigError: bad input, an error in the user's Python code, a missing bus or node, or a log that cannot be
+            written. The log is closed first.
     """
     if job.plant != "external":  # here, where an effect that cannot be compiled is still reported as bad input
         Actuator(job.scenario.model).warm()
     if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
         compile_cycle(job.realtime)
-    with lock_folder(folder), open_participants(job) as participants:
-        prepare()
-        with (open_recorder(job, folder) as recorder,
-              contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
-            outcome = play_job(job, folder, session, recorder, progress, diagnose)
-        outcome.save()
+    with lock_folder(folder), play_user_steps(job, folder) as finished:
+        with open_participants(job) as participants:
+            prepare()
+            with (open_recorder(job, folder) as recorder,
+                  contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
+                outcome = play_job(job, folder, session, recorder, progress, diagnose)
+            outcome.save()
+        finished.append(outcome)
     return outcome
+
+
+@contextlib.contextmanager
+def play_user_steps(job: Job, folder: Path) -> Iterator[list[Outcome]]:
+    """Play the user's steps before and after what is inside, the latter whatever happens there.
+
+    Whoever is inside puts the outcome into the list, if there is one.
+
+    Raises:
+        InputError: an error in a step; an exception of the run comes first.
+    """
+    finished: list[Outcome] = []
+    try:
+        _play_steps(job, folder, "before", "")
+        yield finished
+    except BaseException:
+        with contextlib.suppress(InputError):
+            _play_steps(job, folder, "after", "")
+        raise
+    _play_steps(job, folder, "after", finished[0].verdict)
+
+
+def _play_steps(job: Job, folder: Path, when: str, verdict: str) -> None:
+    run = StepRun(job.sequence.title, folder, job.seed, job.list_settings(), verdict)
+    for step in job.sequence.steps:
+        if step.when == when:
+            step.play(run)
 
 
 def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progress: Progress,
@@ -210,4 +241,5 @@ def _count_lost_frames(history: History) -> dict[str, int]:
 
 def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
-                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail)
+                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail,
+                 requirement=", ".join(check.requirement))

@@ -36,6 +36,7 @@ class CheckResult(NamedTuple):
     t0: float  # s, the window
     t1: float
     detail: str
+    requirement: tuple[str, ...] = ()  # ids of the requirements that the check verifies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,7 @@ class Check(ABC):
     low: InUnit | None = None
     high: InUnit | None = None
     unit: str = ""
+    requirement: str | tuple[str, ...] = ()  # id of the requirement that it verifies, or several
 
     def __post_init__(self) -> None:
         require_check(self.low is not None or self.high is not None, "", "a low, a high, or both")
@@ -60,12 +62,20 @@ class Check(ABC):
             require_check(0 <= t0 < t1 <= LATEST_TIME, "window",
                           f"[t0, t1] with 0 <= t0 < t1 <= {LATEST_TIME:g}, not {[t0, t1]}")
         require_check(0 <= self.skip <= LONGEST, "skip", f"0 s or more, at most {LONGEST:g}, not {self.skip:g}")
-        find_scale(self.shown_unit, self.si_unit)
+        for word in self.requirements:
+            require_check(bool(word.strip()) and word.isprintable(), "requirement",
+                          f"the id of a requirement, such as REQ-12, not {word!r}")
+        _ = self.scale  # raises InputError for a unit of something else
 
     @property
     def about(self) -> str:
         """The signal, or the event, that is judged."""
         return str(getattr(self, "signal", None) or getattr(self, "event", ""))
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """The ids of the requirements that the check verifies."""
+        return (self.requirement,) if isinstance(self.requirement, str) else self.requirement
 
     @property
     def si_unit(self) -> str:
@@ -74,6 +84,11 @@ class Check(ABC):
     @property
     def shown_unit(self) -> str:
         return self.unit or self.si_unit
+
+    @property
+    def scale(self) -> float:
+        """How many SI units the unit of the limits is."""
+        return find_scale(self.shown_unit, self.si_unit)
 
     @abstractmethod
     def measure(self, run: RunData, span: slice) -> float:
@@ -86,7 +101,7 @@ class Check(ABC):
             span = run.find_rows(self.window, self.skip)
             t0, t1 = span.start / RATE, span.stop / RATE
             missing = run.count_missing(self.about, span)
-            measured = self.measure(run, span) / find_scale(self.shown_unit, self.si_unit)
+            measured = self.measure(run, span) / self.scale
             if not isfinite(measured):
                 raise NotMeasurable(f"the measure came to {measured:g}")
             value, detail = measured, f"{missing} missing samples bridged" if missing else ""
@@ -96,4 +111,5 @@ class Check(ABC):
             detail = f"the measure failed ({type(error).__name__}: {error})"
         low, high = (nan if limit is None else limit for limit in (self.low, self.high))
         passed = not (value != value or value < low or value > high)  # NaN limits compare false
-        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail)
+        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail,
+                           self.requirements)

@@ -25,14 +25,18 @@ from rig.sequences.fault_parameters import Known, check_faults, check_overrides,
 from rig.sequences.faults import Fault, Parameter, Plan
 from rig.sequences.guards import Guard
 from rig.sequences.protocol import ProtocolLimits
+from rig.sequences.python_parts import VALUES_OF_PART, PythonCheck, PythonPart, PythonSegment, Step
 from rig.sequences.required_firmware import RequiredFirmware
 from rig.sequences.run_data import MAIN
 from rig.sequences.tables import Place
 from rig.sequences.timing import TimingPolicy
+from rig.sequences.user_code import UserModules, require_function_name
 
 ReadFile = Callable[[str], bytes]
 
-_KINDS: tables.Kinds = {Segment: segments.KINDS, Fault: faults.KINDS, Check: checks.KINDS}
+SEGMENT_KINDS: dict[str, type[Segment]] = {**segments.KINDS, PythonSegment.kind: PythonSegment}
+CHECK_KINDS: dict[str, type[Check]] = {**checks.KINDS, PythonCheck.kind: PythonCheck}
+_KINDS: tables.Kinds = {Segment: SEGMENT_KINDS, Fault: faults.KINDS, Check: CHECK_KINDS}
 _OWN = {"key": False}  # a field that the program fills in
 
 
@@ -61,6 +65,7 @@ class Sequence:
     faults: tuple[Fault, ...] = ()
     checks: tuple[Check, ...] = ()
     guards: tuple[Guard, ...] = ()
+    steps: tuple[Step, ...] = ()
     ends: Literal["completed", "safe_state"] = "completed"
     model: ModelChoice = ModelChoice()
     protocol: ProtocolLimits = field(default_factory=ProtocolLimits)
@@ -68,7 +73,7 @@ class Sequence:
     firmware: RequiredFirmware = field(default_factory=RequiredFirmware)
     name: str = field(default="", metadata=_OWN)  # the file's, without folders
     source: str = field(default="", metadata=_OWN, repr=False)
-    files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV files, by name in source
+    files: Mapping[str, bytes] = field(default_factory=dict, metadata=_OWN, repr=False)  # CSV and Python files, by name
 
     @property
     def duration(self) -> float:
@@ -118,12 +123,16 @@ class Sequence:
         return {fault.label: fault.start for fault in self.faults}
 
     def bundle(self) -> dict[str, bytes]:
-        """The text and the CSV files it uses, by name: all that `from_bundle` needs to make the same sequence."""
+        """The text and the files it uses, by name: all that `from_bundle` needs to make the same sequence."""
         return {self.name: self.source.encode(), **self.files}
 
     @classmethod
     def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = find_quantity) -> Sequence:
-        """The sequence of a bundle; raises InputError if a file is not in it or does not make one."""
+        """The sequence of a bundle; Python files in it run.
+
+        Raises:
+            InputError: a file is not in it or does not make a sequence.
+        """
         sources = [name for name in bundle if name.endswith(".toml")]
         if len(sources) != 1:
             raise InputError("bundle", "", f"one .toml file, not {len(sources)}")
@@ -144,7 +153,7 @@ def load_sequence(name_or_path: str | Path, known: Known = find_quantity) -> Seq
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
-        name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV files in it are sought beside it.
+        name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it.
         known: raises InputError for the name of a parameter that does not exist.
 
     Raises:
@@ -177,10 +186,17 @@ def _read_beside(folder: Path) -> ReadFile:
 
 
 def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = find_quantity) -> Sequence:
-    """The sequence of a TOML text; `read_file` gives the bytes of the CSV files that it names."""
+    """The sequence of a TOML text; `read_file` gives the bytes of the CSV and Python files that it names.
+
+    The Python files run.
+
+    Raises:
+        InputError: the file, line and key that cannot be used, or the line of a Python file.
+    """
     table, place = tables.parse_table(text, name)
     sequence = tables.build_dataclass(Sequence, table, place, _KINDS)
     sequence = replace(sequence, name=Path(name).name, source=text)
+    sequence = _with_functions(sequence, place, read_file)
     for phase in ("setup", "main", "cleanup", "load"):
         sequence = _with_csv(sequence, phase, place.at(phase), read_file)
     _check_phases(sequence, place)
@@ -211,6 +227,27 @@ def _with_csv(sequence: Sequence, phase: str, place: Place, read_file: ReadFile)
     return replace(sequence, files=embedded, **filled)
 
 
+def _with_functions(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
+    """The sequence with the functions of its parts in Python filled in from their files."""
+    modules, embedded = UserModules(Path(place.file).parent), dict(sequence.files)
+
+    def fill_in(part: PythonPart, here: Place) -> PythonPart:
+        file, name = require_function_name(part.python)
+        try:
+            embedded[file] = embedded.get(file) or read_file(file)
+        except InputError as error:
+            raise here.at("python").refuse(f"a Python file beside the sequence; {error}") from error
+        function = modules.find_function(file, embedded[file], name)
+        function.require_arguments(VALUES_OF_PART[type(part)], part.arguments)
+        return replace(part, function=function)
+
+    filled: dict[str, Any] = {}
+    for key in ("setup", "main", "cleanup", "load", "checks", "steps"):
+        filled[key] = tuple(fill_in(part, place.at(key, i)) if isinstance(part, PythonPart) else part
+                            for i, part in enumerate(getattr(sequence, key)))
+    return replace(sequence, files=embedded, **filled)
+
+
 def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in ("setup", "main", "cleanup", "load"):
         called = name_sections(getattr(sequence, phase))
@@ -233,7 +270,10 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
     for phase, most, unit in (("setup", FARTHEST, "m"), ("main", FARTHEST, "m"), ("cleanup", FARTHEST, "m"),
                               ("load", STRONGEST, "N")):
         with np.errstate(all="ignore"):  # what overflows is refused below
-            values, sections, end = build_profile(getattr(sequence, phase), 0.0 if phase == "load" else start)
+            try:
+                values, sections, end = build_profile(getattr(sequence, phase), 0.0 if phase == "load" else start)
+            except InputError as error:  # a function that computes a segment
+                raise (place.at(phase).refuse(error.expected) if error.where == "segment" else error) from error
         for i, section in enumerate(sections):
             last = end if i == len(sections) - 1 else 0.0
             largest = np.abs((*values[section.start:section.stop], last)).max()

@@ -120,11 +120,11 @@ def _describe_off(off: float | None, name: str, model: Model) -> str:
 
 def list_checks(model: Model) -> Rows:
     """The kinds of checks of a sequence, with their own keys and defaults."""
-    from rig.sequences.checks import KINDS as CHECKS
+    from rig.sequences.sequence import CHECK_KINDS
 
     return [{"name": name, "measures": (kind.__doc__ or "").split("\n")[0].rstrip("."),
-             "unit": kind.si or "the signal's", "keys": "\n".join(_describe_keys(kind))}
-            for name, kind in CHECKS.items()]
+             "unit": "any" if name == "python" else kind.si or "the signal's", "keys": "\n".join(_describe_keys(kind))}
+            for name, kind in CHECK_KINDS.items()]
 
 
 def _describe_keys(kind: type[Any]) -> Iterator[str]:
@@ -135,7 +135,7 @@ def _describe_keys(kind: type[Any]) -> Iterator[str]:
 
     common = {f.name for f in fields(Check)} - {"window"}
     for f in fields(kind):
-        if f.name not in common:
+        if f.name not in common and f.metadata.get("key", True):
             yield f.name if f.default is MISSING else f"{f.name} = {f.default!r}"
 
 
@@ -160,6 +160,7 @@ USES: Mapping[str, str] = {
     "signals": "Choose outputs with --signals xj,p12,xs.",
     "sequences": "Run one with rig run NAME.",
     "effects": "Add one with --set EFFECT.PARAMETER=VALUE; rig effects NAME shows its law.",
-    "checks": "Use one in a sequence by its kind; every check also takes name, low, high, unit, window and skip.",
+    "checks": ("Use one in a sequence by its kind; every check also takes name, low, high, unit, window, skip and "
+               "requirement."),
     "models": "Choose one with --model NAME, or a file.",
 }
