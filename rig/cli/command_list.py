@@ -11,6 +11,7 @@ HELP_OF_COMMAND = {
     "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
     "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
     "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
+    "diff": "hold two or more runs side by side: signals, checks, timing, model, firmware",
     "doctor": "report what this machine can do: CAN, vcan, real-time rights, viewer",
     "effects": "list the catalogue of physical effects, or show one in detail",
     "explain": "find the physical effects that a model lacks, and rank the candidates",

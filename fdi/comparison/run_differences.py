@@ -1,0 +1,273 @@
+"""Two or more runs side by side: their signals subtracted row by row, their checks matched.
+
+The first run is the reference. Rows are aligned by the command: equal commands belong to one cycle. Where the commands
+differ nothing is subtracted. A difference is held against the noise of both runs, which each run's own second
+differences show (a lower bound: noise that is not white has less in them).
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.comparison.matched_checks import MatchedCheck, match_checks
+from fdi.estimation.noise import FINEST, floor_from_data
+from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
+from fdi.trace.signals import SIGNALS
+from fdi.trace.trace import Trace, rms
+
+Floats = NDArray[np.float64]
+COMPARED = ("xj", "p12", "xs", "cor", "load")
+SAME_COMMAND = 1.5e-7  # m; the bus carries steps of 1e-7 m
+
+
+class Run(NamedTuple):
+    """A run of a comparison: its letter, the text the user gave, and its trace."""
+
+    label: str  # A, B, ..
+    source: str
+    trace: Trace
+
+
+@dataclass(frozen=True)
+class SignalDifference:
+    """How one signal differs from that of the reference, SI.
+
+    `noise` is the noise floor of the reference and of the other run.
+    """
+
+    name: str
+    unit: str
+    rms: float
+    largest: float  # with its sign: other run minus reference
+    t: float  # s, time of the reference at which the difference is largest
+    noise: tuple[float, float]
+    samples: int
+    calm_share: float  # of the samples, those within two noise floors of both runs
+    is_equal: bool  # to the last digit
+
+    @property
+    def ratio(self) -> float:
+        """RMS difference over what the noise of both runs leaves; 1 for two runs that differ only by noise."""
+        expected = math.hypot(*self.noise)
+        if expected > 0.0:
+            return self.rms / expected
+        return 0.0 if self.rms == 0.0 else float("inf")
+
+    @property
+    def is_within_noise(self) -> bool:
+        """Whether noise explains the difference."""
+        return self.is_equal or self.ratio <= RUN_DIFFERENCE_RATIO
+
+
+@dataclass(frozen=True, eq=False)
+class RunPair:
+    """A run against the reference. `t` and each column of `differences` have shape (n,): rows that both runs have.
+
+    The differences are NaN where a sample is missing or the commands differ.
+    """
+
+    run: Run
+    signals: tuple[SignalDifference, ...]
+    has_same_command: bool
+    common: float  # s, duration over which the commands agree
+    overlap: float  # s, duration that both runs cover
+    offset: float  # s, time of the reference minus time of this run, for the same cycle
+    t: Floats  # s, of the reference
+    differences: dict[str, Floats]
+    not_compared: dict[str, str]  # signal: reason
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RunDifferences:
+    """Several runs against the first of them."""
+
+    runs: tuple[Run, ...]
+    pairs: tuple[RunPair, ...]
+    checks: tuple[MatchedCheck, ...]
+
+    @property
+    def verdict(self) -> str:
+        """SAME if noise explains all differences and no check changed its verdict; otherwise DIFFERENT."""
+        is_same = all(pair.has_same_command and pair.signals and all(s.is_within_noise for s in pair.signals)
+                      for pair in self.pairs)
+        return "SAME" if is_same and not any(check.is_changed for check in self.checks) else "DIFFERENT"
+
+
+def compare_runs(sources: Sequence[str], traces: Sequence[Trace]) -> RunDifferences:
+    """Compare runs with the first one.
+
+    Args:
+        sources: name of each trace, for people.
+        traces: two or more, with all phases or only their main phase.
+    """
+    runs = tuple(Run(_make_label(i), source, trace)
+                 for i, (source, trace) in enumerate(zip(sources, traces, strict=True)))
+    pairs = tuple(_subtract(runs[0], other) for other in runs[1:])
+    return RunDifferences(runs, pairs, tuple(match_checks([run.trace.checks for run in runs])))
+
+
+def _make_label(number: int) -> str:
+    """A to Z, then A1, B1 ..
+
+    >>> _make_label(1), _make_label(27)
+    ('B', 'B1')
+    """
+    return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
+
+
+class _Rows(NamedTuple):
+    """The rows that two runs share: times of the reference, shape (n,), and where each run is sampled."""
+
+    t: Floats
+    offset: float
+    reference: Trace
+    other: Trace
+
+    def sample(self, name: str) -> tuple[Floats, Floats]:
+        """A signal of both runs at these rows."""
+        return (sample_column(self.reference, name, self.t), sample_column(self.other, name, self.t - self.offset))
+
+
+def sample_column(trace: Trace, name: str, t: Floats) -> Floats:
+    """A column of a trace at times within it: its rows where they meet the times, else straight lines between rows."""
+    rows = (t - trace.t[0]) / trace.period
+    nearest: Floats = np.rint(rows)
+    values = trace.column(name)
+    if not len(t) or float(np.abs(rows - nearest).max()) < 0.01:
+        picked: Floats = values[np.clip(nearest.astype(int), 0, len(values) - 1)]
+        return picked
+    between: Floats = np.interp(rows, np.arange(len(values)), values)
+    return between
+
+
+def _subtract(reference: Run, other: Run) -> RunPair:
+    a, b = reference.trace, other.trace
+    offset = find_offset(a, b)
+    rows = _share_rows(a, b, offset)
+    agrees = _find_common_rows(rows)
+    period = max(a.period, b.period)
+    overlap, common = len(rows.t) * period, float(agrees.sum()) * period
+    is_same = len(rows.t) > 0 and bool(agrees.mean() > 0.995)  # missing rows and edges of interpolated steps aside
+    differences, found, left_out = {}, [], {}
+    for name in COMPARED:
+        reason = _find_obstacle(name, reference, other)
+        if reason:
+            left_out[name] = reason
+        if reason or name not in a.signals:
+            continue
+        first, second = rows.sample(name)
+        if not np.nan_to_num(first).any() and not np.nan_to_num(second).any():
+            continue  # no load in either run
+        difference = np.where(agrees, second - first, np.nan)
+        known = ~np.isnan(difference)
+        if not known.any():
+            left_out[name] = "no row with equal commands in which both runs have it"
+            continue
+        differences[name] = difference
+        found.append(_measure_difference(name, a.units[name], rows.t, difference, (first, second)))
+    return RunPair(other, tuple(found), is_same, common, overlap, offset, rows.t, differences, left_out,
+                   tuple(_list_notes(reference, other, offset, rows, agrees, is_same)))
+
+
+def _find_obstacle(name: str, reference: Run, other: Run) -> str:
+    """Why a signal cannot be compared; "" if it can, or if no run has it."""
+    has = [run for run in (reference, other) if name in run.trace.signals]
+    if len(has) == 1:
+        return f"only {has[0].label} has it"
+    a, b = (run.trace.units.get(name, SIGNALS[name].unit) for run in (reference, other))
+    return f"in {a} in {reference.label}, in {b} in {other.label}" if has and a != b else ""
+
+
+def _measure_difference(name: str, unit: str, t: Floats, difference: Floats,
+                        columns: tuple[Floats, Floats]) -> SignalDifference:
+    known = np.flatnonzero(~np.isnan(difference))
+    row = int(known[np.argmax(np.abs(difference[known]))])
+    is_equal = not difference[known].any()
+    noise = [max(float(floor_from_data(column).value), FINEST.get(name, 0.0)) for column in columns]
+    calm = np.abs(difference[known]) <= NOISE_BAND_RATIO * math.hypot(*noise)
+    return SignalDifference(name, unit, rms(difference), float(difference[row]), float(t[row]), (noise[0], noise[1]),
+                            len(known), float(calm.mean()), is_equal)
+
+
+def find_offset(a: Trace, b: Trace) -> float:
+    """Time of `a` minus time of `b`, s, at which their commands agree in most rows.
+
+    Tried are equal times, equal first rows, and the offset at which the changes of the commands correlate best.
+    """
+    best, most = 0.0, -1
+    for offset in _propose_offsets(a, b):
+        rows = _share_rows(a, b, offset)
+        count = int(_find_common_rows(rows).sum())
+        if count > 1.002 * most:  # the first of equals: the later ones are less natural
+            best, most = offset, count
+        if count > 0.998 * min(len(a) * a.period, len(b) * b.period) / max(a.period, b.period):
+            break
+    return best
+
+
+def _propose_offsets(a: Trace, b: Trace) -> Iterator[float]:
+    yield 0.0
+    yield float(a.t[0] - b.t[0])
+    period = max(a.period, b.period)
+    first, second = (_sample_rates(trace, period) for trace in (a, b))
+    if first.any() and second.any():
+        yield float(a.t[0] - b.t[0]) + _correlate(first, second) * period
+
+
+def _sample_rates(trace: Trace, period: float) -> Floats:
+    """Changes of the command from row to row, one row per `period`."""
+    t = np.arange(trace.t[0], trace.t[-1] + 0.5 * trace.period, period)
+    return np.nan_to_num(np.diff(sample_column(trace, "com", t), prepend=np.nan))
+
+
+def _correlate(first: Floats, second: Floats) -> int:
+    """Rows by which `second` has to be moved to fit `first` best."""
+    size = 1 << (len(first) + len(second)).bit_length()
+    product = np.fft.rfft(np.sign(first), size) * np.conj(np.fft.rfft(np.sign(second), size))
+    lag = int(np.argmax(np.fft.irfft(product, size)))
+    return lag if lag < size // 2 else lag - size
+
+
+def _share_rows(a: Trace, b: Trace, offset: float) -> _Rows:
+    """The rows of the slower run, on the reference's time, that lie within both runs."""
+    slower = a.t if a.period >= b.period else b.t + offset
+    small = 1e-6 * a.period
+    low = max(a.t[0], b.t[0] + offset) - small
+    high = min(a.t[-1], b.t[-1] + offset) + small
+    return _Rows(slower[(slower >= low) & (slower <= high)], offset, a, b)
+
+
+def _find_common_rows(rows: _Rows) -> NDArray[np.bool_]:
+    """The rows in which both commands are known and equal."""
+    first, second = rows.sample("com")
+    with np.errstate(invalid="ignore"):
+        agrees: NDArray[np.bool_] = np.abs(first - second) <= SAME_COMMAND
+    return agrees
+
+
+def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: NDArray[np.bool_],
+                is_same: bool) -> Iterator[str]:
+    """What a reader must know before trusting the differences."""
+    a, b = reference.trace, other.trace
+    where = f"{other.label} against {reference.label}"
+    if not is_same:
+        share = 100.0 * float(agrees.mean()) if len(agrees) else 0.0
+        yield (f"{where}: the commands differ; they agree in {share:.3g} % of the {len(agrees)} rows that both runs "
+               "cover, and only these are compared. What came before still acts in them")
+    if abs(offset) > 0.5 * min(a.period, b.period):
+        yield f"{where}: aligned by the command; t = {offset:.6g} s of {reference.label} is t = 0 of {other.label}"
+    if abs(a.period / b.period - 1.0) > 1e-6:
+        yield (f"{where}: rows every {1e3 * a.period:g} ms and {1e3 * b.period:g} ms; compared in the rows of the "
+               "slower run, with straight lines between the rows of the faster one")
+    uncovered = max(len(a) * a.period, len(b) * b.period) - len(rows.t) * max(a.period, b.period)
+    if uncovered > 2.0 * max(a.period, b.period):
+        yield f"{where}: {uncovered:.3f} s of the longer run have no counterpart"
+    for run in (reference, other):
+        if run.trace.gaps:
+            yield f"{run.label}: {sum(gap.cycles for gap in run.trace.gaps)} cycles are missing"
