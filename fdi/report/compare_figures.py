@@ -8,8 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.comparison.compare import Comparison
+from fdi.comparison.deviation_map import DeviationMap, map_deviation
 from fdi.comparison.residuals import Depends, ResidualTests
-from fdi.report.drawing import COMMAND, DRAWN_UNITS, INK, RED, shade_sections, start_figure, thin_line, to_svg
+from fdi.report.drawing import (
+    ABOVE,
+    COMMAND,
+    INK,
+    LEVELS,
+    RED,
+    choose_drawn_unit,
+    shade_sections,
+    start_figure,
+    thin_line,
+    to_svg,
+)
 from fdi.report.numbers import SIGNAL_NAMES, format_ratio
 from fdi.thresholds import NOISE_BAND_RATIO
 
@@ -33,7 +45,7 @@ def draw_overview(c: Comparison) -> str:
         axes[0].plot(*thin_line(run.t, run.com * 1e3), color=COMMAND, lw=2.2, label="Com, command")
         axes[0].plot(*thin_line(run.t, run.xj * 1e3), color=COLOURS["xj"], lw=1.0, label="XJ, ram")
         axes[0].set_ylabel("position [mm]")
-        axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)
+        axes[0].legend(ncols=2, **ABOVE)
         for i, name in enumerate(names):
             _draw_replay(axes[1 + 2 * i], c, name)
             _draw_residual(axes[2 + 2 * i], c, name)
@@ -47,16 +59,16 @@ def draw_overview(c: Comparison) -> str:
 
 
 def _draw_replay(ax: Axes, c: Comparison, name: str) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], DRAWN_UNITS[name]
+    label, (unit, scale) = SIGNAL_NAMES[name], LEVELS[name]
     t = c.trace.t
     ax.plot(*thin_line(t, c.trace.mask_unusable(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
     ax.plot(*thin_line(t, c.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
     ax.set_ylabel(f"{label} [{unit}]")
-    ax.legend(loc="upper right", ncols=2, frameon=False)
+    ax.legend(ncols=2, **ABOVE)
 
 
 def _draw_residual(ax: Axes, c: Comparison, name: str) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], DRAWN_UNITS[name]
+    label, (unit, scale) = SIGNAL_NAMES[name], choose_drawn_unit(name, c.signals[name].error)
     floor = NOISE_BAND_RATIO * c.signals[name].floor.value * scale
     ax.axhspan(-floor, floor, color=NOISE, alpha=0.25, lw=0)
     ax.plot(*thin_line(c.trace.t, c.replay.residual[name] * scale), color=INK, lw=0.7)
@@ -85,6 +97,45 @@ def draw_error_shares(c: Comparison) -> str:
         ax.set_xlabel("share of the squared error [%]")
         ax.set_xlim(0, 125 * max(p.share for p in places))
         return to_svg(figure, "shares")
+
+
+def draw_deviation_map(c: Comparison) -> str:
+    """Error over noise floor of each signal by speed and amplitude of the ram; "" without rows enough."""
+    from matplotlib.colors import LogNorm
+
+    found = map_error(c)
+    if found is None:
+        return ""
+    names = list(found.ratio)
+    most = max(float(np.nanmax(ratio)) for ratio in found.ratio.values())
+    norm = LogNorm(1.0, max(most, 10.0))
+    with start_figure(1.2 + 0.42 * len(found.amplitudes)) as figure:
+        axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+        for ax, name in zip(axes, names, strict=True):
+            ratio = found.ratio[name]
+            ax.pcolormesh(np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0)
+            for (row, column), value in np.ndenumerate(ratio):
+                if np.isfinite(value):
+                    colour = "white" if norm(value) > 0.6 else INK
+                    ax.text(column + 0.5, row + 0.5, format_ratio(float(value)), ha="center", va="center", fontsize=8,
+                            color=colour)
+            ax.set_xticks(range(len(found.speeds)), _name_edges(found.speeds))
+            ax.set_title(SIGNAL_NAMES[name], fontsize=9)
+            ax.set_xlabel("speed [mm/s]")
+            ax.grid(visible=False)
+        axes[0].set_yticks(range(len(found.amplitudes)), _name_edges(found.amplitudes))
+        axes[0].set_ylabel("amplitude [mm]")
+        return to_svg(figure, "map")
+
+
+def map_error(c: Comparison) -> DeviationMap | None:
+    """The residuals of a comparison by speed and amplitude, over their noise floors."""
+    floor = {name: s.floor.value for name, s in c.signals.items() if s.floor.value > 0.0}
+    return map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
+
+
+def _name_edges(edges: Floats) -> list[str]:
+    return ["" if np.isinf(edge) else f"{1e3 * edge:g}" for edge in edges]
 
 
 def draw_whiteness(c: Comparison) -> str:
@@ -144,7 +195,7 @@ def draw_dependence(c: Comparison) -> str:
 
 
 def _draw_means(axes: Sequence[Axes], kinds: Sequence[str], by: dict[str, Depends], name: str, floor: float) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], DRAWN_UNITS[name]
+    label, (unit, scale) = SIGNAL_NAMES[name], choose_drawn_unit(name, max((d.size for d in by.values()), key=abs))
     for ax, kind in zip(axes, kinds, strict=True):
         if kind not in by:
             ax.set_axis_off()

@@ -279,6 +279,10 @@ def _show_figures(c: Comparison) -> list[Section]:
         sections.append(Section("Where", [_tabulate_places(c), Figure(
             "Share of each section in the squared error. The longest bar shows where to look first.",
             partial(compare_figures.draw_error_shares, c))], medium=Medium.PAGE))
+    sections.append(Section("By speed and amplitude", [Figure(
+        "Error over noise floor by speed of the ram (over 20 rows) and by amplitude (half its range within 0.25 s "
+        "before and after). 1 is noise; dark cells show at which motion the model fails. Empty: fewer than 30 rows.",
+        partial(compare_figures.draw_deviation_map, c))]))
     sections.append(Section("Is the residual noise", [Figure(
         "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within green: "
         "the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat shows the "

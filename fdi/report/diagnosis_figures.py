@@ -26,7 +26,7 @@ from fdi.diagnosis.bands import (
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.diagnosis.precursors import Precursor
 from fdi.diagnosis.rms_grid import Grid
-from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, label_log_axis, thin_line, to_svg
+from fdi.report.drawing import ABOVE, COMMAND, GREEN, INK, RED, STYLE, label_log_axis, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
@@ -52,7 +52,7 @@ def draw_overview(trace: Trace, judged: BandVerdict) -> str:
         _shade_events(ax, judged.events, 1.0, 0.0)
         ax.set_ylabel("position [mm]")
         ax.set_xlabel("time [s]")
-        ax.legend(loc="upper right", ncols=2, frameon=False)
+        ax.legend(ncols=2, **ABOVE)
         return to_svg(figure, "overview")
 
 
@@ -70,7 +70,7 @@ def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
             _draw_step(ax, trace, bands, step, place[step.section], judged)
         for ax in axes[len(bands.steps):]:
             ax.set_axis_off()
-        axes[0].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False)
         return to_svg(figure, "steps")
 
 
@@ -105,7 +105,7 @@ def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
             _draw_ramp(pair, trace, ramp, place[ramp.section], judged)
         axes[0, 0].set_ylabel("error [um]")
         axes[1, 0].set_ylabel("speed beyond the\ndemand's [mm/s]")
-        axes[0, -1].legend(loc="upper right", frameon=False, fontsize=7, ncols=2)
+        figure.legend(*axes[0, -1].get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False)
         return to_svg(figure, "ramps")
 
 
@@ -212,5 +212,5 @@ def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
         ax.invert_yaxis()
         ax.grid(axis="y", visible=False)
         ax.set_xlabel("shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")
-        ax.legend(loc="lower right", frameon=False)
+        ax.legend(ncols=2, **ABOVE)
         return to_svg(figure, "telling")

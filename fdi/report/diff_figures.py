@@ -5,7 +5,7 @@ import math
 from typing import TYPE_CHECKING
 
 from fdi.comparison.run_differences import RunDifferences, SignalDifference
-from fdi.report.drawing import COMMAND, GREEN, shade_sections, start_figure, thin_line, to_svg
+from fdi.report.drawing import ABOVE, COMMAND, GREEN, LEVELS, shade_sections, start_figure, thin_line, to_svg
 from fdi.report.numbers import SIGNAL_NAMES, choose_unit
 from fdi.thresholds import NOISE_BAND_RATIO
 
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLOURS = ("#1f6feb", "#d9730d", "#bf3989", "#0f8b8d", "#8250df", "#57606a")  # of the runs, the reference first
-LEVELS = {"xj": ("mm", 1e3), "cor": ("mA", 1e3), "load": ("kN", 1e-3), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}
-"""Unit and scale of a signal itself, as on a run's page."""
 
 
 def choose_difference_units(found: RunDifferences) -> dict[str, tuple[float, str]]:
@@ -43,8 +41,7 @@ def draw_differences(found: RunDifferences) -> str:
         for i, name in enumerate(units):
             _draw_signal(axes[1 + 2 * i], found, name)
             _draw_difference(axes[2 + 2 * i], found, name, units[name])
-        place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "frameon": False, "borderaxespad": 0.0}
-        axes[min(1, len(axes) - 1)].legend(ncols=len(found.runs), **place)
+        axes[min(1, len(axes) - 1)].legend(ncols=len(found.runs), **ABOVE)
         for ax in axes:
             shade_sections(ax, reference)
         axes[-1].set_xlabel("time of A [s]")

@@ -11,9 +11,10 @@ from fdi.discovery.candidates import Candidate
 from fdi.discovery.model_file import Row
 from fdi.discovery.search import Hypothesis
 from fdi.report.drawing import (
+    ABOVE,
     COMMAND,
-    DRAWN_UNITS,
     INK,
+    choose_drawn_unit,
     label_log_axis,
     shade_sections,
     start_figure,
@@ -22,7 +23,7 @@ from fdi.report.drawing import (
 )
 from fdi.report.numbers import SIGNAL_NAMES
 from fdi.thresholds import NOISE_BAND_RATIO
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, rms
 
 if TYPE_CHECKING:
 
@@ -32,7 +33,7 @@ Floats = NDArray[np.float64]
 
 AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar"), "spool": (1e6, "um"),
         "current": (1e3, "mA"), "time": (1.0, "s")}
-BEFORE, AFTER, HELD, FLOOR = "#c9ced6", "#1f6feb", "#d9730d", "#2b8a3e"
+BEFORE, AFTER, HELD, FLOOR = "#9aa4b1", "#1f6feb", "#d9730d", "#2b8a3e"
 
 
 def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, floor: Mapping[str, float],
@@ -48,7 +49,7 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
         axes[0].plot(*thin_line(t, trace.com * 1e3), color=COMMAND, lw=1.6)
         axes[0].set_ylabel("Com [mm]")
         for i, (ax, name) in enumerate(zip(axes[1:], trace.outputs, strict=True)):
-            unit, scale = DRAWN_UNITS[name]
+            unit, scale = choose_drawn_unit(name, rms(before.fit.residuals[i, :n]))
             line = thin_line(t, -before.fit.residuals[i, :n] * scale)
             ax.plot(*line, color=BEFORE, lw=0.9, label="model as it was")
             if after is not None:
@@ -58,7 +59,7 @@ def draw_residuals(trace: Trace, before: Hypothesis, after: Hypothesis | None, f
                 ax.axhline(side * NOISE_BAND_RATIO * floor[name] * scale, color=FLOOR, lw=0.8, ls=":",
                            label="two noise floors" if side > 0 else None)
             ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
-        axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
+        axes[1].legend(ncols=3, **ABOVE)
         for ax in axes:
             shade_sections(ax, trace)
         axes[-1].set_xlabel("time [s]")
@@ -83,7 +84,7 @@ def draw_ranking(candidates: Sequence[Candidate], floor: Mapping[str, float], mo
         label_log_axis(ax.xaxis)
         ax.set_yticks(rows, [" + ".join([*c.beside, c.effect]) for c in shown])
         ax.set_xlabel("error of the worst signal over its noise floor")
-        ax.legend(loc="lower right", frameon=False)
+        ax.legend(ncols=3, **ABOVE)
         return to_svg(figure, "ranking")
 
 
@@ -105,7 +106,7 @@ def draw_ledger(rows: Sequence[Row], floor: Mapping[str, float]) -> str:
             ax.set_xticks(x, names, rotation=20, ha="right")
             ax.set_title(SIGNAL_NAMES[s], fontsize=9, color=INK)
         axes[0].set_ylabel("error over noise floor")
-        axes[0].legend(loc="upper right", frameon=False)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
         return to_svg(figure, "ledger")
 
 

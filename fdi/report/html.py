@@ -37,6 +37,7 @@ def load_templates() -> Environment:
     templates = Environment(loader=PackageLoader("fdi.report", "."), autoescape=True, trim_blocks=True,
                             lstrip_blocks=True)
     templates.globals["group_by_kind"] = _group_by_kind
+    templates.globals["figure_script"] = Path(__file__).with_name("figure.js").read_text(encoding="utf-8")
     return templates
 
 

@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.identification.identify import Estimate
-from fdi.report.drawing import COMMAND, DRAWN_UNITS, label_log_axis, shade_sections, start_figure, thin_line, to_svg
+from fdi.report.drawing import (
+    ABOVE,
+    COMMAND,
+    DRAWN_UNITS,
+    label_log_axis,
+    shade_sections,
+    start_figure,
+    thin_line,
+    to_svg,
+)
 from fdi.report.explain_figures import AFTER, BEFORE, FLOOR, HELD
 from fdi.report.numbers import SIGNAL_NAMES
 from fdi.thresholds import NOISE_BAND_RATIO
@@ -56,7 +65,7 @@ def draw_residuals(trace: Trace, before: Floats, after: Floats, floor: Mapping[s
             ax.set_ylim(-max(width, 1.2 * scale * float(np.nanmax(np.abs(after[i])))),
                         max(width, 1.2 * scale * float(np.nanmax(np.abs(after[i])))))
             ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
-        axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.0)
+        axes[1].legend(ncols=3, **ABOVE)
         for ax in axes:
             shade_sections(ax, trace)
         axes[-1].set_xlabel("time [s]; what is beyond an axis is cut off")

@@ -176,7 +176,7 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
                 ax.plot(grid.merged.kintas, grid.merged.fss, "D", color="#ffd33d", ms=5, mec=INK, label="G")
         axes[0].set_ylabel("FSS [N]")
         for ax in axes:
-            ax.legend(loc="upper right", fontsize=7)
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=False)
         return to_svg(figure, "maps")
 
 

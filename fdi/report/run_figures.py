@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from fdi.report.drawing import COMMAND, GREEN, INK, LINE_COLUMNS, RED, STYLE, shade_sections, thin_line, to_svg
+from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, shade_sections, thin_line, to_svg
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ def draw_signals(trace: Trace) -> str:
             if name == "xj":
                 ax.plot(*thin_line(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
             line = thin_line(trace.t, _bridge_short_gaps(values[name]) * scale)
-            ax.plot(*line, color=colour, lw=1.0, label="XJ, ram")
+            ax.plot(*line, color=colour, lw=1.0, label="XJ, ram" if name == "xj" else None)
             _mark_missing(ax, trace, values[name])
             ax.set_ylabel(label)
             if name == "close":
@@ -130,9 +130,9 @@ def _bridge_short_gaps(values: Floats) -> Floats:
     return np.where(near, np.interp(rows, known, values[known]), values)
 
 
-def _mark_missing(ax: Axes, trace: Trace, values: Floats) -> None:
-    """A red mark at the foot of the panel wherever samples are missing."""
-    pieces = np.array_split(np.isnan(values), min(LINE_COLUMNS, len(values)))
+def _mark_missing(ax: Axes, trace: Trace, values: Floats, columns: int = 1400) -> None:
+    """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
+    pieces = np.array_split(np.isnan(values), min(columns, len(values)))
     lost = np.array([piece.any() for piece in pieces])
     starts = np.cumsum([0, *map(len, pieces)])
     edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)

@@ -52,6 +52,7 @@ def build_run_report(trace: Trace) -> Report:
         facts=_list_facts(trace), notes=_list_notes(trace),
         sections=[Section("First cause and consequences", _show_cause(trace), medium=Medium.PAGE),
                   Section("Checks", _tabulate_checks(trace.sequence_checks)),
+                  Section("Failed checks", _draw_failed_checks(trace), medium=Medium.PAGE),
                   Section("Servovalve", _show_diagnosis(trace), medium=Medium.PAGE),
                   Section("Protocol", _tabulate_protocol(trace.protocol_checks)),
                   Section("Signals", [_draw_signals(trace)]),
@@ -164,6 +165,25 @@ def _tabulate_checks(checks: tuple[Check, ...]) -> list[Item]:
         columns.append(Column("remark"))
         rows = [[*row, Cell(check.detail, "muted")] for row, check in zip(rows, checks, strict=True)]
     return [Table(columns, rows)]
+
+
+def _draw_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
+    """A close-up of each of the first `most` failed checks that have a window and a signal."""
+    failed = [check for check in trace.sequence_checks if not check.passed and not math.isnan(check.t0)]
+    return [_draw_failed_check(trace, check, number) for number, check in enumerate(failed[:most])]
+
+
+def _draw_failed_check(trace: Trace, check: Check, number: int) -> Figure:
+    def draw() -> str:
+        from fdi.report import check_figures
+
+        return check_figures.draw_failed_check(trace, check, f"check{number}")
+
+    unit = "" if check.unit == "1" else f" {check.unit}"
+    measured = check.detail if math.isnan(check.value) else f"{_format_value(check)}{unit} measured"
+    limits = f"{format_limits(check.low, check.high)}{unit}"
+    return Figure(f"{check.name}: {_name_measure(check)}, {measured}, limit {limits}. "
+                  "Dashed: limits; red: what was measured.", draw)
 
 
 def _tabulate_protocol(checks: tuple[Check, ...]) -> list[Item]:

@@ -1,0 +1,95 @@
+"""A headless browser for pages: how wide they come out, pictures of them, and their print as PDF.
+
+Without chromium `find_browser` is None; what needs it is skipped.
+"""
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from html import unescape
+from pathlib import Path
+from typing import NamedTuple
+
+PROBE = """<script>addEventListener("load", () => {
+  const root = document.documentElement, width = root.clientWidth, out = [];
+  const scrolls = e => { for (; e && e !== document.body; e = e.parentElement)
+    if (["auto", "scroll", "hidden"].includes(getComputedStyle(e).overflowX)) return true; return false; };
+  for (const e of document.body.querySelectorAll(":not(svg *)"))
+    if (e.getBoundingClientRect().right > width + 1 && !scrolls(e.parentElement)) out.push(e.outerHTML.slice(0, 80));
+  const note = document.createElement("pre"); note.id = "probe";
+  note.textContent = JSON.stringify({inner: innerWidth, scroll: root.scrollWidth, client: root.clientWidth,
+    height: root.scrollHeight, beyond: out, errors: window.probeErrors || []});
+  document.body.append(note);
+});
+window.probeErrors = []; addEventListener("error", e => window.probeErrors.push(e.message));
+</script>"""
+
+
+TELL_PARENT = """<script>addEventListener("load", () => setTimeout(() => document.body.append(
+  frames[0].document.getElementById("probe").cloneNode(true)), 50));</script>"""
+
+
+class PageSize(NamedTuple):
+    """How a page came out, CSS pixels."""
+
+    inner: int  # width of the window
+    scroll: int  # width of what is in it
+    client: int  # width without a scroll bar
+    height: int
+    beyond: list[str]  # elements that are cut off at the right and do not scroll in a box of their own
+    errors: list[str]  # of scripts
+
+
+def find_browser() -> str | None:
+    """Chromium, if this machine has one."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def call_browser(*arguments: str, seconds: float = 120.0) -> str:
+    """Run the browser once and return its standard output."""
+    browser = find_browser()
+    assert browser is not None
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
+                   f"--user-data-dir={profile}", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=True).stdout
+
+
+def measure_page(page: Path, width: int, script: str = "") -> PageSize:
+    """Open a page in a window of `width` pixels, run `script` in it, and measure it."""
+    run = f"<script>addEventListener('load', () => {{ {script} }});</script>" if script else ""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "page.html")
+        copy.write_text(page.read_text(encoding="utf-8").replace("<head>", f"<head>{run}{PROBE}", 1), encoding="utf-8")
+        frame = write_frame(Path(folder), width, 900, TELL_PARENT)
+        dom = call_browser("--allow-file-access-from-files", "--virtual-time-budget=10000",
+                           f"--window-size={max(width, 500)},900", "--dump-dom", frame.as_uri())
+    found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
+    assert found, f"{page}: the page did not load"
+    return PageSize(**json.loads(unescape(found[1])))
+
+
+def take_picture(page: Path, width: int, out: Path, most: int = 12000) -> None:
+    """A picture of the whole page (its first `most` pixels) in a window of `width` pixels."""
+    height = min(measure_page(page, width).height + 20, most)
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(page, Path(folder, "page.html"))
+        frame = write_frame(Path(folder), width, height)
+        call_browser(f"--window-size={max(width, 500)},{height}", f"--screenshot={out}", frame.as_uri())
+
+
+def write_frame(folder: Path, width: int, height: int, script: str = "") -> Path:
+    """A page that shows page.html of the same folder in a frame: a window is never narrower than 500 pixels."""
+    style = f"border:0;background:#fff;width:{width}px;height:{height}px"
+    frame = folder / "frame.html"
+    text = f'<body style="margin:0;background:#888"><iframe src="page.html" style="{style}"></iframe>{script}'
+    frame.write_text(text, encoding="utf-8")
+    return frame
+
+
+def print_page(page: Path, out: Path) -> None:
+    """The print of a page as PDF."""
+    call_browser("--no-pdf-header-footer", f"--print-to-pdf={out}", page.resolve().as_uri())
