@@ -19,6 +19,7 @@ from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, compute_misfit, scaled_bounds
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogProblem, compute_values
 from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.identification.population import evolve_population
 from fdi.progress import Progress, ignore_progress
 from plant.threads import map_in_threads
 
@@ -26,8 +27,12 @@ Floats = NDArray[np.float64]
 
 # factor on the noise, fits that go on, rounds of each, solver steps a cycle
 FIT_STAGES = ((100.0, 3, 3, 10), (30.0, 2, 4, 10), (6.0, 1, 5, 20), (1.0, 1, 8, 20))
-RESTART_STAGES = ((30.0, 4), (6.0, 4), (1.0, 8))  # factor on the noise, rounds
-FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no restart is needed
+# of a search by a population: factor on the noise, generations
+NARROW_STAGES = ((30.0, 40), (6.0, 40), (1.0, 40))
+WIDE_STAGES = ((100.0, 30), *NARROW_STAGES)
+SEARCH_STEPS = 10  # solver steps a cycle
+SEARCHES = 4  # pairs of such searches at most
+FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no other valley is looked for
 SCATTERED = 48  # starts beside the regressions' values and the data sheet's
 GRID = (-0.3, -0.15, -0.07, -0.03, -0.01, 0.01, 0.03, 0.07, 0.15, 0.3)  # of the logarithm, or of half a range
 
@@ -90,26 +95,82 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, pro
     return fits[0]
 
 
-def restart_fit(problem: LogProblem, found: Fit) -> Fit:
-    """The best of a fit and some that begin elsewhere on the line to a unit whose tolerances are nominal.
+def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: int, progress: Progress = ignore_progress
+                         ) -> Fit:
+    """The best of a fit and of searches by populations, two at a time, until one leaves only noise.
 
-    Stops of the ram make ridges: what lies behind one of them is found from the other side, or never.
+    A narrow search begins at the best fit so far. A wide one begins at the values `begin` (p,) of the regressions,
+    which know nothing of the valley that the fit ended in. Each finds what the other misses (docs/identify.md). The
+    searches take coarse steps; what they find is fitted to the `problem` with its own steps.
     """
     best = found
-    for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
+    for attempt in range(SEARCHES):
         if is_fitted(best):
             break
-        home = np.where([is_wide(f) for f in best.free], best.x, 0.0)
+        progress(f"search of other valleys, {attempt + 1} of at most {SEARCHES}", 0.75 + 0.15 * attempt / SEARCHES)
 
-        def fit_from(part: float, home: Floats = home, best: Fit = best) -> Fit:
-            alone = replace(problem, workers=1, _lanes={})
-            fit = start_fit(best.free, best.x + part * (home - best.x))
-            for factor, rounds in RESTART_STAGES:
-                fit = descend(alone, scan_unknowns(make_loud(alone, factor), fit), rounds, factor)
-            return fit
+        def search(is_wide_search: bool, best: Fit = best, number: int = attempt) -> Fit:
+            coarse = replace(problem, workers=1, steps=SEARCH_STEPS, _lanes={})
+            end = (_search_widely(coarse, best.free, begin, seed + number) if is_wide_search
+                   else _search_narrowly(coarse, best, seed + number))
+            return descend(replace(problem, workers=1, _lanes={}), end, 8)
 
-        best = min(best, *map_in_threads(fit_from, parts, problem.workers), key=lambda fit: fit.cost)
+        best = min(best, *map_in_threads(search, (False, True), problem.workers), key=lambda fit: fit.cost)
     return best
+
+
+def _search_narrowly(problem: LogProblem, best: Fit, seed: int) -> Fit:
+    begun = descend(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
+    spread = 4.0 * begun.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
+    return _follow_population(problem, begun, spread, NARROW_STAGES, seed)
+
+
+def _search_widely(problem: LogProblem, free: Sequence[Free], begin: Floats, seed: int) -> Fit:
+    begun = descend(problem, start_fit(free, begin), 3, WIDE_STAGES[0][0])
+    widths = _widen_frictions(free, 0.3, 0.2)
+    spread = 9.0 * begun.covariance + np.diag(widths**2)
+    home = replace(begun, x=np.where(widths > 0.0, begin, begun.x))
+    return _follow_population(problem, home, spread, WIDE_STAGES, seed)
+
+
+def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Floats:
+    """Widths (p,), scaled, of the first trials along static and dynamic frictions, given of the logarithm."""
+    return np.array([0.0 if not is_wide(f) else static / f.scale if f.name.endswith("static_friction")
+                     else dynamic / f.scale if f.name.endswith("dynamic_friction") else 0.0 for f in free])
+
+
+def _follow_population(problem: LogProblem, begun: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int
+                       ) -> Fit:
+    """The fit at which a population ends whose noise counts for less from stage to stage."""
+    fit = begun
+    for number, (factor, generations) in enumerate(stages):
+        found = evolve_fit(make_loud(problem, factor), fit, spread, generations, 10 * seed + number)
+        spread = 4.0 * found.covariance
+        slid = descend(problem, found, 2, factor)
+        fit = slid if slid.cost < found.cost else found
+    return fit
+
+
+def evolve_fit(problem: LogProblem, fit: Fit, spread: Floats, generations: int, seed: int) -> Fit:
+    """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
+    is that of the last trials.
+    """
+    prior = np.array([f.prior**-2 for f in fit.free])
+    low, high = scaled_bounds(fit.free)
+
+    def measure_costs(trials: Floats) -> Floats:
+        costs: Floats = compute_misfit(problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
+        return costs
+
+    end = evolve_population(measure_costs, fit.x, spread, low, high, generations, seed)
+    return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
+
+
+def polish_fit(problem: LogProblem, fit: Fit, seed: int, generations: int = 25) -> Fit:
+    """The fit at the lowest place near it: slopes stop at the first ridge of a rough valley, a population does not."""
+    spread = 4.0 * fit.covariance + np.diag(_widen_frictions(fit.free, 0.02, 0.0) ** 2)
+    found = evolve_fit(problem, fit, spread, generations, seed)
+    return min(fit, descend(problem, found, 4), key=lambda each: each.cost)
 
 
 def is_fitted(fit: Fit) -> bool:

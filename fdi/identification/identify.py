@@ -30,8 +30,9 @@ from fdi.identification.global_fit import (
     draw_starts,
     fit_from_afar,
     is_fitted,
-    restart_fit,
+    polish_fit,
     scale_values,
+    search_other_valleys,
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -50,7 +51,7 @@ from plant.threads import count_threads
 
 Floats = NDArray[np.float64]
 
-LAST_STEPS, RESTART_STEPS = 50, 20  # solver steps a cycle, of the last rounds and of further starts
+LAST_STEPS = 50  # solver steps a cycle, of the last rounds
 OPEN_MISFIT = 4.0  # -2 log likelihood by which a parameter may go to the end of its range and still not be seen
 
 
@@ -157,7 +158,7 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
     problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
     progress("last fits, with finer steps", 0.7)
-    problem, fit = finish(problem, fit)
+    problem, fit = finish(problem, fit, scale_values(fit.free, {**model.values, **begun}), seed, progress)
     progress("judging", 0.92)
     found = build_model(model, problem, fit, gains)
     estimates, covariance = estimate_parameters(model, ranges, fit, hidden)
@@ -236,13 +237,18 @@ def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) ->
     return fixed, Fit(free, x, np.inf, np.inf, fit.covariance[np.ix_(kept, kept)], none, none, none)
 
 
-def finish(problem: LogProblem, fit: Fit) -> tuple[LogProblem, Fit]:
-    """The last rounds, with finer steps; then with the noise that is left, where only noise is left."""
+def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress: Progress = ignore_progress
+           ) -> tuple[LogProblem, Fit]:
+    """The last rounds, with finer steps; then with the noise that is left, where only noise is left.
+
+    `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a wrong valley.
+    """
     fine = replace(problem, steps=LAST_STEPS, _lanes={})
     fit = descend(fine, fit, 8)
     if not is_fitted(fit):
-        other = restart_fit(replace(problem, steps=RESTART_STEPS, _lanes={}), descend(problem, fit, 1))
-        fit = min(fit, descend(fine, other, 8), key=lambda each: each.cost)
+        fit = search_other_valleys(fine, fit, begin, seed, progress)
+    progress("last rounds", 0.9)
+    fit = polish_fit(fine, fit, seed)
     size = np.sqrt(np.nanmean(fit.residuals**2, axis=1))
     level = np.array([n.level for n in fine.noise])
     if (size <= RESIDUAL_HELD_OUT * level).all():
