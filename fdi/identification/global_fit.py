@@ -32,6 +32,7 @@ NARROW_STAGES = ((30.0, 40), (6.0, 40), (1.0, 40))
 WIDE_STAGES = ((100.0, 30), *NARROW_STAGES)
 SEARCH_STEPS = 10  # solver steps a cycle
 SEARCHES = 4  # pairs of such searches at most
+SEARCH_GAIN = 0.1  # share of the excess misfit that a pair must remove for another one to follow
 FITTED_SQUARE = 1.02  # mean square of whitened residuals up to which no other valley is looked for
 SCATTERED = 48  # starts beside the regressions' values and the data sheet's
 GRID = (-0.3, -0.15, -0.07, -0.03, -0.01, 0.01, 0.03, 0.07, 0.15, 0.3)  # of the logarithm, or of half a range
@@ -115,7 +116,10 @@ def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: i
                    else _search_narrowly(coarse, best, seed + number))
             return descend(replace(problem, workers=1, _lanes={}), end, 8)
 
+        before = best.misfit - np.count_nonzero(best.white)
         best = min(best, *map_in_threads(search, (False, True), problem.workers), key=lambda fit: fit.cost)
+        if best.misfit - np.count_nonzero(best.white) > (1.0 - SEARCH_GAIN) * before:
+            break  # physics is missing, or a range is too narrow: no other valley is deeper
     return best
 
 

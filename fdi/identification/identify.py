@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.runs import Source
+from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, limit_friction_values
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms, limit_friction_values
 from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
 from fdi.estimation.noise import sensor_floors
 from fdi.estimation.unknowns import silence_readings
@@ -33,10 +34,12 @@ from fdi.identification.global_fit import (
     polish_fit,
     scale_values,
     search_other_valleys,
+    start_fit,
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     FITTED_RUN_WORST,
+    HELD_OUT_UNDECIDED_SHARE,
     IDENTIFIABLE_SHARE,
     IDENTIFIED_INTERVAL_FACTOR,
     INTERVAL_95_SD,
@@ -71,8 +74,9 @@ class Estimate(NamedTuple):
 
     @property
     def is_at_bound(self) -> bool:
-        """Whether the value is at an end of the range: the data want to go further."""
-        return self.is_identifiable and not 1.0001 * self.least < self.value < 0.9999 * self.most
+        """Whether the interval reaches an end of the range: the data may want to go further."""
+        near = 1e-9 * (self.most - self.least)
+        return self.is_identifiable and (self.low <= self.least + near or self.high >= self.most - near)
 
 
 class RunError(NamedTuple):
@@ -84,11 +88,20 @@ class RunError(NamedTuple):
     after: Mapping[str, float]
     typical: Mapping[str, float]  # after, without the worst blocks
     floor: Mapping[str, float]
+    decided: Mapping[str, float]  # after, of a held-out run without the rows that no model can predict
+    undecided: float = 0.0  # share of these rows; 0 for a fitted run
 
     @property
     def ratio(self) -> float:
         """Error of the worst signal over its noise floor, after."""
         return max(self.after[s] / self.floor[s] for s in self.after)
+
+    @property
+    def decided_ratio(self) -> float:
+        """The same without the rows that no model can predict, if enough others are left."""
+        if self.undecided > HELD_OUT_UNDECIDED_SHARE:
+            return self.ratio
+        return max(self.decided[s] / self.floor[s] for s in self.decided)
 
 
 class Correlation(NamedTuple):
@@ -181,14 +194,18 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
                 ) -> dict[str, tuple[float, float, float]]:
     """Free parameters that no run shows, with the value nearest to the data sheet's, and the values that fit as well.
 
-    An end stop that the ram never met may be anywhere beyond the furthest position.
+    An end stop that the ram never met may be anywhere beyond the furthest position. A fit that stands at an end already
+    is tried some way inside: what changes there is seen, and only its range is too narrow.
     """
     places = [(k, r) for k, f in enumerate(fit.free) if (r := ranges.get(f.name)) is not None
               and type(f) is not LogFrictionRatio]
     trials = [fit.x]
     for k, _ in places:
         f = fit.free[k]
-        trials += [_put(fit.x, k, (end - f.centre) / f.scale) for end in (f.low, f.high)]
+        low, high = ((end - f.centre) / f.scale for end in (f.low, f.high))
+        inside = IDENTIFIABLE_SHARE * 0.5 * (high - low)
+        trials.append(_put(fit.x, k, low if fit.x[k] - low > 1e-3 * (high - low) else low + inside))
+        trials.append(_put(fit.x, k, high if high - fit.x[k] > 1e-3 * (high - low) else high - inside))
     costs = compute_misfit(problem.compute_white_residuals(fit.free, np.array(trials)))
     found = {}
     for i, (k, r) in enumerate(places):
@@ -326,31 +343,34 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
     """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI."""
     errors, residuals = [], []
     for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
-        left = [_compute_residuals(m, trace) for m in (before, after)]
+        left = [_make_judging_problem(m, trace).compute_residuals((), np.empty((1, 0)))[0] for m in (before, after)]
         first, last = ({s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left)
         typical = dict(zip(trace.outputs, compute_typical_rms(left[1]).tolist(), strict=True))
         own = {s: floor[s] for s in trace.outputs}
-        errors.append(RunError(source, number >= fitted, first, last, typical, own))
+        decided, share = last, 0.0
+        if number >= fitted and _moves(trace):
+            undecided = find_undecided_rows(_make_judging_problem(after, trace), start_fit((), np.empty(0)), own)
+            share = float(undecided.mean())
+            if 0.0 < share < 1.0:
+                decided = {s: rms(r[~undecided]) for s, r in zip(trace.outputs, left[1], strict=True)}
+        errors.append(RunError(source, number >= fitted, first, last, typical, own, decided, share))
         residuals.append((left[0], left[1]))
     return tuple(errors), tuple(residuals)
 
 
-def _compute_residuals(model: Model, trace: Trace) -> Floats:
+def _make_judging_problem(model: Model, trace: Trace) -> Problem:
     noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
-    problem = Problem(silence_readings(model), trace, noise, steps=LAST_STEPS)
-    none: tuple[Free, ...] = ()
-    residuals: Floats = problem.compute_residuals(none, np.empty((1, 0)))[0]
-    return residuals
+    return Problem(silence_readings(model), trace, noise, steps=LAST_STEPS)
 
 
 def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) -> tuple[str, str]:
     """The verdict, and the reason for any but IDENTIFIED."""
     worse = [e for e in errors if any(e.typical[s] > RESIDUAL_HELD_OUT * e.floor[s] for s in e.typical)
-             or e.ratio > RESIDUAL_WORST]
+             or e.decided_ratio > RESIDUAL_WORST]
     if worse:
-        worst = max(worse, key=lambda e: e.ratio)
+        worst = max(worse, key=lambda e: e.decided_ratio)
         kind = "held-out run" if worst.is_held_out else "run"
-        left = f"{worst.ratio:.3g} noise floors of the {kind} {worst.source.file}"
+        left = f"{worst.decided_ratio:.3g} noise floors of the {kind} {worst.source.file}"
         return "UNEXPLAINED", f"the best parameters leave {left}"
     unseen = [e.name for e in estimates if not e.is_identifiable]
     if len(unseen) == len(estimates):

@@ -17,7 +17,7 @@ from fdi.report.numbers import (
     join_words,
 )
 from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Mood, Report, Section, Table
-from fdi.thresholds import RESIDUAL_HELD_OUT
+from fdi.thresholds import HELD_OUT_UNDECIDED_SHARE, RESIDUAL_HELD_OUT
 
 MOODS: dict[str, Mood] = {"IDENTIFIED": "good", "PARTLY": "doubtful", "CANNOT_TELL": "doubtful", "UNEXPLAINED": "bad"}
 
@@ -128,10 +128,12 @@ def _describe_findings(found: Identification) -> list[Item]:
     lines += [Line("to identify", f"{join_words(names)}: {text}") for text, names in advised.items()]
     at_bound = [e.name for e in found.estimates if e.is_at_bound]
     if at_bound:
-        lines.append(Line("at a bound", f"{join_words(at_bound)}: the range of the data sheet is too narrow", "bad"))
+        lines.append(Line("at a bound", f"{join_words(at_bound)}: the interval reaches the end of the data sheet's "
+                                        "range; give a wider one", "bad"))
     if found.correlations:
         pairs = join_words(f"{c.first} with {c.second} ({c.value:+.3f})" for c in found.correlations[:4])
         lines.append(Line("correlated", f"{pairs}: the ratio or product is known better than each"))
+    lines += [Line("held-out run", text) for text in _describe_undecided(found.holdouts)]
     gains = found.controller
     if gains is not None and gains.is_proportional:
         limit = "" if gains.limit is None else f", limit {format_amount(gains.limit, 'A')}"
@@ -140,6 +142,13 @@ def _describe_findings(found: Identification) -> list[Item]:
     elif gains is not None:
         lines.append(Line("controller", "no proportional law with a limit: the model keeps its gains"))
     return lines
+
+
+def _describe_undecided(holdouts: Sequence[RunError]) -> list[str]:
+    """Which part of each held-out run no model can predict, and the error of the rest."""
+    return [f"{format_percent(e.undecided, 2)} of {e.source.file} cannot be predicted, because stops of ram or spool "
+            f"there depend on a thousandth of a friction level; the rest is at {format_ratio(e.decided_ratio)} noise "
+            "floors" for e in holdouts if 0.0 < e.undecided <= HELD_OUT_UNDECIDED_SHARE]
 
 
 def _show_residuals(found: Identification) -> list[Item]:
@@ -158,7 +167,8 @@ def collect_data(found: Identification) -> dict[str, Any]:
                            "range": [e.least, e.most], "identifiable": e.is_identifiable, "at_bound": e.is_at_bound}
                   for e in found.estimates}
     runs = [{"file": e.source.file, "sha256": e.source.sha256, "held_out": e.is_held_out, "error_before": e.before,
-             "error": e.after, "ratio": {s: x / e.floor[s] for s, x in e.after.items()}} for e in found.errors]
+             "error": e.after, "ratio": {s: x / e.floor[s] for s, x in e.after.items()}, "undecided": e.undecided,
+             "ratio_decided": {s: x / e.floor[s] for s, x in e.decided.items()}} for e in found.errors]
     gains = found.controller
     controller = None if gains is None else {"gain": gains.gain, "limit": gains.limit, "exact": gains.exact}
     return {"verdict": found.verdict, "reason": found.reason, "parameters": parameters, "floor": dict(found.floor),

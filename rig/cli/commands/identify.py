@@ -25,7 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """The model goes to --out (default: identified.toml). Exit status 0 if every free parameter is identified."""
+    """The model goes to --out (default: identified.toml). Exit status 0 if every free parameter is identified.
+
+    A model that does not explain the runs (UNEXPLAINED) is written only with --out.
+    """
     from fdi.identification.free_parameters import read_free_parameters
     from fdi.identification.identify import identify_model
     from fdi.identification.model_text import write_identified_model
@@ -46,7 +49,10 @@ def run_command(args: argparse.Namespace) -> int:
         found = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, args.seed, progress)
         progress("writing", 0.97)
         files = [("page", str(page))]
-        if found.verdict != "CANNOT_TELL":
+        if found.verdict == "UNEXPLAINED":
+            note = describe_doubtful_file(None if args.out is None else str(path))
+            found = replace(found, notes=(*found.notes, note))
+        if found.verdict in ("IDENTIFIED", "PARTLY") or (found.verdict == "UNEXPLAINED" and args.out is not None):
             found = replace(found, model=replace(found.model, name=path.stem))
             backup = write_identified_model(found, path, command, date.today().isoformat())
             files.insert(0, ("model", str(path) + (f" (the one before: {backup})" if backup is not None else "")))
@@ -57,11 +63,15 @@ def run_command(args: argparse.Namespace) -> int:
     return 0 if found.verdict == "IDENTIFIED" else 1
 
 
+def describe_doubtful_file(path: str | None) -> str:
+    """The note on the model file of parameters that do not explain the runs; `path`: None if it was not asked for."""
+    if path is None:
+        return "no model file: these parameters do not explain the runs; --out FILE.toml writes them all the same"
+    return f"{path} was written because of --out; its parameters do not explain the runs"
+
+
 def choose_next_command(args: argparse.Namespace, found: Identification, path: str) -> str:
-    """What to type next: compare a held-out run, or find out what is missing; "" where nothing was identified."""
-    if found.verdict == "CANNOT_TELL":
+    """What to type next: compare a held-out run; "" where there is no model to go on with."""
+    if found.verdict in ("CANNOT_TELL", "UNEXPLAINED"):
         return ""
-    if found.verdict == "UNEXPLAINED":
-        holdout = ["--holdout", args.holdout[0]] if args.holdout else []
-        return "rig explain " + shlex.join([args.runs[0], *holdout, "--model", path])
     return "rig compare " + shlex.join([(args.holdout or args.runs)[0], "--model", path])

@@ -32,7 +32,9 @@ def judge_unit(seed: int, workers: int | None = None) -> dict[str, Any]:
             for e in found.estimates}
     return {"seed": seed, "verdict": found.verdict, "parameters": rows, "gain_error": _compare_gain(found, truth),
             "fitted": max(e.ratio for e in found.errors if not e.is_held_out),
-            "held_out": max(e.ratio for e in found.holdouts)}
+            "held_out": max(e.ratio for e in found.holdouts),
+            "decided": max(e.decided_ratio for e in found.holdouts),
+            "undecided": max(e.undecided for e in found.holdouts)}
 
 
 def _compare_gain(found: Any, truth: Mapping[str, float]) -> float:
@@ -55,13 +57,15 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"| {name} | {len(seen)} of {len(rows)} | {inside} of {len(seen)} | {100 * half:.2g} % | "
                      f"{100 * error:.2g} % |")
     share = measure_share(good, total)
-    held = sorted(row["held_out"] for row in rows)
+    whole = sum(all(p["inside"] for p in row["parameters"].values() if p["identifiable"]) for row in rows)
+    held, decided = (sorted(row[key] for row in rows) for key in ("held_out", "decided"))
     words = sorted({row["verdict"] for row in rows})
     verdicts = ", ".join(f"{word} {sum(row['verdict'] == word for row in rows)}" for word in words)
     lines += ["", f"All parameters: {good} of {total} intervals hold the true value ({100 * share.value:.1f} %, "
-              f"{100 * share.low:.1f} .. {100 * share.high:.1f}). Held-out error: median {held[len(held) // 2]:.3f}, "
-              f"largest {held[-1]:.3f} noise floors; {sum(x <= 1.1 for x in held)} of {len(held)} at most 1.1. "
-              f"Verdicts: {verdicts}."]
+              f"{100 * share.low:.1f} .. {100 * share.high:.1f}); in {whole} of {len(rows)} trials all of them do. "
+              f"Held-out error: median {held[len(held) // 2]:.3f}, largest {held[-1]:.3f} noise floors; "
+              f"{sum(x <= 1.1 for x in held)} of {len(held)} at most 1.1; without the rows that no model can predict "
+              f"{sum(x <= 1.1 for x in decided)}, largest {decided[-1]:.3f}. Verdicts: {verdicts}."]
     return "\n".join(lines)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fdi.discovery.model_file import read_provenance
+from fdi.identification import global_fit
 from fdi.identification.closed_form import estimate_by_regressions
 from fdi.identification.controller import read_controller
 from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
@@ -96,6 +97,31 @@ def test_no_value_counts_as_identified_where_the_model_fails(found: Identificati
     assert "may be wrong" not in format_report(build_identification_report(found, "eha"))
 
 
+def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], tmp_path: Path,
+                                                      capsys: pytest.CaptureFixture[str],
+                                                      monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(global_fit, "SEARCHES", 0)  # no other valley is deeper, and looking for one takes ten seconds
+    runs[1].write_csv(tmp_path / "stops.csv")
+    (tmp_path / "sheet.toml").write_text("[identify.jack]\narea = 1.3\ntravel = 6\n[identify.valve]\nflow_gain = 6\n"
+                                         "[identify.supply]\npressure = 3\n")
+    assert main(["identify", "stops.csv", "--model", "sheet.toml", "--json"]) == 1
+    answer = json.loads(capsys.readouterr().out)
+    area = answer["parameters"]["jack.area"]
+    assert answer["verdict"] == "UNEXPLAINED" and "noise floors" in answer["reason"]
+    assert area["identifiable"] and area["at_bound"]
+    assert area["high"] == area["range"][1] and area["value"] == pytest.approx(area["high"], rel=0.02)
+    assert not any(answer["parameters"][name]["at_bound"] for name in ("jack.travel", "supply.pressure"))
+    assert not (tmp_path / "identified.toml").exists() and (tmp_path / "identified.html").exists()
+    assert main(["identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml"]) == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "jack.area: the interval reaches the end of the data sheet's range" in shown
+    assert "mine.toml was written because of --out; its parameters do not explain the runs" in shown
+    assert "rig compare" not in shown and "rig explain" not in shown
+    written = read_provenance(tmp_path / "mine.toml").identification
+    assert written is not None and written["verdict"] == "UNEXPLAINED"
+
+
 def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace], tmp_path: Path,
                                              capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.toml"
@@ -134,6 +160,14 @@ def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
     assert found.verdict in ("PARTLY", "CANNOT_TELL")
     assert not area.is_identifiable and area.high / area.low > 3.0
     assert {a.parameter: a.experiment for a in found.advice}["jack.area"] == "load"
+
+
+def test_end_stop_that_was_never_met_is_not_at_a_bound(runs: tuple[Trace, Trace, Trace]) -> None:
+    found = identify([runs[0]], [], {"valve": {"flow_gain": 6.0}, "jack": {"travel": [0.012, 0.05]}})
+    flow, travel = found.estimates
+    assert flow.is_identifiable and not flow.is_at_bound
+    assert not travel.is_identifiable and not travel.is_at_bound
+    assert travel.low < 0.013 and travel.high == 0.05
 
 
 def test_run_at_rest_identifies_nothing() -> None:
