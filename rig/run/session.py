@@ -39,7 +39,7 @@ from rig.run.history import History
 from rig.run.job import Job
 from rig.run.loop import CycleInput, Loop
 from rig.run.overruns import OverrunWatch
-from rig.run.participants import Participants
+from rig.run.participants import FRAME_TIMEOUT, Participants
 from rig.run.probe import (
     AFTER,
     ATTEMPTS,
@@ -61,6 +61,7 @@ from rig.run.probe import (
     select_last,
 )
 from rig.run.processes import describe_exit
+from rig.run.silence import SilenceWatch
 from rig.sequences.faults import Schedule
 from rig.sequences.guards import GuardWatch
 from rig.sequences.protocol import Emergency, Heartbeat, ProtocolRecord, Rows
@@ -135,7 +136,9 @@ class Session:
         self._unjudged: list[Signals] = []  # rows that the guards have not seen
         self._clock = wire.clock
         self._last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of the node
-        self._next_look = 0  # when to look again whether the processes of the nodes are alive
+        self._next_look = 0  # when to look again whether the nodes are alive
+        self._silence = SilenceWatch(round(FRAME_TIMEOUT * 1e9))
+        self._silent: set[int] = set()  # the nodes among `gone` that are known by their silence in lockstep
         wire.is_node_gone = self._is_node_gone
         self._master = Master(wire, self.now, job.realtime)
         self._drives: list[Frame] = []  # drive frames, if faults act on the bus
@@ -546,7 +549,7 @@ class Session:
         self.log_event("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
 
     def _is_node_gone(self) -> bool:
-        """Whether a node will not answer any more; looks every 20 ms whether a process that we started has ended."""
+        """Whether a node will not answer any more; looks every 20 ms."""
         now = self._clock.now()
         if now >= self._next_look:
             self._next_look = now + 20_000_000
@@ -555,7 +558,30 @@ class Session:
                 if self.gone.get(node) != how:
                     self.gone[node] = how
                     self._handle_trouble("process", f"node {node} {NAMES[node]}: {how}", node)
+            if self._playing and not self.job.realtime and not self._is_embedded:
+                self._look_for_silent_nodes(now)
         return bool(self.gone)
+
+    def _look_for_silent_nodes(self, now: int) -> None:
+        """Lockstep between processes: a node that neither beats nor answers is gone, until it is heard again.
+
+        The heartbeat alone is watched with much patience there, and a cycle waits long for a node that is late.
+        """
+        if self._master.is_deaf:
+            return
+        self._silence.look(now, self._master.heard_ns)
+        answering = [node for node in self._last_answers if self._is_answering(node, recent=1)]
+        found = self._silence.find_silent(answering)
+        for node in self._silent - found.keys():
+            self._silent.discard(node)
+            self._handle_return(node)
+        for node in found.keys() - self.gone.keys():
+            self._silent.add(node)
+            self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
+            what = f"node {node} {NAMES[node]} is silent"
+            self._handle_trouble("heartbeat", what, node)
+            if not self.aborted:  # no sequence can mean that in lockstep
+                self._abort("abort", what)
 
     def _state(self, node: int, state: int) -> None:
         known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}

@@ -207,6 +207,38 @@ def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, s
     assert gone(where) and said.json["timing"]["cycles"] < 60_000
 
 
+@pytest.mark.parametrize(("name", "source", "row"), [("controller", "node 2 controller", "cor"),
+                                                    ("plant", "node 3 plant", "xj")])
+def test_an_external_node_that_dies_is_named_before_others_miss_it(tmp_path: Path, name: str, source: str,
+                                                                   row: str) -> None:
+    """Nobody tells the rig that it has ended, and in lockstep a cycle waits long for a node that is late.
+
+    The first cycle without an answer waits; then the node is known to be gone, and no other cycle waits. Without that
+    knowledge three cycles would wait until the other node reports missing frames, and clean-up would wait after them.
+    """
+    where = spec("udp_multicast")
+    (tmp_path / "long.toml").write_text(LONG)
+    nodes = {each: started("node", each, "--bus", where) for each in ("plant", "controller")}
+    try:
+        for node in nodes.values():
+            assert node.stdout is not None and where in node.stdout.readline()
+        process = started("run", tmp_path / "long.toml", "--bus", where, "--controller", "external", "--plant",
+                          "external", "--out", tmp_path, "--json")
+        grown(tmp_path / "trace.mcap", 60_000, timeout=120.0)
+        nodes[name].kill()
+        said = finished(process)
+    finally:
+        for node in nodes.values():
+            node.kill()
+            finished(node)
+    cause, trace = said.json["cause"], Trace.read(tmp_path, all=True)
+    assert (said.status, said.json["verdict"]) == (1, "ABORTED")
+    assert (cause["source"], cause["kind"]) == (source, "stopped") and "no heartbeat for 2" in cause["text"]
+    assert f"{source} is silent" in said.json["consequences"][0]["text"]
+    assert np.isnan(getattr(trace, row)[trace.phase != CLEANUP]).sum() == 2
+    assert int((trace.phase == CLEANUP).sum()) == 100
+
+
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_ctrl_c_at_a_terminal_reaches_the_rig_alone(tmp_path: Path, pace: str) -> None:
     """A terminal interrupts all its processes; clean-up needs the plant."""
