@@ -21,7 +21,6 @@ from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_close
 from plant.state import State
 
 Array = NDArray[np.float64]
-NOISE_BLOCK = 64  # cycles of noise at a time: 10 us once in 64 cycles
 SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
 
 
@@ -42,11 +41,11 @@ def draw_noise(seed: int, cycles: int) -> Array:
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
 
 
-def iterate_noise(seed: int) -> Iterator[list[float]]:
-    """The rows of `draw_noise` without end; drawn in blocks, which costs a tenth of drawing single rows."""
+def iterate_noise(seed: int, block: int = 64) -> Iterator[list[float]]:
+    """The rows of `draw_noise` without end; drawn `block` at a time, which costs a tenth of drawing single rows."""
     rng = np.random.default_rng(seed)
     while True:
-        yield from rng.standard_normal((NOISE_BLOCK, NOISES)).tolist()
+        yield from rng.standard_normal((block, NOISES)).tolist()
 
 
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int = STEPS,

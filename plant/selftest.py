@@ -13,7 +13,6 @@ from plant.run import simulate
 from plant.starts import compute_changes, compute_levels, compute_rms, find_starts
 
 Array = NDArray[np.float64]
-STEPS = 20  # steps a cycle where plain Python runs too
 SHORT = np.concatenate([np.zeros(5), np.full(25, 2e-3), np.linspace(2e-3, -1e-3, 20)])  # m, what it runs
 
 
@@ -71,7 +70,8 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
         model, said = off.replace(starts[-1]), _format_values(starts[-1])
         if not _are_equal(*(simulate(model, command, load) for _ in range(2))):
             faults.append(f"with {said} two runs of one seed differ")
-        if not _are_equal(*(simulate(model, SHORT, steps=STEPS, fast=fast) for fast in (True, False))):
+        steps = 20  # a cycle: plain Python runs too
+        if not _are_equal(*(simulate(model, SHORT, steps=steps, fast=fast) for fast in (True, False))):
             faults.append(f"with {said} compiled code and plain Python differ")
     return faults
 

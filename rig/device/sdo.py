@@ -14,7 +14,6 @@ from rig.network.frame import Frame, Send
 
 _HEAD = struct.Struct("<BHB")
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # client command specifiers
-_TIMEOUT = 5_000_000_000  # ns between two requests of one transfer: a client on a busy machine may stand still
 _LARGEST = 1 << 20  # bytes in one download: a scenario is a few kB
 
 
@@ -93,7 +92,8 @@ class SdoServer:
 
     def tick(self, t_ns: int) -> None:
         """Abort a transfer whose client stopped sending."""
-        if self._open is not None and t_ns - self._last_ns > _TIMEOUT:
+        longest_pause = 5_000_000_000  # ns: a client on a busy machine may stand still
+        if self._open is not None and t_ns - self._last_ns > longest_pause:
             self._abort(Abort.TIMEOUT)
 
     def _abort(self, code: int) -> None:

@@ -8,7 +8,6 @@ from rig.network.frame import Frame
 
 # 0x1006 gives the period of SYNC but not when SYNC counts as lost. The bench measures the lateness of a single SYNC
 # itself; a dozen missing in a row mean that the producer is gone. The rig writes 8 ms.
-_LOST_AFTER = 12  # periods
 
 
 class SyncConsumer:
@@ -21,9 +20,12 @@ class SyncConsumer:
         self._deadline = 0  # 0: not waiting
         self._lost = self._malformed = False
 
-    def configure(self, period_us: int) -> None:
-        """A new communication cycle period (0x1006); 0: do not watch. Watching begins with the next SYNC."""
-        self._limit_ns = period_us * 1000 * _LOST_AFTER
+    def configure(self, period_us: int, lost_after: int = 12) -> None:
+        """A new communication cycle period (0x1006); 0: do not watch. Watching begins with the next SYNC.
+
+        SYNC is lost after `lost_after` periods.
+        """
+        self._limit_ns = period_us * 1000 * lost_after
         self._deadline = 0
 
     def stop(self) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-LONGEST_TEXT = 64  # characters of a name that are kept
-
 
 class Identity(NamedTuple):
     """The identity of a node; None for an object that it does not have."""
@@ -43,7 +41,7 @@ def read_identity(upload: Callable[[int, int], bytes | None]) -> Identity:
     return Identity(**texts, **numbers)  # type: ignore[arg-type]  # the keys are the fields, with their types
 
 
-def _decode_text(data: bytes) -> str:
-    """A VISIBLE_STRING; what is no printable ASCII character becomes a question mark."""
-    text = data.rstrip(b"\0 ")[:LONGEST_TEXT].decode("ascii", "replace")
+def _decode_text(data: bytes, longest: int = 64) -> str:
+    """A VISIBLE_STRING, at most `longest` characters; one that is no printable ASCII becomes a question mark."""
+    text = data.rstrip(b"\0 ")[:longest].decode("ascii", "replace")
     return "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)

@@ -27,10 +27,8 @@ from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
 from rig.network.wire import Wire
 
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
-QUICK_HEARTBEAT = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
-SCENARIO_TIMEOUT = 120.0  # s: the plant compiles its model in between
 _OURS = (0x000, codec.SYNC, codec.COMMAND, 0x700 + RIG)  # frames that only the rig may send
 R = TypeVar("R")
 _BROKEN_OFF = (0x05030000, 0x05040000, 0x05040001)  # aborts of a server that has lost a transfer, or given it up
@@ -248,13 +246,14 @@ class Master:
         Raises:
             BusError: a node refused or did not answer.
         """
-        self._download(PLANT, SCENARIO, 0, scenario, SCENARIO_TIMEOUT)
+        self._download(PLANT, SCENARIO, 0, scenario, seconds=120.0)  # the plant compiles its model in between
         self._settings.clear()
         for sub, value in enumerate(gains or (), 1):
             self._set(CONTROLLER, GAINS, sub, value)
+        quick_heartbeat = 10  # ms: until the nodes are OPERATIONAL, so that the time this takes is measured that finely
         for node in (CONTROLLER, PLANT):
             foreign = node == CONTROLLER and gains is None
-            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, RIG << 16 | limit_ms), (0x1017, 0, QUICK_HEARTBEAT))
+            settings = ((0x1006, 0, sync_period_us), (0x1016, 1, RIG << 16 | limit_ms), (0x1017, 0, quick_heartbeat))
             for index, sub, value in settings:
                 self._keep(node, index, sub)
                 try:

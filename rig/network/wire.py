@@ -11,7 +11,6 @@ from rig.network.link import Link
 
 MS = 1_000_000  # ns
 _STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
-_PATIENCE = 5  # cycles: a node that is gone must not make clean-up last minutes
 Done = Callable[[], bool]
 
 
@@ -103,10 +102,14 @@ class EmbeddedWire:
 class LinkWire:
     """A bus between programs or machines. Waiting is in wall time, whatever the pace."""
 
-    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
+    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2, patience: int = 5) -> None:
+        """`grace`: how late an answer may be in lockstep, s; a tenth of it after `patience` cycles without all answers.
+
+        A node that is gone must not make clean-up last minutes.
+        """
         self.clock: Clock = clock
         self._wall = clock
-        self.link, self._grace = link, grace
+        self.link, self._grace, self._patience = link, grace, patience
         self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _ignore_frame
         self.is_node_gone: Done = _is_false
@@ -129,7 +132,7 @@ class LinkWire:
 
         When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
         """
-        is_patient = self._missed < _PATIENCE
+        is_patient = self._missed < self._patience
         grace = self._grace if is_patient else 0.1 * self._grace
         is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
         if self.is_node_gone():

@@ -14,7 +14,6 @@ from rig.sequences.faults import Plan
 
 FORCE_RESOLUTION = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it
-LARGEST_JSON = 1 << 26  # bytes of JSON: six hours of random load
 LONGEST_PLAN = 20_000_000  # cycles; noise is drawn for all of them beforehand
 WHERE = "scenario (object 0x2210)"
 
@@ -66,7 +65,8 @@ class Scenario(NamedTuple):
             InputError: the bytes are not a scenario, or name something this node does not know.
         """
         try:
-            table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, LARGEST_JSON))
+            largest = 1 << 26  # bytes of JSON: six hours of random load
+            table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, largest))
             named = table["model"]
             model = Model(str(named["name"])).with_effects(named["effects"]).replace(named["values"], WHERE)
             force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()

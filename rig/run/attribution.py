@@ -27,7 +27,6 @@ Mask = NDArray[np.bool_]
 
 _NO_DRIVE = int(Flags.DRIVE_MISSING | Flags.DRIVE_LATE)
 _RPDO_TIMEOUT = 0x8250
-_HEARTBEAT = 150  # cycles: a change of the NMT state is known with the next heartbeat
 _SETTLING = 100  # cycles: after a lost frame the position loop needs less than this to forget it
 
 
@@ -156,7 +155,8 @@ def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterabl
     feedback = ~is_in_time & ~records.injected.plant & ~records.injected.sync
     missing = np.isnan(records.feedback) & np.isnan(records.valve)
     for cycle in stops:
-        first = _find_run_start(missing, min(cycle, records.cycles - 1), near=_HEARTBEAT)
+        known_after = 150  # cycles: a change of the NMT state is known with the next heartbeat
+        first = _find_run_start(missing, min(cycle, records.cycles - 1), near=known_after)
         present = np.flatnonzero(~missing[first:])
         feedback[first:first + int(present[0]) if len(present) else None] = False
     delay = records.plant_delay

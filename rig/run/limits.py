@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from plant.model import Model
 
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
-CURRENT_RESOLUTION = 2e-8  # A: two counts of the drive frame
 
 
 class LimitReached(NamedTuple):
@@ -43,7 +42,7 @@ def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero
     margins = {
         "xj": ("jack.travel", NEAR_A_STOP * model["sensors.position_noise"]),
         "xs": ("spool.travel", NEAR_A_STOP * model["sensors.spool_noise"]),
-        "cor": ("controller.current_limit", CURRENT_RESOLUTION),
+        "cor": ("controller.current_limit", 2e-8),  # A: two counts of the drive frame
     }
     period, found = model["controller.period"], []
     for signal, (parameter, margin) in margins.items():

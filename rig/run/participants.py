@@ -25,11 +25,8 @@ from rig.run.processes import NodeProcesses
 from rig.sequences.faults import is_noticed_by_time
 
 EMBEDDED_NAMES = ("embedded", "virtual")
-RIVAL_TIMEOUT = 0.25  # s: a rig at work is heard within this
 FRAME_TIMEOUT = 2.0  # s: in lockstep a frame may be this late, for the machine may be busy
 LOST_FRAME_TIMEOUT = 0.2  # s: the same where frames are to be lost, so that the run comes to an end
-BOOT_TIMEOUT = 0.7  # s: a node that is there boots within this
-START_TIMEOUT = 180.0  # s: a node of our own may have to compile its loop and the plant first
 
 
 class Participants(NamedTuple):
@@ -85,12 +82,22 @@ def _require_time(job: Job) -> None:
                                                "lockstep between processes nodes watch neither SYNC nor heartbeats")
 
 
-def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses) -> None:
-    """Start the nodes of this job that do not answer on the bus. Raises BusError."""
-    if master.hears_rival(RIVAL_TIMEOUT):  # before sending anything: a reset would end the other rig's test
+def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, rival_time: float = 0.25,
+                         boot_time: float = 0.7) -> None:
+    """Start the nodes of this job that do not answer on the bus.
+
+    Args:
+        job, master, processes: what is to be there, how to ask for it, and where to start it.
+        rival_time: s; another rig at work is heard within this.
+        boot_time: s; a node that is there boots within this.
+
+    Raises:
+        BusError: another rig, or a node that does not answer.
+    """
+    if master.hears_rival(rival_time):  # before sending anything: a reset would end the other rig's test
         raise BusError(f"another rig is active on {job.bus}: received a SYNC or heartbeat of node 1")
     for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
-        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, BOOT_TIMEOUT)
+        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, boot_time)
         if wanted == "external" and not there:
             raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
         if node == CONTROLLER and wanted != "external" and there:
@@ -125,9 +132,13 @@ def _make_command(job: Job, node: int) -> list[str]:
     return words
 
 
-def _wait_for_node(master: Master, node: int, processes: NodeProcesses) -> None:
-    """Until a node of our own answers. Raises BusError when it does not."""
-    for _ in range(round(START_TIMEOUT)):
+def _wait_for_node(master: Master, node: int, processes: NodeProcesses, seconds: int = 180) -> None:
+    """Until a node of our own answers; it may have to compile its loop and the plant.
+
+    Raises:
+        BusError: it does not answer.
+    """
+    for _ in range(seconds):
         if master.is_present(node, 1.0):
             return
         if node in processes.find_ended():

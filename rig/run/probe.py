@@ -26,7 +26,6 @@ BEFORE, AFTER = 3, 4  # phase numbers, beside those of set-up, main and clean-up
 PROBES = 2  # before set-up
 ATTEMPTS = 5  # at each of them, in real time
 DISTANCE = 1e-3  # m: from the position to the demand while the control word is not ACTIVE
-_STEP = 0.5e-3  # m: while it is; far below the current limit
 _MISSED_LIMIT = 5  # cycles in a row without an answer: then the probe ends, because each costs a timeout
 
 
@@ -44,8 +43,9 @@ LAST_STEPS = (Step(0, DISTANCE, 8),)
 
 def list_first_steps(step_delay: float) -> tuple[Step, ...]:
     """The steps of a probe before set-up, whose demand step may be answered `step_delay` s late."""
+    step = 0.5e-3  # m; its current is far below the limit
     return (Step(0, DISTANCE, 4), Step(Control.DISABLE, DISTANCE, 2), Step(Control.DISABLE | Control.HOLD, DISTANCE, 2),
-            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, _STEP, 3 + round(step_delay * RATE)),
+            Step(Control.ACTIVE, 0.0, 3), Step(Control.ACTIVE, step, 3 + round(step_delay * RATE)),
             Step(0, DISTANCE, 8))
 
 

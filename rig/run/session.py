@@ -70,7 +70,6 @@ from rig.sequences.run_data import DriveFrames
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
 _SETTLING = 20  # cycles of clean-up that nodes started again have to get rid of their errors
-_MOST_DRIVES = 2_000_000  # half an hour; a longer run is judged on what was kept
 _ENDS_BRING_UP = ("bring_up", "late")  # troubles that a run cannot go on with
 _ENDS_RUN = ("process", *_ENDS_BRING_UP)  # whatever the sequence tests, it needs its nodes
 _ENABLING_STEPS = (Control.DISABLE, Control.DISABLE | Control.HOLD)  # one cycle each on the way to ACTIVE
@@ -184,7 +183,8 @@ class Session:
     def _keep_drive(self, frame: Frame) -> None:
         """Record a frame; keep the drive frames for the checks of reactions."""
         self.recorder.frame(frame)
-        if frame.cob_id == codec.DRIVE and len(frame.data) == 8 and len(self._drives) < _MOST_DRIVES:
+        most = 2_000_000  # half an hour; a longer run is judged on what was kept
+        if frame.cob_id == codec.DRIVE and len(frame.data) == 8 and len(self._drives) < most:
             self._drives.append(frame)
 
     def read_drives(self) -> DriveFrames:

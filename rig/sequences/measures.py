@@ -12,7 +12,6 @@ import numpy as np
 from plant.segments import RATE, Array
 
 MEDIAN_SAMPLES = 5  # samples
-SMALLEST_STEP = 20e-6  # m, ten times the noise
 SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
 
 
@@ -52,10 +51,13 @@ def compute_speed(position: Array) -> Array:
     return difference
 
 
-def measure_step_size(com: Array, before: float) -> float:
-    """What a step section asks for; NotMeasurable if it has no step at its start or moves on later."""
+def measure_step_size(com: Array, before: float, smallest: float = 20e-6) -> float:
+    """What a step section asks for; NotMeasurable if it has no step at its start or moves on later.
+
+    `smallest`: m; ten times the noise.
+    """
     size = float(com[-1] - before)
-    if abs(size) < SMALLEST_STEP or np.abs(com - com[-1]).max() > 1e-9:
+    if abs(size) < smallest or np.abs(com - com[-1]).max() > 1e-9:
         raise NotMeasurable("the command does not step here and then hold")
     return size
 

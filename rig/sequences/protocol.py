@@ -33,9 +33,7 @@ DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lis
 }
 _LEVELS, _READY = int(Control.ACTIVE), int(Status.READY)
 LONGEST_STEP_DELAY = 0.1  # s: the probe's step lasts as long
-LARGEST_FROZEN_CHANGE = 100e-6  # m: fifty times the noise of the position sensor
 _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
-_LONGEST_PAUSE = 3.0  # heartbeat periods: then a node counts as silent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +263,8 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
 def _judge_frozen(record: ProtocolRecord) -> CheckResult:
     """How far the position error moved while the current of the closed loop stood still."""
     change = measure_frozen(record.run, record.current_limit if record.gains is not None else None)
-    return _make_result("current follows the error", "current", change * 1e6, "um", high=LARGEST_FROZEN_CHANGE * 1e6)
+    largest = 100e-6  # m: fifty times the noise of the position sensor
+    return _make_result("current follows the error", "current", change * 1e6, "um", high=largest * 1e6)
 
 
 def measure_frozen(rows: Rows, limit: float | None) -> float:
@@ -370,7 +369,8 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
     """
     begin, end = record.heard
     period, tolerance = record.heartbeat_period, limits.heartbeat
-    if end - begin - record.deaf < _LONGEST_PAUSE * period:
+    longest_pause = 3.0 * period  # s: then a node counts as silent
+    if end - begin - record.deaf < longest_pause:
         return
     for node, beats in record.heartbeats.items():
         t, waited = np.array(beats, float).reshape(-1, 2).T

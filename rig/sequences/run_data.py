@@ -13,7 +13,6 @@ from rig.sequences import measures
 from rig.sequences.measures import NotMeasurable
 
 MAIN = "main"  # the window that is all of the main phase
-LARGEST_MISSING_SHARE = 0.01  # of a window; fewer missing samples are bridged by straight lines, and the detail says so
 
 
 class TraceLike(Protocol):
@@ -93,8 +92,8 @@ class RunData:
             raise NotMeasurable("the window is empty")
         return slice(first, last)
 
-    def read_signal(self, name: str, span: slice) -> Array:
-        """A signal's samples in a span, few missing ones bridged; NotMeasurable without it."""
+    def read_signal(self, name: str, span: slice, largest_missing_share: float = 0.01) -> Array:
+        """A signal's samples in a span, few missing ones bridged by straight lines; NotMeasurable without it."""
         if name == "error":
             return self.read_signal("com", span) - self.read_signal("xj", span)
         if name == "speed":
@@ -102,7 +101,7 @@ class RunData:
         column = getattr(self.trace, name, None)
         if column is None:
             raise NotMeasurable(f"{name} was not measured")
-        return measures.bridge_gaps(np.asarray(column, float)[span], name, LARGEST_MISSING_SHARE)
+        return measures.bridge_gaps(np.asarray(column, float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""

@@ -9,7 +9,6 @@ from plant.errors import InputError
 from plant.segments import LONGEST, Second
 
 PERIOD = 1e-3  # s, one cycle
-_SYNC_PERIODS_TOLERATED = 1.5  # after so many times 0x1006 without a SYNC some CANopen stacks call SYNC lost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +50,9 @@ class TimingPolicy:
         bus. So 1.5 times the value is at least the longest pause that the sequence accepts: its overruns in a row (or
         `in_a_row`, if more) and one more SYNC that is late by its limit.
         """
+        periods_tolerated = 1.5  # after so many times 0x1006 without a SYNC some CANopen stacks call SYNC lost
         pause = (max(self.most_in_a_row or 0, in_a_row) + 1) * PERIOD + self.sync
-        return 1000 * ceil(pause / _SYNC_PERIODS_TOLERATED / PERIOD)
+        return 1000 * ceil(pause / periods_tolerated / PERIOD)
 
 
 def _require(holds: bool, key: str, expected: str) -> None:

@@ -35,7 +35,6 @@ EFFECTS = tuple(name for name in hidden.CATALOGUE
 """Effects with a size that both simulators give in the same unit, and that a replay passes."""
 FACTORS = (1.5, 0.5)
 """Times the claimed size."""
-FIRST_SEED = 7200
 COLUMNS = ["xj", "p12", "xs"]
 
 SIZES: Mapping[str, Callable[[float, Mapping[str, float]], float]] = {
@@ -74,7 +73,8 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
     """Claim a size for a healthy unit, hide the effect in it at a multiple of that, and explain the runs."""
     number, effect, factor = job
     target = folder / f"{number:04d}"
-    healthy = draw_unit(FIRST_SEED + number, effect)
+    first_seed = 7200
+    healthy = draw_unit(first_seed + number, effect)
     claimed = claim_size(healthy, effect, target / "healthy")
     row: Row = {"case": number, "effect": effect, "factor": factor, "sources": sources,
                 "claimed": claimed if math.isfinite(claimed) else None, "verdict": "NOT_CLAIMED", "found": None}

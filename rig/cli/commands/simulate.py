@@ -7,7 +7,6 @@ from typing import Any
 from rig.cli import options
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
-SAMPLE_STEPS = 400  # a cycle: finer than those of a fit, as a real unit is
 SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),
                  (5.0, -1e-3), (5.5, 4e-3), (6.0, 1e-3), (7.5, 1.3e-3), (8.0, -4e-3), (9.0, -4e-3), (9.001, 0.0),
                  (10.0, 0.0))  # s, m: steps, slow ramps and corners
@@ -91,8 +90,9 @@ def write_samples(args: argparse.Namespace) -> int:
     other = build_profile((Points(points=SAMPLE_POINTS),)).command
     runs = {"run.csv": usual, "run2.csv": usual, "held.csv": other}
     places = {name: require_new(folder / name, is_forced=args.force) for name in runs}
+    steps = args.steps or 400  # a cycle: finer than those of a fit, as a real unit is
     for seed, (name, com) in enumerate(runs.items(), args.seed + 1):
-        columns = simulate(model, com, load[:len(com)], seed, args.steps or SAMPLE_STEPS)
+        columns = simulate(model, com, load[:len(com)], seed, steps)
         Trace.from_columns(columns._asdict(), period, {"seed": str(seed)}).write_csv(places[name])
     sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
                 f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")

@@ -22,7 +22,6 @@ from rig.studies.robustness.frames import invent_frames
 from rig.studies.robustness.nodes import read_usage, start_nodes
 
 _NESTED, _HUGE = b"\x91" * 2000, b"\xdd\xff\xff\xff\xff"  # msgpack: arrays in arrays; an array of 4 billion
-_LARGEST = 60_000  # bytes
 
 
 class DatagramCount(NamedTuple):
@@ -77,7 +76,7 @@ def _change(rng: np.random.Generator, datagram: bytes) -> bytes:
             changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
         return bytes(changed[:int(rng.integers(len(changed) + 1))] if rng.random() < 0.3 else changed)
     if kind < 0.68:
-        return (_NESTED, _HUGE)[int(rng.integers(2))] + rng.bytes(int(rng.integers(_LARGEST)))
+        return (_NESTED, _HUGE)[int(rng.integers(2))] + rng.bytes(int(rng.integers(60_000)))
     return rng.bytes(int(rng.integers(100)))
 
 

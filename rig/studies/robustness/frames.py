@@ -13,7 +13,6 @@ _OBJECTS = (0x1000, 0x1001, 0x1003, 0x1005, 0x1006, 0x1008, 0x1014, 0x1016, 0x10
             0x1600, 0x1800, 0x1A00, 0x2100, 0x2110, 0x2200, 0x2210, 0x2211, 0x2212, 0x6040, 0x6041)
 _COMMANDS = (0x40, 0x21, 0x22, 0x23, 0x2B, 0x2F, 0x00, 0x10, 0x01, 0x60, 0x70, 0x80, 0xA0, 0xC2, 0xFF)  # of SDO
 _NMT = (1, 1, 1, 1, 2, 128, 129, 130)  # start four times as often: a node that is started has more to do wrong
-SYNC_EVERY = 8  # frames, on average
 
 
 def invent_frames(count: int, seed: int) -> Iterator[Frame]:
@@ -26,7 +25,7 @@ def invent_frames(count: int, seed: int) -> Iterator[Frame]:
     t_ns, cycle = 0, 0
     for _ in range(count):
         kind = rng.random()
-        if kind < 1.0 / SYNC_EVERY:
+        if kind < 1.0 / 8.0:
             t_ns, cycle = t_ns + 1_000_000, cycle + 1
             yield Frame(t_ns, codec.SYNC, b"")
             continue

@@ -20,8 +20,6 @@ from rig.studies.robustness.fuzz import fuzz_node, fuzz_rig
 from rig.studies.robustness.logs import LogCount, fuzz_logs
 from rig.studies.robustness.soak import soak_bench
 
-MOST_GROWTH = 16 << 20  # bytes of memory that invented frames may cost
-
 
 def run_study(frames: int, trials: int, minutes: float, seed: int, controller: str,
               progress: Progress) -> dict[str, Any]:
@@ -38,11 +36,12 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     problems: list[str] = []
     counts = [fuzz_node("plant", frames, seed, progress), fuzz_node("controller", frames, seed, progress),
               fuzz_rig(frames, seed, progress)] if frames else []
+    most_growth = 16 << 20  # bytes of memory that invented frames may cost
     for count in counts:
         problems += [f"invented frames, {count.target}: {failure}" for failure in count.failures]
         if not count.works:
             problems.append(f"invented frames, {count.target}: does not work afterwards")
-        if count.growth > MOST_GROWTH:
+        if count.growth > most_growth:
             problems.append(f"invented frames, {count.target}: {count.growth >> 20} MiB more memory")
     datagrams = fuzz_datagrams(frames // 10, seed, _draw_group(seed, 1), controller, progress) if frames else None
     if datagrams and datagrams.verdict != "PASS":
