@@ -21,7 +21,7 @@ PROBE = """<script>addEventListener("load", () => {
     if (e.getBoundingClientRect().right > width + 1 && !scrolls(e.parentElement)) out.push(e.outerHTML.slice(0, 80));
   const note = document.createElement("pre"); note.id = "probe";
   note.textContent = JSON.stringify({inner: innerWidth, scroll: root.scrollWidth, client: root.clientWidth,
-    height: root.scrollHeight, beyond: out, errors: window.probeErrors || []});
+    height: root.scrollHeight, beyond: out, errors: window.probeErrors || [], notes: window.probeNotes || {}});
   document.body.append(note);
 });
 window.probeErrors = []; addEventListener("error", e => window.probeErrors.push(e.message));
@@ -41,6 +41,7 @@ class PageSize(NamedTuple):
     height: int
     beyond: list[str]  # elements that are cut off at the right and do not scroll in a box of their own
     errors: list[str]  # of scripts
+    notes: dict[str, str]  # what the script of the caller left in window.probeNotes
 
 
 def find_browser() -> str | None:
@@ -60,7 +61,7 @@ def call_browser(*arguments: str, seconds: float = 120.0) -> str:
 
 def measure_page(page: Path, width: int, script: str = "") -> PageSize:
     """Open a page in a window of `width` pixels, run `script` in it, and measure it."""
-    run = f"<script>addEventListener('load', () => {{ {script} }});</script>" if script else ""
+    run = f"<script>addEventListener('load', () => {{ {script} }});</script>" if script else ""  # before the probe
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "page.html")
         copy.write_text(page.read_text(encoding="utf-8").replace("<head>", f"<head>{run}{PROBE}", 1), encoding="utf-8")
