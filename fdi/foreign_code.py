@@ -103,3 +103,14 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
+
+
+def require_different_names(files: Sequence[Path]) -> None:
+    """Refuse two effect files of one name: a log stores them by name.
+
+    Raises:
+        InputError: the second file of that name.
+    """
+    for i, file in enumerate(files):
+        if file.name in [other.name for other in files[:i]]:
+            raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")

@@ -53,6 +53,7 @@ FOLDER_MAY_IMPORT = {
     "rig.doctor": {"rig.network", "rig.run"},
     "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
     "rig.studies": {*BENCH, "rig.junit"},
+    "rig.testing": BENCH,
     "rig.cli": {*BENCH, "rig.conformance", "rig.junit", "rig.studies"},
 }
 # Modules of others that only some files may import (prefixes of paths).
@@ -73,7 +74,7 @@ ONLY_IN = {
     "asyncio": (),
     "random": (),
     "tests": (),
-    "pytest": (),
+    "pytest": ("rig/testing/pytest_plugin.py",),
     "scipy": ("fdi/",),
 }
 # The edge, where the wall clock may be seen; everything else is told the time.

@@ -29,11 +29,15 @@ class Medium(Enum):
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table: its text, the mood that colours it, and whether it is printed bold."""
+    """A cell of a table: its text, the mood that colours it, and whether it is printed bold.
+
+    `link` is where the text leads on the page: the path of a file, relative to the page.
+    """
 
     text: str
     mood: Mood = ""
     is_strong: bool = False
+    link: str = ""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def load_effects_of_model(args: argparse.Namespace, model: str | None) -> tuple[
     from fdi import foreign_code
 
     files = foreign_code.load_effects_of_model(model, args.effects, is_trusted=args.trust)
-    require_different_names((*args.effects, *files))
+    foreign_code.require_different_names((*args.effects, *files))
     return files
 
 
@@ -124,20 +124,10 @@ def load_user_effects(files: Sequence[Path]) -> None:
     Raises:
         InputError: an invalid file, or two files of one name.
     """
-    require_different_names(files)
     if files:
+        from fdi.foreign_code import require_different_names
         from plant.effects import load_effects
 
+        require_different_names(files)
         for file in files:
             load_effects(file)
-
-
-def require_different_names(files: Sequence[Path]) -> None:
-    """Refuse two effect files of one name: a log stores them by name.
-
-    Raises:
-        InputError: the second file of that name.
-    """
-    for i, file in enumerate(files):
-        if file.name in [other.name for other in files[:i]]:
-            raise InputError("--effects", str(file), f"files of different names, not a second {file.name}")

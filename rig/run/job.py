@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,12 @@ class Job:
         return {"seed": self.seed, "bus": self.bus, "pace": self.pace, "controller": self.controller,
                 "plant": self.plant, "model": self.model.name, "sequence": self.sequence.title,
                 "period": self.period_ns / 1e9, "max_overruns": self.max_overruns}
+
+
+def replace_settings(job: Job, **given: object) -> Job:
+    """The job with the settings that are not None."""
+    settings: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    return replace(job, **settings)
 
 
 def require_bench_cycle(model: Model, where: object) -> None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
     from rig.run.job import Job
+    from rig.run.job_choice import JobChoice
     from rig.run.outcome import Outcome
 
 
@@ -23,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from rig.run.choices import CONTROLLERS, PACES, PLANTS
 
     add = parser.add_argument
-    add("sequence", nargs="?", metavar="SEQUENCE",
-        help="test sequence: a .toml file, or the name of a shipped one (default: preflight)")
+    add("sequence", nargs="*", metavar="SEQUENCE",
+        help="test sequence: a .toml file, or the name of a shipped one (default: preflight). Several, or a suite "
+             "file, run on all cores and end in one report (docs/suite.md)")
     options.add_model_options(parser)
     parser.set_defaults(seed=None)  # None: not given; --from takes the seed of the log
     add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
@@ -40,6 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest share of overruns in a real-time run; more make its timing invalid "
              "(default: that of the sequence, 0.001)")
     add("--fdi", action="store_true", help="also diagnose the servovalve like rig fdi, against a nominal unit")
+    add("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
+    add("--jobs", type=options.parse_count, default=None, metavar="N",
+        help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN bus)")
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run recorded in this log")
 
 
@@ -52,18 +57,22 @@ def run_command(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
-    from rig.network.bus import choose_bus
+    from rig.network.clock import WallClock
+    from rig.run.job import replace_settings
+    from rig.run.job_choice import build_job
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
 
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
-    job = read_job(args.source, args) if args.source else build_job(args)
-    bus, why = choose_bus(job.bus if args.source else args.bus)
-    if job.controller == "c" and bus == "embedded" and args.bus == "auto":
-        bus, why = "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
+    if not args.source and is_suite(args.sequence):
+        return start_suite(args)
+    job = read_job(args.source, args) if args.source else build_job(build_choice(args), is_trusted=args.trust)
+    bus, why = choose_bus_of_run(args, job.bus if args.source else args.bus, job.controller)
     job = replace_settings(job, bus=bus)
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
+    junit = choose_junit(args)
+    clock = WallClock()
     with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
         with announce_run(job, why, is_silent=args.json or args.quiet) as progress:
             prepare = pages.wait_until_loaded if job.realtime else do_nothing
@@ -75,7 +84,69 @@ def run_command(args: argparse.Namespace) -> int:
         with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
             show_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
         pages.finish_page()
+    if junit is not None:
+        from fdi.output import write_text
+        from rig.studies.suite.suite_junit import write_junit_of_run
+
+        write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
     return outcome.status
+
+
+def is_suite(names: list[str]) -> bool:
+    """Whether the command line names several sequences or a suite file."""
+    from rig.studies.suite.suite_file import is_suite_file
+
+    return len(names) > 1 or any(map(is_suite_file, names))
+
+
+def start_suite(args: argparse.Namespace) -> int:
+    """Run several sequences or suite files; return the exit status.
+
+    Raises:
+        RigError: bad input; nothing has run then.
+    """
+    from plant import InputError
+    from rig.cli.suite import run_suite
+
+    if args.fdi:
+        raise InputError("--fdi", "", "one sequence; for several: rig fdi FOLDER of each case")
+    base = build_choice(args)
+    bus, _ = choose_bus_of_run(args, args.bus, args.controller)
+
+    def choose_folder() -> Path:  # not before everything has been tried: an error leaves no folder behind
+        return Path(args.out) if args.out else make_folder(Path("runs"), find_suite_name(args.sequence))
+
+    return run_suite(args, base._replace(bus=bus), choose_folder)
+
+
+def find_suite_name(names: list[str]) -> str:
+    """The name of the folder of several runs: that of the one suite file, else "suite"."""
+    return Path(names[0]).stem if len(names) == 1 else "suite"
+
+
+def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | None) -> tuple[str, str]:
+    """The bus of a run and why it is that one.
+
+    Raises:
+        RigError: a bus that is not there.
+    """
+    from rig.network.bus import choose_bus
+
+    bus, why = choose_bus(wanted)
+    if controller == "c" and bus == "embedded" and args.bus == "auto":
+        return "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs"
+    return bus, why
+
+
+def choose_junit(args: argparse.Namespace) -> Path | None:
+    """The file of --junit, once it is known that it can be written.
+
+    Raises:
+        InputError: it cannot be written, or is no .xml file.
+    """
+    from rig.cli.answer import choose_file
+
+    return choose_file(args.junit, (".xml",), None, "--junit")
 
 
 def do_nothing() -> None:
@@ -159,30 +230,17 @@ def diagnose_servovalve(trace: Trace, progress: Progress) -> dict[str, Any]:
     return dict(to_plain(collect_data(diagnosis)))
 
 
-def build_job(args: argparse.Namespace) -> Job:
-    """The job that the options describe; --model and --set override the sequence's own model.
+def build_choice(args: argparse.Namespace) -> JobChoice:
+    """What the command line chooses for the run of its first sequence; the bus is chosen later.
 
     Raises:
-        InputError: a sequence, model or value that cannot be used.
+        InputError: a --set that is not GROUP.FIELD=VALUE.
     """
-    from plant import InputError, load_model
-    from rig.run.job import Job, require_bench_cycle
-    from rig.sequences import load_sequence
+    from rig.run.job_choice import JobChoice
 
-    effects = options.load_chosen_effects(args, args.model)
-    sequence = load_sequence(args.sequence or "preflight")
-    if args.model is None:
-        effects += options.load_effects_of_model(args, sequence.model.name)
-    chosen = load_model(args.model or sequence.model.name).replace(sequence.model.overrides, sequence.name)
-    model = chosen.replace(options.parse_changes(args.set))
-    require_bench_cycle(model, "--set")
-    foreign = [name for name in model.list_changes() if name.startswith("controller.")]
-    if args.controller == "external" and foreign:
-        raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
-    job = Job(sequence=sequence, model=model, seed=args.seed or 0, effects=effects,
-              max_overruns=sequence.timing.share)
-    return replace_settings(job, pace=args.pace, controller=args.controller, plant=args.plant,
-                            max_overruns=args.max_overruns)
+    return JobChoice(sequence=[*args.sequence, "preflight"][0], model=args.model,
+                     changes=options.parse_changes(args.set), seed=args.seed or 0, effects=tuple(args.effects),
+                     pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
 
 
 def read_job(source: Path, args: argparse.Namespace) -> Job:
@@ -195,7 +253,7 @@ def read_job(source: Path, args: argparse.Namespace) -> Job:
             a bus in the log that --bus does not name.
     """
     from plant import InputError
-    from rig.run.job import read_job
+    from rig.run.job import read_job, replace_settings
     from rig.run.participants import EMBEDDED_NAMES
 
     if args.sequence or args.set or args.model or args.effects or args.seed is not None:
@@ -213,16 +271,12 @@ def read_job(source: Path, args: argparse.Namespace) -> Job:
                             max_overruns=args.max_overruns)
 
 
-def replace_settings(job: Job, **given: object) -> Job:
-    """The job with the settings that are not None."""
-    from dataclasses import replace
-
-    settings: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
-    return replace(job, **settings)
-
-
 def make_folder(parent: Path, name: str) -> Path:
-    """Make a new folder: parent/name, else name-2, name-3, ... Made at once, so that no two runs take it."""
+    """Make a new folder: parent/name, else name-2, name-3, ... Made at once, so that no two runs take it.
+
+    Raises:
+        InputError: the place cannot be written.
+    """
     from itertools import count
 
     from plant import InputError

@@ -16,13 +16,16 @@ from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import RigError
+from rig.network.clock import WallClock
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
 def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int,
-                     describe_failure: Callable[[Job, str], Result], attempts: int = 3) -> Iterator[tuple[Job, Result]]:
+                     describe_failure: Callable[[Job, str], Result], attempts: int = 3,
+                     choose_limit: Callable[[Job], float] | None = None,
+                     patience: float = 5.0) -> Iterator[tuple[Job, Result]]:
     """Each job with its result as soon as it is finished, in any order.
 
     Args:
@@ -31,6 +34,9 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
         processes: number of workers.
         describe_failure: makes the result of a job from the job and the reason why it has none.
         attempts: a job that this many workers have died of has failed.
+        choose_limit: the s that a job may take; the worker of one that takes longer is ended, and the job has failed.
+            None: no limit.
+        patience: s that a worker has to end its job when it is told to stop, before it is killed.
 
     Raises:
         RigError: a worker process cannot start.
@@ -38,10 +44,19 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
     """
     waiting = deque((job, 1) for job in jobs)
     workers: list[_Worker[Job]] = []
+    clock = WallClock()
     try:
         workers += [_Worker(work) for _ in range(min(processes, len(jobs)))]
         while workers:
-            for worker in _wait_for_messages(workers):
+            for worker in _find_overdue(workers, clock.now()):
+                workers.remove(worker)
+                worker.stop(patience)
+                assert worker.job is not None and choose_limit is not None
+                late = worker.job[0]
+                if waiting:
+                    workers.append(_Worker(work))
+                yield late, describe_failure(late, f"it took longer than {choose_limit(late):g} s")
+            for worker in _wait_for_messages(workers, clock.now()) if workers else []:
                 finished = worker.job
                 try:
                     message = worker.receive()
@@ -54,20 +69,33 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
                     if attempt < attempts:
                         waiting.append((job, attempt + 1))
                     else:
-                        yield job, describe_failure(job, f"each of {attempts} worker processes that tried it died")
+                        yield job, describe_failure(job, describe_deaths(attempts, worker.process.exitcode))
                     if waiting:
                         workers.append(_Worker(work))
                     continue
                 if waiting:
-                    worker.assign(waiting.popleft())
+                    job, attempt = waiting.popleft()
+                    limit = None if choose_limit is None else clock.now() + round(1e9 * choose_limit(job))
+                    worker.assign((job, attempt), limit)
                 else:
                     workers.remove(worker)
                     worker.stop()
                 if finished is not None:
                     yield finished[0], message.unpack()
     finally:
+        for worker in workers:  # all at once: each may need its time to come to an end
+            worker.ask_to_stop()
         for worker in workers:
-            worker.stop()
+            worker.stop(patience)
+
+
+def describe_deaths(attempts: int, exit_code: int | None) -> str:
+    """Why a job has no result whose workers died; `exit_code` is that of the last one, negative for a signal."""
+    if attempts > 1:
+        return f"each of {attempts} worker processes that tried it died"
+    if exit_code is not None and exit_code < 0:
+        return f"its process was ended by signal {-exit_code} ({signal.Signals(-exit_code).name})"
+    return f"its process ended with status {exit_code}"
 
 
 class _Message(NamedTuple):
@@ -98,11 +126,12 @@ class _Worker(Generic[Job]):
             self.process.start()
         far_end.close()
         self.job: tuple[Job, int] | None = None
+        self.due_ns: int | None = None  # when its job must have ended
         self.is_idle = False  # not before it has said that it has started
 
-    def assign(self, job: tuple[Job, int]) -> None:
-        """Give the worker a job and the number of the attempt."""
-        self.job, self.is_idle = job, False
+    def assign(self, job: tuple[Job, int], due_ns: int | None) -> None:
+        """Give the worker a job and the number of the attempt, and the time when it must have ended."""
+        self.job, self.is_idle, self.due_ns = job, False, due_ns
         with contextlib.suppress(OSError):  # it has died since; `receive` will notice
             self.connection.send(job[0])
 
@@ -112,22 +141,36 @@ class _Worker(Generic[Job]):
             message: _Message = self.connection.recv()
         except (EOFError, OSError):
             raise _WorkerDiedError from None
-        self.job, self.is_idle = None, True
+        self.job, self.is_idle, self.due_ns = None, True, None
         return message
 
-    def stop(self, patience: float = 5.0) -> None:
-        """End the process: an idle one ends by itself, a busy one is terminated, and killed after `patience` s."""
+    def ask_to_stop(self) -> None:
+        """Ask the process to end: an idle one ends by itself, a busy one is terminated. Once is enough."""
+        if self.connection.closed:
+            return
         self.connection.close()
         if not self.is_idle:
             self.process.terminate()
+
+    def stop(self, patience: float = 5.0) -> None:
+        """End the process; it is killed after `patience` s."""
+        self.ask_to_stop()
         self.process.join(patience)
         self.process.kill()
         self.process.join()
 
 
-def _wait_for_messages(workers: Sequence[_Worker[Job]]) -> list[_Worker[Job]]:
-    """The workers that have sent something or have died, at least one."""
-    ready = connection.wait([worker.connection for worker in workers])
+def _find_overdue(workers: Sequence[_Worker[Job]], now_ns: int) -> list[_Worker[Job]]:
+    """The workers whose job has taken too long."""
+    return [worker for worker in workers
+            if worker.due_ns is not None and now_ns >= worker.due_ns and not worker.connection.poll()]
+
+
+def _wait_for_messages(workers: Sequence[_Worker[Job]], now_ns: int) -> list[_Worker[Job]]:
+    """The workers that have sent something or have died; none if a job takes too long before that."""
+    due = [worker.due_ns for worker in workers if worker.due_ns is not None]
+    seconds = max(0.0, 1e-9 * (min(due) - now_ns)) if due else None
+    ready = connection.wait([worker.connection for worker in workers], seconds)
     return [worker for worker in workers if worker.connection in ready]
 
 

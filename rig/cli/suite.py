@@ -1,0 +1,156 @@
+"""`rig run` with several sequences or a suite file: all runs, one report."""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rig.run.job_choice import JobChoice
+    from rig.studies.suite.case import CaseResult
+    from rig.studies.suite.suite_file import Suite
+
+
+def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable[[], Path]) -> int:
+    """Run all sequences and suite files of the command line; write page, JSON and JUnit; return the exit status.
+
+    Args:
+        args: of the command line.
+        base: what its options choose for every case.
+        choose_folder: gives the folder of the results; called when all cases have been tried.
+
+    Raises:
+        RigError: a sequence, model or parameter that cannot be used; nothing has run then.
+    """
+    from fdi.output import write_text
+    from fdi.report.html import write_html
+    from fdi.report.json import to_json
+    from rig.cli.answer import choose_file, show_answer
+    from rig.cli.interruption import catch_signals
+    from rig.network.clock import WallClock
+    from rig.studies.suite.case import find_status
+    from rig.studies.suite.run_suite import run_cases
+    from rig.studies.suite.suite_junit import write_junit
+    from rig.studies.suite.suite_report import build_suite_report
+
+    tried = read_suite(args, base)
+    processes = choose_processes(args, base, len(tried.cases))
+    folder = choose_folder()
+    suite = tried.put_into(folder)
+    make_folders(suite, folder)
+    junit = choose_file(args.junit, (".xml",), None, "--junit")
+    show = announce_suite(suite, processes, is_silent=args.json or args.quiet)
+    clock = WallClock()
+    with catch_signals():  # Ctrl-C and SIGTERM both break it off
+        results, is_interrupted = run_cases(suite.cases, processes, show, 5.0 if base.bus == "embedded" else 30.0)
+    seconds = 1e-9 * clock.now()
+    files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case")]
+    files += [("JUnit", str(junit))] if junit else []
+    report = build_suite_report(suite, results, seconds, processes, folder, files)
+    write_html(report, folder / "suite.html")
+    write_text(folder / "suite.json", to_json(report.data) + "\n")
+    if junit is not None:
+        write_text(junit, write_junit(suite.title, results), "--junit")
+    show_answer(report, args)
+    return find_status(results, is_interrupted=is_interrupted)
+
+
+def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
+    """The suite that the command line names; every case has been tried.
+
+    Raises:
+        InputError: what cannot be used, or an option that a suite file has to say.
+    """
+    from plant.errors import InputError
+    from rig.studies.suite.suite_file import Variant, build_suite, is_suite_file, read_suite_file
+
+    variants: list[Variant] = []
+    titles: list[str] = []
+    sources: list[str] = []
+    requirements: dict[str, str] = {}
+    for name in args.sequence:
+        if not is_suite_file(name):
+            variants.append(Variant(Path(name).stem, base._replace(sequence=name)))
+            continue
+        if args.model or args.set or args.seed is not None:
+            raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
+        content, own = read_suite_file(Path(name), base)
+        variants += own
+        titles.append(content.title)
+        sources.append(name)
+        listed = content.requirements
+        requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
+    title = titles[0] if len(titles) == 1 else f"{len(args.sequence)} sequences"
+    return build_suite(title, variants, requirements, ", ".join(sources), is_trusted=args.trust)
+
+
+def make_folders(suite: Suite, folder: Path) -> None:
+    """Make the folder of a suite and those of its cases.
+
+    Raises:
+        InputError: they cannot be made.
+    """
+    from plant.errors import InputError
+
+    try:
+        for case in suite.cases:
+            case.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
+
+
+def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> int:
+    """How many cases run at a time: all cores in lockstep on the embedded bus, one on a bus or in real time.
+
+    Raises:
+        InputError: --jobs above 1 where only one run at a time is possible.
+    """
+    import os
+
+    from plant.errors import InputError
+
+    is_alone = base.bus.partition(":")[0] not in ("embedded", "virtual") or base.pace == "realtime"
+    if is_alone and (args.jobs or 1) > 1:
+        raise InputError("--jobs", str(args.jobs), "1 in real time and on a bus between programs, which the runs share")
+    wanted = 1 if is_alone else args.jobs or len(os.sched_getaffinity(0))
+    return max(1, min(wanted, cases))
+
+
+def announce_suite(suite: Suite, processes: int, *, is_silent: bool) -> Callable[[CaseResult], None]:
+    """Say what is about to run; the function returned prints a line for each case that has ended."""
+    from rich.text import Text
+
+    from fdi.report.numbers import count_nouns
+    from fdi.report.report import Cell
+    from fdi.report.terminal import style_of
+    from rig.cli.terminal import open_console
+    from rig.studies.suite.suite_report import MOODS
+
+    console = open_console()
+    ended = 0
+
+    def show(result: CaseResult) -> None:
+        nonlocal ended
+        ended += 1
+        line = Text(describe_result(result, ended, len(suite.cases)))
+        line.stylize(style_of(Cell("", MOODS[result.verdict])), 0, len(result.verdict))
+        console.print(line, soft_wrap=True)
+
+    if is_silent:
+        return ignore_result
+    cases = count_nouns(len(suite.cases), "case")
+    console.print(Text(f"{suite.title}: {cases}, {processes} at a time"), soft_wrap=True)
+    return show
+
+
+def ignore_result(result: CaseResult) -> None:
+    """Print nothing about a case."""
+
+
+def describe_result(result: CaseResult, number: int, cases: int) -> str:
+    """A line about a case that has ended: verdict, time, its number of all, name, reason."""
+    width = len(str(cases))
+    time = f"{result.seconds:7.1f} s" if result.seconds else " " * 9
+    reason = f": {result.reason}" if result.reason else ""
+    return f"{result.verdict:<14} {time}  {number:>{width}}/{cases}  {result.case.name}{reason}"

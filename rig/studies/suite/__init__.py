@@ -1,0 +1,1 @@
+"""A suite: many runs, one report with traceability of requirements, JUnit XML for build servers."""

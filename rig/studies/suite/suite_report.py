@@ -1,0 +1,158 @@
+"""The report of a suite: its cases with links to their pages, the checks that failed, and the requirements."""
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from fdi.report.json import to_plain
+from fdi.report.numbers import count_nouns
+from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table
+from fdi.report.run_report import MOODS as RUN_MOODS
+from fdi.report.run_report import format_limits
+from rig.sequences.checks import CheckResult
+from rig.studies.suite.case import CaseResult, find_verdict
+from rig.studies.suite.suite_file import Suite
+from rig.studies.suite.traceability import Evidence, Requirement, trace_requirements
+
+MOODS: dict[str, Mood] = {**RUN_MOODS, "ERROR": "bad", "NOT_RUN": "doubtful", "OPEN": "doubtful",
+                          "NOT_COVERED": "doubtful"}
+
+
+def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: float, processes: int, folder: Path,
+                       files: Sequence[tuple[str, str]] = ()) -> Report:
+    """Report on a suite.
+
+    Args:
+        suite: what was to be run.
+        results: of its cases, in their order.
+        seconds: wall-clock time of all.
+        processes: how many ran at a time.
+        folder: where the page will be; links are relative to it.
+        files: (label, path) of the files written.
+    """
+    requirements = trace_requirements(results, suite.requirements)
+    verdict = find_verdict(results)
+    facts = [("cases", count_cases(results)), ("wall-clock time", f"{seconds:.1f} s, {processes} at a time")]
+    facts += [("suite file", suite.source)] if suite.source else []
+    facts += [("requirements", _count_requirements(requirements))] if requirements else []
+    return Report(
+        command="run", title=suite.title, verdict=verdict, mood=MOODS[verdict], sentence=_describe(results),
+        facts=facts, notes=_list_notes(requirements),
+        sections=[Section("Cases", [_tabulate_cases(results, folder)]),
+                  Section("Checks that failed", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
+                  Section("Requirements", _tabulate_requirements(requirements), title_medium=Medium.BOTH)],
+        files=files, conclusion="" if verdict == "PASS" else f"{verdict}: {_describe(results)}",
+        data=collect_data(suite, results, requirements, seconds, processes))
+
+
+def count_cases(results: Sequence[CaseResult]) -> str:
+    """The number of cases by verdict: "12: 10 PASS, 2 FAIL"."""
+    counts = Counter(result.verdict for result in results)
+    return f"{len(results)}: " + ", ".join(f"{count} {word}" for word, count in counts.most_common())
+
+
+def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
+    bad = [result for result in results if result.verdict not in ("PASS", "NOT_JUDGED")]
+    if not bad:
+        unjudged = sum(result.verdict == "NOT_JUDGED" for result in results)
+        without = f", {unjudged} of them without checks" if unjudged else ""
+        return f"{count_nouns(len(results), 'case')}, none failed{without}."
+    named = ", ".join(result.case.name for result in bad[:most])
+    more = f" and {len(bad) - most} more" if len(bad) > most else ""
+    return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {named}{more}."
+
+
+def _list_notes(requirements: Sequence[Requirement]) -> list[str]:
+    missing = [each.id for each in requirements if each.verdict == "NOT_COVERED"]
+    return [f"no check verifies {', '.join(missing)}"] if missing else []
+
+
+def _count_requirements(requirements: Sequence[Requirement]) -> str:
+    counts = Counter(each.verdict for each in requirements)
+    return f"{len(requirements)}: " + ", ".join(f"{count} {word}" for word, count in counts.most_common())
+
+
+def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> Table:
+    columns = [Column("case"), Column("verdict"), Column("checks", align="right"), Column("time", "s", "right"),
+               Column("reason"), Column("differs from nominal", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = []
+    for result in results:
+        passed = len(result.checks) - len(result.failed)
+        rows.append([Cell(result.case.name, link=_link(result, folder)),
+                     Cell(result.verdict, MOODS[result.verdict]),
+                     f"{passed}/{len(result.checks)}" if result.checks else "-",
+                     f"{result.seconds:.1f}" if result.seconds else "-", result.reason,
+                     Cell("" if result.differences == "nothing" else result.differences, "muted")])
+    caption = "Checks: passed of all, protocol checks included. Time: wall-clock, with the page."
+    return Table(columns, rows, caption)
+
+
+def _link(result: CaseResult, folder: Path) -> str:
+    """The page of a run as the suite's page links it; "" if there is none."""
+    page = result.case.folder / "report.html"
+    return quote(os.path.relpath(page, folder)) if page.is_file() and result.checks else ""
+
+
+def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Table]:
+    failures = [(result, check) for result in results for check in result.failed]
+    if not failures:
+        return []
+    columns = [Column("case"), Column("check"), Column("measured", align="right"), Column("limits", align="right"),
+               Column("unit"), Column("requirement")]
+    rows: list[list[Cell | str]] = [
+        [Cell(result.case.name, link=_link(result, folder)), check.name,
+         Cell(_format_value(check), "bad" if result.verdict == "FAIL" else "doubtful"),
+         format_limits(check.low, check.high), "" if check.unit == "1" else check.unit, ", ".join(check.requirement)]
+        for result, check in failures]
+    return [Table(columns, rows, terminal_rows=30)]
+
+
+def _format_value(check: CheckResult) -> str:
+    return "not measurable" if math.isnan(check.value) else f"{check.value:.4g}"
+
+
+def _tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
+    if not requirements:
+        return []
+    columns = [Column("requirement"), Column("text", medium=Medium.PAGE), Column("verdict"),
+               Column("checks", align="right"), Column("verified by", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = []
+    for each in requirements:
+        passed = sum(evidence.verdict == "PASS" for evidence in each.evidence)
+        rows.append([each.id, each.text, Cell(each.verdict, MOODS[each.verdict]), f"{passed}/{len(each.evidence)}",
+                     describe_evidence(each.evidence)])
+    return [Table(columns, rows, "OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.")]
+
+
+def describe_evidence(evidence: Sequence[Evidence], most: int = 3) -> str:
+    """What verifies a requirement: each check with the cases that it passed in, and the names of the others."""
+    parts = []
+    for check in dict.fromkeys(each.check for each in evidence):
+        own = [each for each in evidence if each.check == check]
+        bad = [f"{each.verdict} in {each.case}" for each in own if each.verdict != "PASS"]
+        more = [f"{len(bad) - most} more"] if len(bad) > most else []
+        parts.append(", ".join([f"{check}: PASS in {len(own) - len(bad)} of {len(own)}", *bad[:most], *more]))
+    return "; ".join(parts)
+
+
+def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequence[Requirement], seconds: float,
+                 processes: int) -> dict[str, Any]:
+    """The JSON answer of a suite."""
+    cases = []
+    for result in results:
+        choice = result.case.choice
+        cases.append({
+            "name": result.case.name, "verdict": result.verdict, "why": result.why, "seconds": round(result.seconds, 3),
+            "folder": str(result.case.folder), "sequence": choice.sequence, "model": choice.model,
+            "set": dict(choice.changes), "seed": choice.seed, "requirement": list(result.case.requirement),
+            "differences": result.differences, "checks": [to_plain(check._asdict()) for check in result.checks]})
+    return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
+            "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
+            "jobs": processes,
+            "requirements": [{"id": each.id, "text": each.text, "verdict": each.verdict,
+                              "checks": [evidence._asdict() for evidence in each.evidence]} for each in requirements]}

@@ -1,0 +1,144 @@
+"""The bench for tests in Python: runs in lockstep on the embedded bus, and what they measured."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from fdi.output import write_text
+from fdi.progress import ignore_progress
+from fdi.report.run_report import format_limits, write_run_page
+from fdi.trace.trace import Trace
+from rig.run.job_choice import JobChoice, build_job
+from rig.run.outcome import Outcome
+from rig.run.runner import run_job
+from rig.run.session import SessionEvent
+from rig.sequences.checks import CheckResult
+from rig.testing.sequence_text import Command, Table, build_sequence
+
+
+class CheckFailedError(AssertionError):
+    """A run did not pass; the message names each check that failed, and the files that show it."""
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """A run on the bench."""
+
+    folder: Path  # of trace.mcap and verdict.json
+    outcome: Outcome = field(repr=False)
+
+    @property
+    def verdict(self) -> str:
+        """PASS, FAIL, ABORTED or NOT_JUDGED (no checks)."""
+        return self.outcome.verdict
+
+    @property
+    def why(self) -> str:
+        """The reason of a verdict other than PASS."""
+        return self.outcome.why
+
+    @property
+    def checks(self) -> dict[str, CheckResult]:
+        """The checks of the sequence and the protocol checks, by name."""
+        return {check.name: check for check in self.outcome.checks}
+
+    @property
+    def events(self) -> Sequence[SessionEvent]:
+        """What happened, in order."""
+        return self.outcome.events
+
+    @cached_property
+    def trace(self) -> Trace:
+        """The main phase: columns t, com, xj, cor, p12, xs, load, SI units."""
+        return Trace.read(self.folder / "trace.mcap")
+
+    def write_page(self) -> Path:
+        """Write report.html, the page of the run, into its folder; return its path."""
+        page = self.folder / "report.html"
+        if not page.exists():
+            write_run_page(self.folder / "trace.mcap", page)
+        return page
+
+    def write_picture(self) -> Path:
+        """Write signals.svg, the signals over time with the windows of the checks, into the folder of the run."""
+        from fdi.report.run_figures import draw_signals  # loads matplotlib
+
+        picture = self.folder / "signals.svg"
+        write_text(picture, draw_signals(Trace.read(self.folder / "trace.mcap", all=True)))
+        return picture
+
+    def assert_passed(self, *names: str) -> None:
+        """Fail a test unless these checks passed; without names, unless the run passed.
+
+        Raises:
+            CheckFailedError: it names the checks that failed with limits and measured values, and a picture.
+            KeyError: a name that no check has.
+        """
+        __tracebackhide__ = True
+        chosen = [self.checks[name] for name in names] if names else list(self.outcome.checks)
+        failed = [check for check in chosen if not check.passed]
+        if not failed and (names or self.verdict in ("PASS", "NOT_JUDGED")):
+            return
+        title = self.outcome.job.sequence.title
+        lines = [f"{title}: {len(failed)} of {len(chosen)} checks failed" if failed else
+                 f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed)]
+        lines += [f"picture: {self.write_picture()}", f"page: {self.write_page()}"]
+        raise CheckFailedError("\n".join(lines))
+
+
+def describe_failure(check: CheckResult) -> str:
+    """A failed check in one line: name, measured value, limits, window, requirement."""
+    unit = "" if check.unit == "1" else f" {check.unit}"
+    value = "not measurable" if check.value != check.value else f"{check.value:.4g}{unit}"
+    parts = [f"measured {value}", f"limits {format_limits(check.low, check.high)}{unit}"]
+    parts += [f"{check.t0:.3f} to {check.t1:.3f} s"] if check.t0 == check.t0 else []
+    parts += [check.detail] if check.detail else []
+    parts += [f"requirement {', '.join(check.requirement)}"] if check.requirement else []
+    return f"{check.name}: {', '.join(parts)}"
+
+
+@dataclass
+class Bench:
+    """Runs sequences in lockstep on the embedded bus; the results of each run go to a folder below `folder`.
+
+    `model` is the model of runs that do not choose one: a file, or the name of a shipped one.
+    """
+
+    folder: Path
+    model: str | None = None
+    runs: list[BenchRun] = field(default_factory=list)
+
+    def run(self, sequence: str | Path | None = None, *, command: Command | None = None,
+            set: Mapping[str, float | str] | None = None, model: str | Path | None = None, seed: int = 0,
+            effects: Sequence[str | Path] = (), faults: Sequence[Table] = (), checks: Sequence[Table] = (),
+            load: Sequence[Table] = (), guards: Sequence[Table] = ()) -> BenchRun:
+        """Run a sequence, or a command built in Python.
+
+        Args:
+            sequence: a file, or the name of a shipped one (default: preflight).
+            command: in its place, a demand in m for each cycle of 1 ms, or a list of segments as tables.
+            set: parameters of the model or of effects, SI: {"filter.clogging": 0.5}.
+            model: a file, or the name of a shipped one; default: that of the bench, else that of the sequence.
+            seed: of the noise.
+            effects: files of your own effects.
+            faults, checks, load, guards: entries as tables, as in a sequence file; added to those of the sequence.
+
+        Raises:
+            InputError: what cannot be used.
+        """
+        built = build_sequence(None if sequence is None else str(sequence), command, faults=faults, checks=checks,
+                               load=load, guards=guards)
+        chosen = self.model if model is None else str(model)
+        choice = JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects)))
+        job = build_job(choice, built)
+        folder = self.folder / f"run-{len(self.runs) + 1}"
+        run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
+        self.runs.append(run)
+        return run
+
+
+def _never() -> bool:
+    """Nobody stops the run."""
+    return False
