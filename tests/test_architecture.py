@@ -74,7 +74,7 @@ ONLY_IN = {
     "asyncio": (),
     "random": (),
     "tests": (),
-    "pytest": ("rig/testing/pytest_plugin.py",),
+    "pytest": (),
     "scipy": ("fdi/",),
 }
 # The edge, where the wall clock may be seen; everything else is told the time.

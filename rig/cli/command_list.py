@@ -9,6 +9,7 @@ HELP_OF_COMMAND = {
     "add": "add effects to a model, fit it, and show the error before and after",
     "bench": "measure speed, real time, bus faults, long recordings, robustness, or how often rig explain is right",
     "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
+    "check": "dry run of a sequence: its command against travel, speed and current, checks on the predicted run",
     "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
     "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
     "diff": "hold two or more runs side by side: signals, checks, timing, model, firmware",

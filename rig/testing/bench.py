@@ -10,6 +10,7 @@ from fdi.output import write_text
 from fdi.progress import ignore_progress
 from fdi.report.run_report import format_limits, write_run_page
 from fdi.trace.trace import Trace
+from plant.errors import InputError
 from rig.run.job_choice import JobChoice, build_job
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
@@ -128,13 +129,16 @@ class Bench:
         Raises:
             InputError: what cannot be used.
         """
-        built = build_sequence(None if sequence is None else str(sequence), command, faults=faults, checks=checks,
-                               load=load, guards=guards)
-        chosen = self.model if model is None else str(model)
-        choice = JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects)))
-        job = build_job(choice, built)
+        __tracebackhide__ = True  # pytest shows the line of the test
         folder = self.folder / f"run-{len(self.runs) + 1}"
-        run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
+        try:
+            built = build_sequence(None if sequence is None else str(sequence), command, faults=faults, checks=checks,
+                                   load=load, guards=guards)
+            chosen = self.model if model is None else str(model)
+            job = build_job(JobChoice(built.name, chosen, set or {}, seed, tuple(map(Path, effects))), built)
+            run = BenchRun(folder, run_job(job, folder, ignore_progress, _never))
+        except InputError as error:
+            raise InputError(error.where, error.field, error.expected) from None
         self.runs.append(run)
         return run
 

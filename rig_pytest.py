@@ -1,7 +1,8 @@
 """The pytest plugin: the fixture `rig_bench` and its options.
 
-pytest imports this file in every project of an environment in which eha-rig is installed, so it imports nothing of the
-bench before a test uses the fixture.
+pytest imports this file in every project of an environment in which eha-rig is installed. It stands outside the packages
+and imports none of them before a test uses the fixture: importing them selects the kernels of linear algebra of the
+whole process (`plant.blas`), which is not a plugin's business in a project that does not use it.
 """
 from __future__ import annotations
 

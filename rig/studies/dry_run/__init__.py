@@ -1,0 +1,1 @@
+"""A dry run: what a sequence asks for, held against the limits of the actuator, before anything moves."""

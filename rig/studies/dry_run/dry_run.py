@@ -1,0 +1,175 @@
+"""The figures of a sequence before its run: command, load, and the run that a healthy actuator is predicted to make."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from plant import Model, simulate
+from plant.run import Columns
+from plant.segments import RATE, Array
+from rig.run.job import Job
+from rig.run.limits import LimitReached, find_limits
+from rig.sequences.checks import CheckResult, evaluate_checks
+from rig.sequences.guards import Guard
+from rig.sequences.sequence import Sequence as TestSequence
+
+OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
+
+
+SHOWN_UNITS = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3), "m/s2": ("m/s2", 1.0), "N": ("kN", 1e-3)}  # and SI value to it
+
+
+class Demand(NamedTuple):
+    """A figure of the command or load beside the limit of the actuator. SI; `limit` is None where there is none."""
+
+    name: str
+    value: float
+    unit: str
+    t: float  # s of main, where it is reached
+    section: str
+    limit: float | None
+    parameter: str  # what the limit comes from
+
+    def describe(self, value: float) -> str:
+        """A value of this figure in the unit of tables: "5 mm"."""
+        unit, scale = SHOWN_UNITS[self.unit]
+        return f"{scale * value:.4g} {unit}"
+
+    @property
+    def is_violated(self) -> bool:
+        """Whether the sequence asks for more than the actuator can do."""
+        return self.limit is not None and self.value > self.limit * (1.0 + 1e-9)
+
+
+class GuardTrip(NamedTuple):
+    """A guard that the predicted run violates, at `t` s of main."""
+
+    name: str
+    t: float
+
+
+class DryRun(NamedTuple):
+    """What a sequence asks for, and what it is predicted to do on a healthy actuator."""
+
+    job: Job
+    durations: dict[str, float]  # s, of setup, main and cleanup
+    demands: list[Demand]
+    t: Array  # s of main
+    speed: Array  # m/s, of the command; 0 where it jumps
+    load: Array  # N
+    predicted: Columns  # of setup, main and cleanup, without the faults
+    limits: tuple[LimitReached, ...]  # that the predicted run reaches
+    checks: list[CheckResult]  # on the predicted run, those that need no events
+    not_predicted: list[str]  # the other checks
+    trips: list[GuardTrip]
+
+    @property
+    def problems(self) -> list[str]:
+        """What violates a limit, in words; empty if the sequence can run."""
+        found = [f"{each.name} {each.describe(each.value)} beyond {each.describe(each.limit)} ({each.parameter}) in "
+                 f"{each.section!r}, t = {each.t:.3f} s"
+                 for each in self.demands if each.limit is not None and each.is_violated]
+        found += [each.describe() for each in self.limits if each.signal == "xj"]
+        found += [f"guard {trip.name!r} violated at t = {trip.t:.3f} s" for trip in self.trips]
+        return found + [f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value]
+
+
+def make_dry_run(job: Job) -> DryRun:
+    """Hold the command and load of a job against the model's limits, and simulate it without bus and faults."""
+    sequence, model = job.sequence, job.model
+    setup, main = sequence.setup_profile(), sequence.main_profile()
+    cleanup = sequence.cleanup_profile(main.end)
+    command = np.concatenate((setup.command, main.command, cleanup.command))
+    first, last = len(setup.command), len(setup.command) + len(main.command)
+    load = np.zeros(len(command))
+    load[first:last] = sequence.load_profile()
+    t = (np.arange(len(command)) - first) / RATE
+    predicted = simulate(model, command, load, job.seed)
+    sections = name_rows(sequence, (setup.command, main.command, cleanup.command))
+    columns = Columns(np.arange(last - first) / RATE, *(column[first:last] for column in predicted[1:]))
+    chosen = [check for check in sequence.checks if check.kind not in OF_EVENTS]
+    return DryRun(
+        job=job, durations={"setup": first / RATE, "main": (last - first) / RATE,
+                            "cleanup": (len(command) - last) / RATE},
+        demands=measure_demands(command, load, t, sections, model), t=t,
+        speed=split_jumps(command, [row for row, _ in sections])[0], load=load, predicted=predicted,
+        limits=find_limits(lambda name: getattr(predicted, name), model, first),
+        checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts()),
+        not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
+        trips=[] if sequence.faults else find_trips(sequence.guards, columns))
+
+
+def name_rows(sequence: TestSequence, commands: Sequence[Array]) -> list[tuple[int, str]]:
+    """First row of each section of setup, main and cleanup, and its name."""
+    profiles = (sequence.setup_profile(), sequence.main_profile(), sequence.cleanup_profile(0.0))
+    found, start = [], 0
+    for phase, profile, command in zip(("setup", "main", "cleanup"), profiles, commands, strict=True):
+        found += [(start + section.start, section.name if phase == "main" else f"{phase}: {section.name}")
+                  for section in profile.sections]
+        start += len(command)
+    return found
+
+
+def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tuple[int, str]],
+                    model: Model) -> list[Demand]:
+    """The largest position, step, speed and acceleration of a command, and the largest load.
+
+    A jump at the first row of a section is a step and counts neither as speed nor as acceleration.
+    """
+    starts = [row for row, _ in sections]
+    speed, jumps = split_jumps(command, starts)
+    is_start = np.isin(np.arange(len(command)), starts)
+    is_known = ~is_start & ~np.roll(is_start, 1)  # rows whose speed and the one before are of the same section
+    acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * RATE, 0.0)
+    limits = find_capabilities(model)
+
+    def find(name: str, values: Array, unit: str, parameter: str) -> Demand:
+        row = int(np.argmax(np.abs(values)))
+        section = sections[int(np.searchsorted(starts, row, side="right")) - 1][1]
+        return Demand(name, float(np.abs(values[row])), unit, float(t[row]), section, limits.get(parameter), parameter)
+
+    return [find("position", command, "m", "jack.travel"),
+            find("step", jumps, "m", ""),
+            find("speed", speed, "m/s", "no-load speed"),
+            find("acceleration", acceleration, "m/s2", ""),
+            find("load", load, "N", "stall force")]
+
+
+def split_jumps(command: Array, starts: Sequence[int]) -> tuple[Array, Array]:
+    """Speed of a command in m/s, 0 at its jumps; and its jumps in m, 0 elsewhere. Shape (n,) both.
+
+    A jump is a change at the first row of a section, `starts`, that is larger than the changes beside it: else the line
+    goes on from the section before.
+    """
+    steps = np.diff(command, prepend=command[:1])
+    beside = np.maximum(np.abs(np.roll(steps, 1)), np.abs(np.roll(steps, -1)))
+    is_jump = np.isin(np.arange(len(command)), starts) & (np.abs(steps) > 2.0 * beside + 1e-9)
+    return np.where(is_jump, 0.0, steps * RATE), np.where(is_jump, steps, 0.0)
+
+
+def find_capabilities(model: Model) -> dict[str, float]:
+    """What the actuator can do, SI, as far as its plant has the parameters.
+
+    The no-load speed is the flow of the open valve over the area of the piston, GQ XSM / AJ; the stall force is the
+    supply pressure on that area, PSR AJ (physics.md).
+    """
+    found = {"jack.travel": model["jack.travel"]}
+    values = model.values
+    if {"valve.flow_gain", "spool.travel"} <= values.keys():
+        found["no-load speed"] = model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
+        found["stall force"] = model["supply.pressure"] * model["jack.area"]
+    return found
+
+
+def find_trips(guards: Sequence[Guard], columns: Columns) -> list[GuardTrip]:
+    """The guards that the predicted main phase violates."""
+    trips = []
+    for guard in guards:
+        low, high = guard.compute_limits()
+        values = columns.com - columns.xj if guard.signal == "error" else getattr(columns, guard.signal)
+        outside = np.convolve((values < low) | (values > high), np.ones(guard.cycles))[:len(values)] >= guard.cycles
+        if outside.any():
+            trips.append(GuardTrip(guard.name, float(columns.t[int(np.argmax(outside))])))
+    return trips

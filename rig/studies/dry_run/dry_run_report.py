@@ -1,0 +1,123 @@
+"""The report of a dry run for terminal, page and JSON."""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fdi.report.json import to_plain
+from fdi.report.report import Cell, Column, Figure, Line, Mood, Report, Section, Table
+from fdi.report.run_report import format_limits
+from rig.run.differences import find_differences
+from rig.studies.dry_run.dry_run import SHOWN_UNITS, Demand, DryRun
+
+
+def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> Report:
+    """Report on a dry run; `files` are (label, path) of the files written."""
+    sequence = dry.job.sequence
+    problems = dry.problems
+    verdict, mood = ("BEYOND_LIMITS", "bad") if problems else ("WITHIN_LIMITS", "good")
+    sentence = "; ".join(problems) if problems else "The actuator can follow this sequence."
+    parts = [f"{name} {seconds:g} s" for name, seconds in dry.durations.items() if seconds]
+    duration = f"{sum(dry.durations.values()):g} s: {', '.join(parts)}"
+    facts = [("model", dry.job.model.name), ("differs from nominal", find_differences(dry.job).describe()),
+             ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards)))]
+    facts += [("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))] if (
+        sequence.steps) else []
+    return Report(
+        command="check", title=f"Dry run: {sequence.title}", verdict=verdict, mood=_as_mood(mood), sentence=sentence,
+        facts=facts, notes=_list_notes(dry),
+        sections=[Section("Command and load", [Line("duration", duration), _tabulate_demands(dry.demands)]),
+                  Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
+                  Section("Checks", _tabulate_checks(dry)),
+                  Section("Picture", [_draw(dry)])],
+        files=files, data=collect_data(dry))
+
+
+def _as_mood(word: str) -> Mood:
+    return "bad" if word == "bad" else "good"
+
+
+def _list_notes(dry: DryRun) -> list[str]:
+    notes = []
+    if dry.job.sequence.faults:
+        notes.append("the prediction is without the faults of the sequence")
+    if dry.not_predicted:
+        notes.append(f"not predicted, because they judge events: {', '.join(dry.not_predicted)}")
+    failing = [check.name for check in dry.checks if not check.passed and check.value == check.value]
+    if failing:
+        notes.append(f"these checks would fail on the predicted run: {', '.join(failing)}")
+    return notes
+
+
+def _tabulate_demands(demands: Sequence[Demand]) -> Table:
+    columns = [Column("largest"), Column("value", align="right"), Column("limit", align="right"), Column("unit"),
+               Column("limit from"), Column("section"), Column("t", "s", "right")]
+    rows: list[list[Cell | str]] = []
+    for each in demands:
+        if each.value < 1e-9:
+            continue
+        unit, scale = SHOWN_UNITS[each.unit]
+        limit = "" if each.limit is None else f"{scale * each.limit:.4g}"
+        rows.append([each.name, Cell(f"{scale * each.value:.4g}", "bad" if each.is_violated else "", True), limit, unit,
+                     each.parameter if each.limit is not None else "", each.section, f"{each.t:.3f}"])
+    return Table(columns, rows,
+                 "A jump between two sections is a step and counts neither as speed nor as acceleration.")
+
+
+def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
+    """The figures of the predicted run: current, following error, limits that it reaches."""
+    run = dry.predicted
+    error = run.com - run.xj
+    limit = dry.job.model.values.get("controller.current_limit")
+    current = f"largest {1e3 * np.abs(run.cor).max():.3g} mA" + (f" of {1e3 * limit:.3g} mA" if limit else "")
+    main = (dry.t >= 0.0) & (dry.t < dry.durations["main"])
+    lines = [("current", current),
+             ("error", f"largest {1e3 * np.abs(error[main]).max():.4g} mm, RMS "
+                       f"{1e3 * math.sqrt(float(np.mean(error[main] ** 2))):.4g} mm in main")]
+    if dry.limits:
+        lines.append(("reaches", "; ".join(each.describe() for each in dry.limits)))
+    return lines
+
+
+def _tabulate_checks(dry: DryRun) -> list[Table]:
+    if not dry.checks:
+        return []
+    columns = [Column("check"), Column("window", "s"), Column("predicted", align="right"),
+               Column("limits", align="right"), Column("unit"), Column("remark")]
+    rows: list[list[Cell | str]] = []
+    for check in dry.checks:
+        is_measured = check.value == check.value
+        window = f"{check.t0:.3f} .. {check.t1:.3f}" if check.t0 == check.t0 else "-"
+        rows.append([check.name, window,
+                     Cell(f"{check.value:.4g}" if is_measured else "none", "good" if check.passed else "bad", True),
+                     format_limits(check.low, check.high), "" if check.unit == "1" else check.unit, check.detail])
+    return [Table(columns, rows)]
+
+
+def _draw(dry: DryRun) -> Figure:
+    def draw() -> str:
+        from rig.studies.dry_run.dry_run_figure import draw_dry_run  # loads matplotlib
+
+        return draw_dry_run(dry)
+
+    return Figure("Position and speed of the command; position, following error and current of the predicted run of a "
+                  "healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are "
+                  "the windows of the checks, green for a check that passes on the predicted run and red for one that "
+                  "does not.", draw)
+
+
+def collect_data(dry: DryRun) -> dict[str, Any]:
+    """The JSON answer of a dry run."""
+    run, error = dry.predicted, dry.predicted.com - dry.predicted.xj
+    return {
+        "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
+        "sequence": dry.job.sequence.title, "model": dry.job.model.name,
+        "differences": find_differences(dry.job).describe(), "durations": dry.durations,
+        "demands": [{**each._asdict(), "violated": each.is_violated} for each in dry.demands],
+        "predicted": {"current": float(np.abs(run.cor).max()), "error": float(np.abs(error).max()),
+                      "limits": [each._asdict() for each in dry.limits],
+                      "guards": [trip._asdict() for trip in dry.trips]},
+        "checks": [to_plain(check._asdict()) for check in dry.checks], "not_predicted": dry.not_predicted}
