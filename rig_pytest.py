@@ -1,8 +1,8 @@
 """The pytest plugin: the fixture `rig_bench` and its options.
 
-pytest imports this file in every project of an environment in which eha-rig is installed. It stands outside the packages
-and imports none of them before a test uses the fixture: importing them selects the kernels of linear algebra of the
-whole process (`plant.blas`), which is not a plugin's business in a project that does not use it.
+pytest imports this file in every project of an environment in which eha-rig is installed. It stands outside the
+packages and imports none of them before a test uses the fixture: importing them selects the kernels of linear algebra
+of the whole process (`plant.blas`), which a project that does not use the fixture has not asked for.
 """
 from __future__ import annotations
 

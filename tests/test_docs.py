@@ -240,6 +240,10 @@ def test_the_keys_of_a_run_are_documented(preflight: Path) -> None:
     assert_documented(answer, "rig run")
 
 
+def test_the_keys_of_a_dry_run_are_documented() -> None:
+    assert_documented(rig("check", "preflight", "--json").json, "rig check")
+
+
 def test_the_keys_of_a_diagnosis_are_documented(preflight: Path) -> None:
     assert_documented(rig("fdi", preflight, "--json").json, "rig fdi")
 
