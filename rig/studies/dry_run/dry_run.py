@@ -125,14 +125,14 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
     acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * RATE, 0.0)
     limits = find_capabilities(model)
 
-    def find(name: str, values: Array, unit: str, parameter: str) -> Demand:
+    def find(name: str, values: Array, unit: str, parameter: str, back: int = 0) -> Demand:
         row = int(np.argmax(np.abs(values)))
-        section = sections[int(np.searchsorted(starts, row, side="right")) - 1][1]
+        section = sections[int(np.searchsorted(starts, max(row - back, 0), side="right")) - 1][1]
         return Demand(name, float(np.abs(values[row])), unit, float(t[row]), section, limits.get(parameter), parameter)
 
     return [find("position", command, "m", "jack.travel"),
             find("step", jumps, "m", ""),
-            find("speed", speed, "m/s", "no-load speed"),
+            find("speed", speed, "m/s", "no-load speed", back=1),  # from the row before, which may be another section's
             find("acceleration", acceleration, "m/s2", ""),
             find("load", load, "N", "stall force")]
 
