@@ -1,6 +1,7 @@
 """The bench for tests in Python: runs in lockstep on the embedded bus, and what they measured."""
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -70,6 +71,23 @@ class BenchRun:
         write_text(picture, draw_signals(Trace.read(self.folder / "trace.mcap", all=True)))
         return picture
 
+    def write_close_up(self, name: str) -> Path | None:
+        """Write a close-up of a check, its window with limits and measured value, into the folder of the run.
+
+        Returns:
+            The SVG file; None for a check that has no window or no signal.
+        """
+        from fdi.report.check_figures import draw_failed_check
+
+        trace = Trace.read(self.folder / "trace.mcap", all=True)
+        check = next(check for check in trace.checks if check.name == name)
+        drawing = draw_failed_check(trace, check)
+        if not drawing:
+            return None
+        picture = self.folder / f"check-{re.sub(r'[^a-zA-Z0-9_.=+-]+', '-', name).strip('-')}.svg"
+        write_text(picture, drawing)
+        return picture
+
     def assert_passed(self, *names: str) -> None:
         """Fail a test unless these checks passed; without names, unless the run passed.
 
@@ -85,7 +103,9 @@ class BenchRun:
         title = self.outcome.job.sequence.title
         lines = [f"{title}: {len(failed)} of {len(chosen)} checks failed" if failed else
                  f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed)]
-        lines += [f"picture: {self.write_picture()}", f"page: {self.write_page()}"]
+        close_ups = [picture for check in failed[:3] if (picture := self.write_close_up(check.name)) is not None]
+        lines += [f"picture: {picture}" for picture in close_ups or [self.write_picture()]]
+        lines.append(f"page: {self.write_page()}")
         raise CheckFailedError("\n".join(lines))
 
 

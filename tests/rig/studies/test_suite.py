@@ -152,8 +152,8 @@ def test_junit_is_valid_and_complete(suite: tuple[Path, Said]) -> None:
 
 def test_several_sequences_on_the_command_line(tmp_path: Path) -> None:
     write_sequences(tmp_path)
-    said = rig("run", tmp_path / "short.toml", tmp_path / "short.toml", "--seed", 3, "--json", "--out",
-               tmp_path / "out")
+    said = rig("run", tmp_path / "short.toml", tmp_path / "short.toml", "--seed", 3, "--json", "--jobs", 1,
+               "--out", tmp_path / "out")
     assert said.status == 0, said.err
     assert [(case["name"], Path(case["folder"]).name, case["seed"]) for case in said.json["cases"]] == [
         ("short", "short", 3), ("short (2)", "short-2", 3)]

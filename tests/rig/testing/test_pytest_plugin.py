@@ -47,9 +47,13 @@ def test_without():
 
 @pytest.fixture
 def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
-    """A user's project with this plugin and no other."""
+    """A user's project with this plugin and no other; one of its files is the example of docs/pytest.md."""
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     pytester.makepyfile(test_mine=PROJECT)
+    page = (ROOT / "docs" / "pytest.md").read_text()
+    block = re.search(r"    # test_controller\.py\n(?:(?:    .*)?\n)+?(?=    pytest )", page)
+    assert block is not None
+    pytester.makepyfile(test_example=re.sub(r"(?m)^    ", "", block[0]))
     (pytester.path / "weak.toml").write_text('name = "weak"\nplant = "eha"\n[supply]\npressure = 1.9e7\n')
     return pytester
 
@@ -57,11 +61,12 @@ def project(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytes
 def test_a_project_with_the_fixture(project: pytest.Pytester) -> None:
     result = project.runpytest_subprocess("-p", "rig_pytest", "--rig-model", "weak.toml", "--rig-out",
                                          "out", "--junitxml", "j.xml")
-    result.assert_outcomes(passed=3, failed=2)
+    result.assert_outcomes(passed=6, failed=2)
+    result.stdout.fnmatch_lines(["test_example.py ...*", "test_mine.py .F.F.*"])
     result.stdout.re_match_lines([
         r"E +.*CheckFailedError: Command from Python: 1 of 11 checks failed",
         r"E +overshoot: measured [\d.]+ %, limits <= 1 %, 0\.050 to 0\.250 s, requirement R-1",
-        r"E +picture: .*out/test_mine\.py-test_fails/run-2/signals\.svg",
+        r"E +picture: .*out/test_mine\.py-test_fails/run-2/check-overshoot\.svg",
         r"E +page: .*out/test_mine\.py-test_fails/run-2/report\.html",
         r"-+ runs of rig_bench -+",
         r".*run-1: NOT_JUDGED: the sequence has no checks",
@@ -70,7 +75,8 @@ def test_a_project_with_the_fixture(project: pytest.Pytester) -> None:
     ])
     assert "bench.py" not in result.stdout.str().split("test_bad_input")[0]  # the failure is shown at the user's line
     folder = project.path / "out" / "test_mine.py-test_fails" / "run-2"
-    assert (folder / "signals.svg").read_text().startswith("<svg") and "R-1" in (folder / "report.html").read_text()
+    assert (folder / "check-overshoot.svg").read_text().startswith("<svg")
+    assert "R-1" in (folder / "report.html").read_text()
     cases = {case.get("name"): case for case in ElementTree.parse(project.path / "j.xml").iter("testcase")}
     properties = [(each.get("name"), each.get("value")) for each in cases["test_fails"].iter("property")]
     assert properties[1][1] == f"FAIL {folder}" and properties[2] == ("requirement", "R-1 FAIL overshoot")
@@ -128,12 +134,3 @@ def test_loading_the_plugin_costs_next_to_nothing() -> None:
                "assert dict(os.environ) == settings; print(*sorted(set(sys.modules) - before))")
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
     assert said.stdout.split() == ["rig_pytest"]
-
-
-def test_the_example_of_the_page_passes(project: pytest.Pytester) -> None:
-    page = (ROOT / "docs" / "pytest.md").read_text()
-    block = re.search(r"    # test_controller\.py\n(?:(?:    .*)?\n)+?(?=    pytest )", page)
-    assert block is not None
-    project.makepyfile(test_controller=re.sub(r"(?m)^    ", "", block[0]))
-    result = project.runpytest_subprocess("-p", "rig_pytest", "test_controller.py")
-    result.assert_outcomes(passed=3)
