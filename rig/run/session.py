@@ -569,7 +569,9 @@ class Session:
         """
         if self._master.is_deaf:
             return
-        self._silence.look(now, self._master.heard_ns)
+        heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
+        self._silence.look(now, {node: heard[node] for node, state in self._master.states.items()
+                                 if node in heard and state == NmtState.OPERATIONAL})
         answering = [node for node in self._last_answers if self._is_answering(node, recent=1)]
         found = self._silence.find_silent(answering)
         for node in self._silent - found.keys():

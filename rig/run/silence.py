@@ -18,13 +18,17 @@ class SilenceWatch:
         self._silent_ns: dict[int, int] = {}
 
     def look(self, now_ns: int, heard_ns: Mapping[int, int]) -> None:
-        """Take note of the last heartbeats; `heard_ns`: when that of each node came. One never heard is not watched."""
+        """Take note of the last heartbeats.
+
+        Args:
+            now_ns: time.
+            heard_ns: when the last heartbeat of each node came that is to be watched.
+        """
         passed = min(now_ns - self._looked_ns, self._step)
         self._looked_ns = now_ns
-        for node, heard in heard_ns.items():
-            is_new = heard != self._heard_ns.get(node)
-            self._heard_ns[node] = heard
-            self._silent_ns[node] = 0 if is_new else self._silent_ns[node] + passed
+        self._silent_ns = {node: self._silent_ns.get(node, 0) + passed if heard == self._heard_ns.get(node) else 0
+                           for node, heard in heard_ns.items()}
+        self._heard_ns = dict(heard_ns)
 
     def find_silent(self, answering: Collection[int] = ()) -> dict[int, float]:
         """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s."""

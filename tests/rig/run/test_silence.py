@@ -38,7 +38,12 @@ def test_time_in_which_the_rig_stood_still_does_not_count() -> None:
     assert watch.find_silent().keys() == {2}
 
 
-def test_a_node_that_was_never_heard_is_not_watched() -> None:
+def test_a_node_that_is_left_out_is_not_watched_and_begins_anew() -> None:
+    """One that was never heard, or that has been reset."""
     watch = SilenceWatch(2000 * MS)
-    look(watch, 0, 5000, {})
+    look(watch, 0, 5000, {3: 0})
+    assert watch.find_silent().keys() == {3}
+    look(watch, 5000, 5020, {})
+    assert watch.find_silent() == {}
+    look(watch, 5020, 6000, {3: 0})
     assert watch.find_silent() == {}
