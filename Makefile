@@ -4,6 +4,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 ARGS   ?=
+# one more than there are CPUs: tests of programs on a bus wait for half of their time
+WORKERS ?= $(shell expr $$(nproc) + 1)
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
@@ -19,7 +21,7 @@ test: lint
 
 pytest: env-test
 	@echo "== pytest"
-	@$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: env-test
 	@echo "== ruff, then mypy --strict"

@@ -1,10 +1,11 @@
 """What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and a
 minute at 1 kHz with the C firmware.
 
-    python tests/vcan/inside.py OUT bus|preflight|minute ...
+    python tests/vcan/inside.py OUT compile|bus|preflight|minute ...
 
 Leaves in OUT: bus.xml (junit) from `bus`; run/, run.json, candump.log and one .log per process from `preflight`;
-minute/ and minute.json from `minute`.
+minute/ and minute.json from `minute`. `compile` fills the cache of compiled code. It is meant for the host, which does
+it ten times as fast as its guest: both have the same files and the same CPU.
 """
 from __future__ import annotations
 
@@ -19,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TESTS = Path(__file__).parent.parent
+sys.path.append(str(TESTS / "support"))
 BUS = "socketcan:vcan0"
 RUN_LIMIT_S = 500
 MINUTE = """
@@ -29,6 +31,31 @@ cleanup = [{ kind = "ramp", to = 0.0, time = 0.2 }]
 checks = [{ name = "no emergency", kind = "event_never", event = "EMCY" }]
 """
 RIG = Path(sys.executable).with_name("rig")
+
+
+def compile_all(out: Path) -> int:
+    """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
+    from c_program import build_faulty
+
+    from plant import Actuator, Model
+    from plant.compile import compile_function
+    from rig.firmware.build import build_controller
+    from rig.network import raw_bus
+    from rig.nodes.emulator_service import compile_loop, compile_plant
+    from rig.run.hard_loop import compile_cycle
+
+    build_controller()
+    build_faulty()
+    port = raw_bus.make_closed_port()
+    compile_function(raw_bus.receive_frame)(port, 0)
+    compile_function(raw_bus.await_frame)(port)
+    compile_function(raw_bus.send_frame)(port, 0x80, 0, 0)
+    for realtime in (False, True):
+        compile_cycle(realtime)
+    compile_loop()
+    compile_plant(Model())
+    Actuator(Model()).warm()
+    return 0
 
 
 def bus_tests(out: Path) -> int:
@@ -96,7 +123,7 @@ def main() -> int:
     out = Path(sys.argv[1]).resolve()
     out.mkdir(parents=True, exist_ok=True)
     os.chdir(TESTS.parent)
-    parts = {"bus": bus_tests, "preflight": preflight, "minute": minute}
+    parts = {"compile": compile_all, "bus": bus_tests, "preflight": preflight, "minute": minute}
     statuses = [parts[name](out) for name in sys.argv[2:]]
     return next((status for status in statuses if status), 0)
 

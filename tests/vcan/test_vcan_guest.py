@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -33,7 +34,10 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         skip_or_fail(guest_missing())
     if shutil.which("candump") is None:
         skip_or_fail("candump is missing")
+    if shutil.which("gcc") is None:
+        skip_or_fail("gcc is missing")
     folder = tmp_path_factory.mktemp("vcan")
+    subprocess.run([sys.executable, FOLDER / "inside.py", folder, "compile"], check=True)
     parts = ["preflight"] if kernel_has_vcan0() else ["bus", "preflight"]  # with a vcan0 here the bus tests ran here
     done = in_guest(sys.executable, FOLDER / "inside.py", folder, *parts)
     (folder / "output.txt").write_text(done.stdout)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import atexit
 import os
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -149,8 +150,10 @@ class TestFrames:
         where = spec(bus_kind)
         receive, send = function("receive_frame"), function("send_frame")
         with open_raw_bus(where) as bus, open_raw_bus(where, ()) as other:
+            with socket.socket(fileno=os.dup(bus.port.words[raw_bus._RX])) as same:
+                same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 100_000)  # bytes; it holds some hundred frames
             sent = 0
-            for _ in range(60_000):
+            for _ in range(3_000):
                 sent += send(other.port, 0x100, 0, 0) == SENT
             kept = 0
             while receive(bus.port, 0)[0] == FRAME:
@@ -158,7 +161,8 @@ class TestFrames:
             send(other.port, 0x100, 0, 0)  # the count rides on the next frame
             assert receive(bus.port, soon())[0] == FRAME
             assert kept + bus.overflows == sent
-            assert sent + other.unsent == 60_000
+            assert bus.overflows > 0
+            assert sent + other.unsent == 3_000
 
     def test_a_link_hears_compiled_frames_and_answers(self, bus_kind: str) -> None:
         where = spec(bus_kind)

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from bus_stations import spec
 from mcap.reader import make_reader
 from rig_command import finished, gone, grown, nodes_on, rig, started
 from short_sequences import SHORT, job, play
+from standing_nodes import stand_nodes
 from vcan_host import kernel_has_vcan0
 
 from fdi.report.run_report import build_run_report
@@ -23,6 +25,7 @@ from plant import simulate
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.link import Link
+from rig.network.node_objects import CONTROLLER, PLANT
 from rig.run import runner
 from rig.run.session import Session
 
@@ -97,14 +100,34 @@ THREE_LOST = 'faults = [{ kind = "lost", frame = "drive", start = 0.2, count = 3
 
 TEXTS = {"lost frames": FAULTY, "a guard": GUARDED, "trouble": THREE_LOST,
          "trouble that is meant": THREE_LOST + 'ends = "safe_state"'}
-CASES = [("udp_multicast", text) for text in TEXTS] + [("socketcan", "lost frames"), ("socketcan", "trouble")]
 
 
-@pytest.mark.parametrize(("bus_kind", "text"), CASES, indirect=["bus_kind"], ids=list(map("-".join, CASES)))
-def test_the_compiled_cycle_in_lockstep_is_the_one_in_python(bus_kind: str, text: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def bus_with_nodes() -> Iterator[str]:
+    """A bus on which both nodes stay from run to run."""
+    where = spec("udp_multicast")
+    with stand_nodes(where, PLANT, CONTROLLER):
+        yield where
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_the_compiled_cycle_in_lockstep_is_the_one_in_python(bus_with_nodes: str, text: str, tmp_path: Path) -> None:
     """The same rows and the same events in the same cycles, also where frames are lost and the run is aborted."""
-    here = play(job(TEXTS[text], seed=1), tmp_path / "a")
-    there = play(job(TEXTS[text], seed=1, bus=spec(bus_kind)), tmp_path / "b")
+    require_equal_runs(bus_with_nodes, TEXTS[text], tmp_path)
+
+
+@pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
+def test_so_it_is_on_a_can_interface(bus_kind: str, tmp_path: Path) -> None:
+    """With frames lost and the run aborted."""
+    where = spec(bus_kind)
+    with stand_nodes(where, PLANT, CONTROLLER):
+        require_equal_runs(where, THREE_LOST, tmp_path)
+
+
+def require_equal_runs(where: str, text: str, tmp_path: Path) -> None:
+    """Play a sequence on the embedded bus and on `where`, whose nodes stand there; compare verdict, rows and events."""
+    here = play(job(text, seed=1), tmp_path / "a")
+    there = play(job(text, seed=1, bus=where, controller="external", plant="external"), tmp_path / "b")
     assert there.timing["kind"] == "lockstep" and (there.verdict, there.aborted) == (here.verdict, here.aborted)
     fields = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
     assert table(tmp_path / "b", fields) == table(tmp_path / "a", fields)

@@ -112,8 +112,8 @@ BAD = [  # text, then what the user reads
     (HEAD + "cheks = []\n", "not 'cheks' (did you mean 'checks'?)"),
     (HEAD + 'source = "x"\n', "mine.toml:3: source: expected a key: "),
     ('title = "T"\nmain = [\n  { kind = "hold", time = 1 },\n  { kind = "stepp", to = 1, time = 1 },\n]\n',
-     "mine.toml:4: main[1].kind: expected a kind: 'chirp', 'csv', 'hold', 'multisine', 'points', 'ramp', 'sine' or "
-     "'step', not 'stepp' (did you mean 'step'?)"),
+     "mine.toml:4: main[1].kind: expected a kind: 'chirp', 'csv', 'hold', 'multisine', 'points', 'python', 'ramp', "
+     "'sine' or 'step', not 'stepp' (did you mean 'step'?)"),
     ('title = "T"\nmain = [{ time = 1 }]\n', "mine.toml:2: main[0]: expected a kind: 'chirp', 'csv'"),
     ('title = "T"\nmain = [{ kind = [], time = 1 }]\n', "mine.toml:2: main[0].kind: expected a kind: 'chirp', 'csv'"),
     ('title = "T"\nmain = [{ kind = "step", time = 1 }]\n',

@@ -1,12 +1,14 @@
 """`rig bench realtime`: the contenders do what they are measured for, and the figures are what they say."""
 from __future__ import annotations
 
+import os
 import shutil
 
 import numpy as np
 import pytest
 from bus_stations import gather, spec
 from rig_command import rig
+from vcan_host import kernel_has_vcan0
 
 from fdi.report.terminal import format_report
 from plant.errors import InputError
@@ -57,12 +59,12 @@ def test_the_responder_in_c_sends_the_frames_of_the_emulator(bus_kind: str) -> N
     link.close()
 
 
-@raw_kinds
 @pytest.mark.parametrize("is_compiled", [False, True])
-def test_the_emulator_answers_alone(bus_kind: str, is_compiled: bool) -> None:
-    where = spec(bus_kind)
+def test_the_emulator_answers_alone(is_compiled: bool) -> None:
+    where = spec("udp_multicast")
     with run_emulator(where, is_compiled):
         link = Link(open_can(where), lambda: 0)
+        errors: list[int] = []
         for cycle in range(5):
             link.send(codec.SYNC, b"")
             frames: list[Frame] = []
@@ -71,9 +73,11 @@ def test_the_emulator_answers_alone(bus_kind: str, is_compiled: bool) -> None:
                 assert more, f"no answer in cycle {cycle}"
             valves = [codec.unpack_valve_state(frame.data) for frame in frames if frame.cob_id == codec.VALVE_STATE]
             assert [valve.cycle for valve in valves] == [cycle]
-            # Nobody answers: an EMCY after three cycles. It has the default heartbeat of 100 ms.
-            others = {frame.cob_id for frame in frames} - {codec.FEEDBACK, codec.VALVE_STATE}
-            assert others <= ({0x083, 0x703} if cycle == MISSED_LIMIT else {0x703})
+            # Nobody answers: one EMCY after three cycles, which may be read with the answers of the cycle after.
+            usual = {codec.FEEDBACK, codec.VALVE_STATE, 0x703}  # the last: it has the default heartbeat of 100 ms
+            errors += [frame.cob_id for frame in frames if frame.cob_id not in usual]
+            assert not errors or cycle >= MISSED_LIMIT
+        assert errors in ([], [0x083])
         link.close()
 
 
@@ -108,15 +112,18 @@ def test_what_is_not_there_is_no_target_met() -> None:
     assert "no real-time priority" in text
 
 
-@raw_kinds
+# The guest has a clock of 100 Hz: no real time there.
+@pytest.mark.parametrize("bus_kind", ["udp_multicast"] + ["socketcan"] * ("EHA_RIG_GUEST" not in os.environ
+                                                                          and kernel_has_vcan0()), indirect=True)
 def test_the_command_measures_everybody(bus_kind: str) -> None:
+    """At least the cycles asked for: where Python is late, the last input is repeated until the next one comes."""
     said = rig("bench", "realtime", "--bus", spec(bus_kind), "--seconds", 0.5, "--blocks", 1, "--json")
     assert said.status in (0, 1) and said.err == ""
     figures = said.json
     there = {COMPILED, PYTHON} | ({IN_C} if shutil.which("gcc") else set())
     assert figures["times_us"]["feedback_response"].keys() == there
     for name in there:
-        assert figures["cycles"][name] == 400 and figures["lost"][name] < 400
+        assert figures["cycles"][name] >= 400 and figures["lost"][name] < figures["cycles"][name]
     if realtime.find_cyclictest():
         assert figures["times_us"]["lateness"][CYCLICTEST]["p50"] > 0
 
