@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fdi.discovery.runs import Source
 from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation import noise as noises
+from fdi.estimation.excerpt import can_be_cut, choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms, limit_friction_values
 from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
@@ -159,12 +160,14 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
         reason = f"no run to fit moves the ram by {1e3 * MOVING_RAM:g} mm: at rest nothing can be identified"
         return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
     gains = read_controller(fitted) if model.kind.controller else None
-    problem = make_problem(model, fitted, floor, workers or count_threads())
     free = list_unknowns(model, tuple(ranges))
     progress("regressions", 0.02)
     names = frozenset(f.name for f in free)
     begun = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
     begun = {name: value for name, value in begun.items() if name in names}
+    parts, remarks = cut_long_runs(fitted, sources, _replace_values(model, begun), floor)
+    problem = make_problem(model, parts, floor, workers or count_threads())
+    notes += remarks
     starts = draw_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
     fit = fit_from_afar(problem, free, starts, progress)
     progress("which parameters the runs show", 0.65)
@@ -182,6 +185,30 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     advice = advise_experiments(found, list_unknowns(model, tuple(ranges)), problem, fit, unseen) if unseen else ()
     return Identification(verdict, reason, model, found, estimates, gains, list_correlations(estimates, covariance),
                           tuple(advice), errors, floor, runs, residuals, tuple(sources), tuple(notes))
+
+
+def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model, floor: Mapping[str, float]
+                  ) -> tuple[tuple[Trace, ...], list[str]]:
+    """The runs to fit, of long ones the part that says most about the parameters; and which part that is, in words.
+
+    Args:
+        runs: prepared for replay.
+        sources: of them, in this order.
+        model: with first values: at those of a data sheet that is several times off, other parts would say most.
+        floor: of each signal, SI.
+    """
+    parts, remarks = [], []
+    for trace, source in zip(runs, sources, strict=False):
+        if can_be_cut(trace, model):
+            excerpt = choose_excerpt(trace, silence_readings(model), floor)
+            remarks.append(f"{source.file}: {excerpt.describe(trace)}")
+            trace = cut_excerpt(trace, excerpt)
+        parts.append(trace)
+    return tuple(parts), remarks
+
+
+def _replace_values(model: Model, values: Mapping[str, float]) -> Model:
+    return replace(model, values=limit_friction_values({**model.values, **values}))
 
 
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
@@ -348,7 +375,7 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
         typical = dict(zip(trace.outputs, compute_typical_rms(left[1]).tolist(), strict=True))
         own = {s: floor[s] for s in trace.outputs}
         decided, share = last, 0.0
-        if number >= fitted and _moves(trace):
+        if number >= fitted and _moves(trace) and not is_long(trace):  # nine replays of a long one take too much memory
             undecided = find_undecided_rows(_make_judging_problem(after, trace), start_fit((), np.empty(0)), own)
             share = float(undecided.mean())
             if 0.0 < share < 1.0:

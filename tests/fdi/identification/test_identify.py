@@ -162,8 +162,15 @@ def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
     assert {a.parameter: a.experiment for a in found.advice}["jack.area"] == "load"
 
 
-def test_end_stop_that_was_never_met_is_not_at_a_bound(runs: tuple[Trace, Trace, Trace]) -> None:
-    found = identify([runs[0]], [], {"valve": {"flow_gain": 6.0}, "jack": {"travel": [0.012, 0.05]}})
+def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at_a_bound(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(global_fit, "SEARCHES", 0)  # the other parameters are off: no valley is deeper
+    t = np.arange(21_000) * 1e-3
+    com = np.where(t < 9.0, 0.0, 4 * MM * np.sin(2 * np.pi * t))
+    run = measure(com, np.zeros(len(com)), 6, "long")
+    found = identify([run], [], {"valve": {"flow_gain": 6.0}, "jack": {"travel": [0.012, 0.05]}})
+    assert any("long: fitted to" in note and "of 21 s" in note for note in found.notes)
+    assert len(found.residuals[0][1][0]) == len(run)  # judged on all of it
     flow, travel = found.estimates
     assert flow.is_identifiable and not flow.is_at_bound
     assert not travel.is_identifiable and not travel.is_at_bound
