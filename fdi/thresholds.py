@@ -298,6 +298,11 @@ SUSPECT_HEALTHY_TOLERANCES = 4.0
 SUSPECT_SMALLEST = {"null_bias.current": 1.6e-5, "constant_load.force": 50.0}
 """Null bias, A, and load, N, below which a suspect is not named: 0.2 % of the largest current, 0.3 um of droop."""
 
+WEIGHT_COUNTS = 0.02
+"""Probability below which an explanation by another effect does not count in the sizes of the valve faults.
+
+It would move the end of a 95 % interval by less than the ends are known."""
+
 MOVING_RAM = 2e-4
 """Range, m, of command and position below which a ram is at rest and shows neither fault: a hundred times the noise."""
 

@@ -35,7 +35,7 @@ FOLDER_MAY_IMPORT = {
     "fdi.comparison": {"fdi.trace", "fdi.estimation"},
     "fdi.discovery": ESTIMATOR,
     "fdi.identification": {*ESTIMATOR, "fdi.discovery"},
-    "fdi.diagnosis": ESTIMATOR,
+    "fdi.diagnosis": {*ESTIMATOR, "fdi.discovery"},
     "fdi.prognosis": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis"},
     "fdi.report": {*ESTIMATOR, "fdi.discovery", "fdi.identification", "fdi.diagnosis", "fdi.prognosis"},
     "fdi.foreign_code": set(),
@@ -149,7 +149,7 @@ def folder(module: str) -> str:
 
 @pytest.mark.parametrize("path", [p for p in MODULES if name(p).startswith(("fdi/", "rig/"))], ids=name)
 def test_folders_import_only_lower_ones(path: Path) -> None:
-    """In fdi: trace, estimation, comparison, then discovery and diagnosis, which do not know each other, prognosis,
+    """In fdi: trace, estimation, comparison, then discovery, diagnosis, prognosis,
     report. In rig: network, device, sequences, nodes, recorder, run, then studies, command line.
     """
     own = folder(name(path).removesuffix(".py").replace("/", "."))

@@ -19,6 +19,7 @@ from fdi.diagnosis.bands import (
     matches_command,
 )
 from fdi.diagnosis.bands_file import load_default_bands
+from fdi.diagnosis.beside import Beside
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
 from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import (
@@ -70,6 +71,7 @@ class Diagnosis:
     floor: Mapping[str, float]  # RMS noise by signal, SI
     bands: Bands | None
     notes: tuple[str, ...]
+    beside: Beside | None = None  # other effects beside the faults; None: they were not searched
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -83,7 +85,8 @@ class Diagnosis:
 
 
 def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = None,
-             progress: Progress = ignore_progress, source: str = "trace", workers: int = 2) -> Diagnosis:
+             progress: Progress = ignore_progress, source: str = "trace", workers: int = 2,
+             with_effects: bool = False) -> Diagnosis:
     """Judge the two faults from a trace of any command.
 
     Args:
@@ -93,6 +96,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         progress: called with each stage and the share done, 0 to 1.
         source: the trace's name in refusals.
         workers: threads.
+        with_effects: search the catalogue for what else is wrong, and size both faults beside it.
 
     Raises:
         InputError: a trace that cannot be judged at all, or bands of another model.
@@ -127,15 +131,24 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         fitted = cut_excerpt(trace, excerpt)
         notes.append(excerpt.describe(trace))
     grid = _search_grid(fitted, model, notes)
-    progress("refinement", 0.75)
+    progress("refinement", 0.1 if with_effects else 0.75)
     refinement = refine_sizes(model, fitted, (*_list_starts(grid), *COARSE_STARTS), floor, workers, whole=trace)
     sizes = _widen_intervals(refinement)
+    beside = None
+    if with_effects:
+        from fdi.diagnosis.joint_search import find_effects_beside  # here: plain diagnoses need no search
+
+        beside = find_effects_beside(model, fitted, refinement, floor, progress, workers, trace)
+        refinement = beside.best.refinement
+        sizes = dict(beside.sizes) if refinement.is_explained else _widen_intervals(refinement)
     levels = _judge_sizes(sizes, refinement)
+    if beside is not None:
+        levels |= dict.fromkeys(beside.disputed)
     progress("done", 1.0)
     return Diagnosis(source=source, verdict=_decide_verdict(levels, refinement.is_explained), levels=levels,
                      ruling=find_ruling_fault(sizes, levels), sizes=sizes, refinement=refinement, grid=grid,
                      precursors=precursors, band_verdict=band_verdict, others=_find_unhealthy(refinement, model),
-                     trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes))
+                     trace=trace, model=model, floor=floor, bands=bands, notes=tuple(notes), beside=beside)
 
 
 def _find_own_bands(trace: Trace, model: Model, notes: list[str]) -> Bands | None:

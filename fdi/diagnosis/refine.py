@@ -214,8 +214,8 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float
     problem = make_problem(model, trace, floor, workers)
     free = list_unknowns(model)
     first = _fit_coarsely(problem, free, starts)
-    problem = _learn_noise(problem, first)
-    found = _report_fit(last := _fit_finely(problem, first), problem)
+    problem = learn_left_noise(problem, first)
+    found = report_fit(last := _fit_finely(problem, first), problem)
     if whole is None or whole is trace:
         return found
     judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
@@ -225,15 +225,15 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
     """A fit from the best start and, if that blames a fault, one from a healthy unit: whichever leaves less."""
     alone = replace(problem, workers=1, _lanes={})
-    begin = [_choose_start(problem, free, starts)]
+    begin = [choose_start(problem, free, starts)]
     healthy = make_start(free, CLOGGING.healthy, FRICTION.healthy, estimate_offsets(problem))
     if _blames_a_fault(free, begin[0]):
         begin.append(healthy)
     fits = map_in_threads(lambda x: _fit_in_stages(alone, free, x), begin, problem.workers)
-    if len(fits) == 1 and (not _is_explained(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
+    if len(fits) == 1 and (not is_noise_left(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
         fits.append(_fit_in_stages(problem, free, healthy))
     best = min(fits, key=lambda f: f.cost)
-    if not _is_explained(problem, best):
+    if not is_noise_left(problem, best):
         for factor, rounds in ((3.0, 4), (1.0, 8)):
             best = _continue_fit(problem, best, factor, rounds)
     return best
@@ -245,12 +245,12 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     last = first
     for rounds in (4, 8):
         last = descend_valley(fine, last, rounds, find_flat_directions(problem, first.free, last.x))
-        if _is_explained(problem, last):
+        if is_noise_left(problem, last):
             return last
     signals = problem.trace.outputs
     for parts in ((1.0, 0.5), (0.75, -0.25), (0.25, 1.25)):
-        ratios = dict(zip(signals, _residual_ratios(problem, last), strict=True))
-        if _is_explained(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
+        ratios = dict(zip(signals, measure_ratios(problem, last), strict=True))
+        if is_noise_left(problem, last) or any(x > RESIDUAL_HOPELESS[s] for s, x in ratios.items()):
             break
         last = _restart_fit(problem, last, parts)
     return last
@@ -287,7 +287,7 @@ def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> 
 def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
     start = replace(found, covariance=guess_covariance(found.free))
     flat = find_flat_directions(problem, found.free, found.x)
-    return descend_valley(_scale_noise(problem, factor), start, rounds, flat)
+    return descend_valley(scale_noise(problem, factor), start, rounds, flat)
 
 
 def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
@@ -297,17 +297,17 @@ def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
     return kintas > FAULT_BLAMED_SHARE * CLOGGING.middle or fss > FAULT_BLAMED_SHARE * FRICTION.middle
 
 
-def _is_explained(problem: Problem, found: Fit) -> bool:
+def is_noise_left(problem: Problem, found: Fit) -> bool:
     """Whether the fit leaves only noise."""
-    return max(_residual_ratios(problem, found)) <= RESIDUAL_IS_NOISE
+    return max(measure_ratios(problem, found)) <= RESIDUAL_IS_NOISE
 
 
-def _residual_ratios(problem: Problem, found: Fit) -> list[float]:
+def measure_ratios(problem: Problem, found: Fit) -> list[float]:
     """RMS residual over noise, signal by signal."""
     return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
 
 
-def _scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
+def scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
     """The problem with its noise taken for `factor` times as large."""
     return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise))
 
@@ -318,9 +318,9 @@ def start_fit(free: Sequence[Free], x: Floats) -> Fit:
     return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
 
 
-def _choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
+def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:
     """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
-    loud = _scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
+    loud = scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
     offsets = estimate_offsets(problem)
     usual = problem.model["spool.dynamic_friction"]
 
@@ -363,7 +363,7 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
     return found
 
 
-def _learn_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
+def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     """The problem with the noise that a fit leaves, signal by signal, where only noise is left."""
     learnt = []
     for old, r in zip(problem.noise, found.residuals, strict=True):
@@ -372,7 +372,8 @@ def _learn_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     return replace(problem, noise=tuple(learnt), _lanes={})
 
 
-def _report_fit(last: Fit, problem: CountedProblem) -> Refinement:
+def report_fit(last: Fit, problem: CountedProblem) -> Refinement:
+    """What a fit found, with the noise of its problem as the floor."""
     outputs = problem.trace.outputs
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}

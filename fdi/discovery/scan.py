@@ -160,8 +160,7 @@ def _simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Sta
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
     ways = list_powers(problem)
     begun = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
-    at = [{f.name: f.value(float(v)) for f, v in zip(fit.free, x, strict=True)} | dict(start)
-          for x, (_, start, _) in zip(begun, starts, strict=True)]
+    at = [problem.list_values(fit.free, x) | dict(start) for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
     steep = prepare_slope(fit)
 

@@ -113,6 +113,10 @@ class Problem:
         """The same, whitened: (m, s, n), 0 where not measured."""
         return self.whiten_residuals(self.compute_residuals(free, x))
 
+    def list_values(self, free: Sequence[Free], x: Floats) -> dict[str, float]:
+        """Parameters by name, SI units, of scaled unknowns `x` (p,), as the model takes them."""
+        return {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
+
     def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
         """Parameters in SI units, (m, p), of scaled unknowns `x` (m, p)."""
         values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])

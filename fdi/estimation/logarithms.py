@@ -58,3 +58,6 @@ class LogProblem(Problem):
 
     def convert_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
         return np.array([compute_values(free, row) for row in x])
+
+    def list_values(self, free: Sequence[Free], x: Floats) -> dict[str, float]:
+        return dict(zip([f.name for f in free], compute_values(free, x).tolist(), strict=True))

@@ -119,12 +119,19 @@ def relax_fit(problem: Problem, found: Fit) -> Fit:
 
 
 def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
-                         others: Sequence[Mapping[str, float]] = ()) -> Floats:
-    """Directions of `FLAT_BY_RATIO` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k)."""
+                         others: Sequence[Mapping[str, float]] = (),
+                         scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {})) -> Floats:
+    """Directions of `FLAT_BY_RATIO` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k).
+
+    `scaled` are parameters that are not logarithms, with their powers in each of `FLAT_BY_RATIO`.
+    """
     law = problem.model["filter.law"]
     load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
+    at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
     said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
             {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT_BY_RATIO]
+    said = [flat | {name: power * at[name] for name, power in more.items() if name in at}
+            for flat, more in zip(said, scaled, strict=True)]
     every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
     ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
     if not len(ways):

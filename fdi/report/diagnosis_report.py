@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdi.diagnosis.bands import Event
+from fdi.diagnosis.beside import Beside, Explanation
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
 from fdi.diagnosis.precursors import format_precursor
@@ -24,6 +25,7 @@ from fdi.report.report import (
     Table,
 )
 from fdi.sources import name_software
+from plant.model import find_quantity
 
 FAULT_NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
 SIZE_SYMBOLS = {CLOGGING.name: "Kintas", FRICTION.name: "FSS"}
@@ -47,6 +49,7 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
         sentence=describe_verdict(d), facts=_list_facts(d),
         notes=[*describe_overruled_bands(d), *explain_grid(d), *d.notes],
         sections=[Section("Faults", _show_faults(d)),
+                  Section("Other effects", _tabulate_effects(d)),
                   Section("Response in its bands", _draw_bands(d)),
                   Section("Events", _tabulate_events(d)),
                   Section("RMS maps", _show_maps(d), medium=Medium.PAGE),
@@ -69,11 +72,18 @@ def build_bands_report(made: Mapping[str, Any]) -> Report:
 
 def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
+    if d.verdict == "SOMETHING_ELSE" and d.beside is not None:
+        return (f"Neither the two faults nor they and other effects of the catalogue explain this trace: the residual "
+                f"of the best fit is {describe_residual(d)}. No fault is reported until the cause is known.")
     if d.verdict == "SOMETHING_ELSE":
         return (f"Neither fault explains this trace: the residual of the best fit is {describe_residual(d)}. Something "
-                "else is wrong; no fault is reported until the cause is known.")
+                "else is wrong; no fault is reported until the cause is known. rig fdi --with-effects searches for the "
+                "cause and sizes both faults beside it.")
     if d.verdict == "CANNOT_TELL":
         names = join_words(FAULT_NAMES[name] for name, level in d.levels.items() if level is None)
+        if d.beside is not None and d.beside.disputed:
+            return (f"The level of {names} depends on what else is wrong, and this trace does not tell "
+                    f"{_join_alternatives(d.beside)} apart." + _describe_other_deviations(d))
         return f"This trace does not determine {names}: a healthy unit and MidBand are both within the 95 % interval."
     if d.verdict == "ACCEPTABLE":
         return "Both faults are acceptable." + _describe_other_deviations(d)
@@ -169,9 +179,25 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
 
 
 def _describe_other_deviations(d: Diagnosis) -> str:
+    words = ""
+    if d.beside is not None and d.beside.is_explained and d.beside.effects:
+        words = f" Beside the faults: {_join_alternatives(d.beside)}."
     if not d.others:
-        return ""
-    return " Other deviations: " + "; ".join(describe_deviation(name, e) for name, e in d.others.items()) + "."
+        return words
+    others = "; ".join(describe_deviation(name, e) for name, e in d.others.items())
+    return f"{words} Other deviations: {others}."
+
+
+def _join_alternatives(b: Beside) -> str:
+    """Effects beside the faults: those of one explanation by "and", explanations that fit equally well by "or"."""
+    marks = join_words(b.marks)
+    found = " or ".join(name_explanation(e) for e in b.explanations if e.effects or not marks)
+    return f"{marks} and {found}" if marks and any(e.effects for e in b.explanations) else marks or found
+
+
+def name_explanation(e: Explanation) -> str:
+    """The effects of an explanation beside the faults, in words."""
+    return " with ".join(e.effects) or "no other effect"
 
 
 def describe_deviation(parameter: str, size: Estimate) -> str:
@@ -223,6 +249,42 @@ def _list_fault_cells(d: Diagnosis, fault: Fault) -> list[Cell | str]:
             Cell(format_size(fault, d.sizes[fault.name]), is_strong=True), *format_limits_of_fault(fault),
             format_digits(at_grid) + unit,
             Cell("not judged" if by_bands is None else LEVEL_NAMES[by_bands], LEVEL_MOODS[by_bands])]
+
+
+def _tabulate_effects(d: Diagnosis) -> list[Item]:
+    """One row for each explanation that may be right: its effects with sizes, and what it makes of both faults."""
+    b = d.beside
+    if b is None:
+        return []
+    columns = [Column("beside the faults"), Column("probability", "%", "right"), Column("size (95 % interval)"),
+               *(column for fault in FAULTS for column in (Column(SIZE_SYMBOLS[fault.name], align="right"),
+                                                           Column("level"))),
+               Column("residual / noise", align="right", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = []
+    for e in b.explanations:
+        sizes = "; ".join(_format_parameter(name, size) for name, size in e.parameters.items())
+        judged = d.refinement.is_explained
+        cells = [cell for f in FAULTS for cell in (
+            format_size(f, e.sizes[f.name]),
+            Cell(LEVEL_NAMES[e.levels[f.name] if judged else None], LEVEL_MOODS[e.levels[f.name] if judged else None]))]
+        rows.append([name_explanation(e), f"{100 * e.weight:.0f}", sizes or NO_NUMBER, *cells,
+                     format_ratio(max(e.refinement.ratio.values()))])
+    words = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
+             b.is_ambiguous else "What the search found beside the faults, fitted together with them.")
+    if not b.is_explained:
+        words = "The best that the search found; it leaves more than noise, so no level follows from it."
+    found: list[Item] = [Table(columns, rows, words)]
+    for effect, parameters in b.marks.items():
+        sizes = "; ".join(_format_parameter(name, size) for name, size in parameters.items())
+        found.append(Line(effect, f"{sizes}, read off without noise"))
+    found += [Paragraph(f"The level of {FAULT_NAMES[name]} depends on which of these is right: cannot be judged.")
+              for name in b.disputed]
+    return found
+
+
+def _format_parameter(name: str, size: Estimate) -> str:
+    unit = find_quantity(name).unit
+    return f"{name} {format_interval(size.value, size.low, size.high, unit)}"
 
 
 def _draw_bands(d: Diagnosis) -> list[Item]:
@@ -383,6 +445,24 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "signals": {s: {"error": r.errors[s], "floor": r.floor[s], "ratio": r.ratio[s]} for s in r.errors},
         "others": {name: {**e._asdict(), "unhealthy": name in d.others} for name, e in r.others.items()},
         "notes": list(d.notes),
+        **({"with_effects": _collect_beside(d.beside)} if d.beside is not None else {}),
+    }
+
+
+def _collect_beside(b: Beside) -> dict[str, Any]:
+    """What was searched and found beside the faults; SI units."""
+    return {
+        "effects": list(b.effects), "explained": b.is_explained, "ambiguous": b.is_ambiguous,
+        "disputed": list(b.disputed),
+        "marks": {effect: {name: e._asdict() for name, e in own.items()} for effect, own in b.marks.items()},
+        "explanations": [
+            {"effects": list(e.effects), "probability": e.weight,
+             "parameters": {name: {**v._asdict(), "unit": find_quantity(name).unit}
+                            for name, v in e.parameters.items()},
+             **{f.symbol: e.sizes[f.name]._asdict() for f in FAULTS},
+             "level": {name: level.word if level is not None and e.refinement.is_explained else None
+                       for name, level in e.levels.items()},
+             "ratio": dict(e.refinement.ratio)} for e in b.explanations],
     }
 
 

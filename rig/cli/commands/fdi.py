@@ -24,6 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="trace.mcap, the folder of a run, or a CSV with t,com,xj,cor[,p12,xs,load]")
     options.add_model_options(parser)
     add("--bands", metavar="FILE", help="bands to judge by (default: the shipped ones, for the preflight command)")
+    add("--with-effects", action="store_true",
+        help="search the catalogue for what else is wrong, and size both faults beside it (minutes)")
     add("--optimisers", action="store_true",
         help="compare with differential evolution, simulated annealing and a genetic algorithm: error, simulations, "
              "time")
@@ -55,7 +57,8 @@ def run_command(args: argparse.Namespace) -> int:
     places = choose_places(args, "", args.trace)
     model = options.load_chosen_model(args)
     with show_progress(is_silent=args.json or args.quiet) as progress:
-        diagnosis = diagnose(Trace.read(args.trace), model, load_bands(args), progress, str(args.trace))
+        diagnosis = diagnose(Trace.read(args.trace), model, load_bands(args), progress, str(args.trace),
+                             with_effects=args.with_effects)
         report = replace(build_diagnosis_report(diagnosis), next_command=suggest_next_command(args, diagnosis),
                          files=places.files)
         rows = apply_other_methods(args, diagnosis, progress)
@@ -120,7 +123,9 @@ def load_bands(args: argparse.Namespace) -> Bands | None:
 
 
 def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:
-    """What to type next: `rig explain` where neither fault explains the trace, else ""."""
+    """What to type next where neither fault explains the trace: the search for other effects, or after it
+    `rig explain`; else "".
+    """
     import shlex
 
     if diagnosis.verdict != "SOMETHING_ELSE":
@@ -130,4 +135,6 @@ def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:
                            ("--effects", args.effects)):
         words += [word for value in values for word in (option, str(value))]
     words += ["--trust"] if args.trust else []
+    if diagnosis.beside is None:
+        return "rig fdi --with-effects " + shlex.join(words)
     return "rig explain " + shlex.join(words)

@@ -1,0 +1,268 @@
+"""The search for what else is wrong beside the valve faults: each effect of the catalogue, with both faults free.
+
+Faults, tolerances and suspects are fitted together with the effect, so that neither takes the other's place: a fault
+that was found first would otherwise take up what belongs to the effect, and the other way round. Scan, fits and charges
+are those of `rig explain`; the fit's last rounds are those of `fdi.diagnosis.refine`, which knows the directions along
+which no signal changes.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.diagnosis.beside import Beside, Explanation, average_explanations
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.diagnosis.refine import (
+    COARSE_STARTS,
+    FAULT_PARAMETERS,
+    FINE_STEPS,
+    NOISE_SCHEDULE,
+    SUSPECTS,
+    CountedProblem,
+    Refinement,
+    choose_start,
+    estimate_offsets,
+    is_noise_left,
+    learn_left_noise,
+    list_unknowns,
+    make_problem,
+    make_start,
+    measure_ratios,
+    report_fit,
+    scale_noise,
+)
+from fdi.discovery.candidates import list_fitted_parameters
+from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
+from fdi.discovery.scan import Prospect, scan_effects
+from fdi.estimation.final_rounds import descend_valley, guess_covariance, linearise_across
+from fdi.estimation.fit import Fit
+from fdi.estimation.judgement import judge_on_all
+from fdi.estimation.likelihood import Free
+from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.estimation.unknowns import UNREPLAYED, complete_model
+from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import FURTHER_EFFECT_SHARE, GAIN_CONVINCES, GAIN_TIE, GAIN_WORTH_A_FIT
+from fdi.trace.trace import Trace
+from plant.effects import CATALOGUE
+from plant.model import Model, list_searched_effects
+from plant.threads import R, T, map_in_threads
+
+Floats = NDArray[np.float64]
+
+# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT_BY_RATIO`: pressures, spool
+# forces, torques, and all that goes with the jack's area
+EFFECT_POWERS: tuple[Mapping[str, float], ...] = (
+    {"supply_droop.slope": -1.0},
+    {"supply_droop.slope": 1.0, "flow_force.coefficient": 1.0},
+    {},
+    {"supply_droop.slope": -1.0, "compressibility.coefficient": 1.0, "aero_stiffness.stiffness": 1.0,
+     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0},
+)
+
+
+def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Mapping[str, float],
+                        progress: Progress = ignore_progress, workers: int = 2, whole: Trace | None = None) -> Beside:
+    """The valve faults beside the other effects that a recording shows.
+
+    Args:
+        model: the unit as delivered.
+        trace: the run, prepared for replay.
+        alone: the faults fitted without another effect.
+        floor: RMS noise by signal, SI.
+        progress: called with each stage and the share done, 0 to 1.
+        workers: threads.
+        whole: the recording that `trace` was cut from: fits are judged on it.
+    """
+    marks, floor = _read_marks(model, whole or trace, floor)
+    problem = make_joint_problem(model, trace, floor, workers)
+    search = JointSearch(problem, list_other_effects(model), model, progress)
+    fits = search.find_explanations(alone.fit)
+    explanations = [_explain(effects, fit, search.problem, whole) for effects, fit in fits]
+    return average_explanations(explanations, marks)
+
+
+def list_other_effects(model: Model) -> list[str]:
+    """The effects that are searched: all that a replay shows, but for those that every fit of the faults has."""
+    always = {CLOGGING.name, FRICTION.name, *(s.effect for s in SUSPECTS), *model.effects}
+    return [e.name for e in list_searched_effects(model.plant)
+            if e.name not in always and e.port not in UNREPLAYED and e.starts]
+
+
+def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], workers: int = 2) -> CountedProblem:
+    """The run, and the model with the whole catalogue ready in it."""
+    problem = make_problem(model, trace, floor, workers)
+    return replace(problem, bare=problem.model, model=complete_model(problem.model), _lanes={})
+
+
+def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
+                ) -> tuple[dict[str, dict[str, Estimate]], dict[str, float]]:
+    """Effects that are read off without noise, and the floors with the rounding of the position among them."""
+    tooth = find_quantisation(trace) if "quantisation" not in model.effects else None
+    prints = [*([tooth] if tooth else []), *find_firmware_marks(model, [trace])[1][:1]]
+    floor = dict(floor)
+    if tooth:
+        step = tooth.parameters["quantisation.lsb"][0]
+        floor["xj"] = max(floor["xj"], float(np.hypot(model["sensors.position_noise"], step / np.sqrt(12.0))))
+    return {p.effect: {name: Estimate(*of) for name, of in p.parameters.items()} for p in prints}, floor
+
+
+def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:
+    found = report_fit(fit, problem)
+    if whole is not None and whole is not problem.trace:
+        judged = judge_on_all(problem, [fit], whole, FINE_STEPS)[0]
+        found = replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
+    values = {name: Estimate(v.value, v.low, v.high) for effect in effects
+              for name, v in list_fitted_parameters(effect, fit, problem.model).items()}
+    return Explanation(effects, values, found)
+
+
+Named = tuple[tuple[str, ...], Fit]
+"""Effects beside the faults, and the fit with them."""
+
+
+class JointSearch:
+    """The state of one search: the problem with its noise, and the effects to try."""
+
+    def __init__(self, problem: CountedProblem, effects: Sequence[str], model: Model, progress: Progress) -> None:
+        self.problem, self.effects, self.model, self.progress = problem, list(effects), model, progress
+
+    def find_explanations(self, alone: Fit, most_effects: int = 2) -> list[Named]:
+        """Fits with 0, 1 .. other effects that may be the answer, taken to the end with one noise."""
+        free = list_unknowns(self.model)
+        base = self.descend(replace(alone, free=free, covariance=guess_joint_covariance(free)), ((1.0, 2),))
+        found: list[Named] = [((), base)]
+        parents = list(found)
+        for count in range(1, most_effects + 1):
+            self.progress(f"looking for effect {count} beside the faults", 0.25 * count)
+            tried = [each for parent in parents for each in self.add_effects(parent, count)]
+            if not tried:
+                break
+            best = min(tried, key=_get_cost)
+            before = min(found, key=_get_cost)
+            if count > 1 and not _takes_fair_share(before[1], best[1]):
+                break
+            found += tried
+            if is_noise_left(self.problem, best[1]):
+                break
+            parents = sorted(tried, key=_get_cost)[:2]
+        return self.finish(found)
+
+    def add_effects(self, parent: Named, count: int) -> list[Named]:
+        """The parent with one more effect each: the promising ones fitted."""
+        present, fit = parent
+        effects = [e for e in self.effects if e not in present and not _excludes(e, present)]
+        prospects = [scan_effects(self.problem, at, effects, self.problem.workers)
+                     for at in ([fit, self.start_afresh()] if count == 1 else [fit])]
+        worth = _interleave([[p for p in each if p.cost < fit.cost - GAIN_WORTH_A_FIT] for each in prospects],
+                            8 if count == 1 else 5)
+        if not worth:
+            return []
+        named = ", ".join(dict.fromkeys(p.effect for p in worth))
+        self.progress(f"fitting {named}", 0.25 * count + 0.1)
+        begun = self.map_alone(self._begin_fit, worth)
+        begun = sorted(begun, key=lambda f: f.cost)[:4]
+        self.progress(f"fitting {', '.join(dict.fromkeys(self._name_added(f, present) for f in begun))}",
+                      0.25 * count + 0.15)
+        fits = self.map_alone(lambda f: self.descend(f, ((3.0, 3), (1.0, 6))), begun)
+        best: dict[str, Named] = {}
+        for each in sorted(fits, key=lambda f: f.cost):
+            best.setdefault(self._name_added(each, present), ((*present, self._name_added(each, present)), each))
+        return list(best.values())
+
+    def start_afresh(self) -> Fit:
+        """A unit with the best pair of faults and no other deviation: an effect may lead fits into a wrong valley."""
+        free = list_unknowns(self.model)
+        x = choose_start(self.problem, free, COARSE_STARTS)
+        flat = self.find_flat(free, x)
+        return linearise_across(self.problem, free, x, guess_joint_covariance(free), flat)
+
+    def finish(self, found: Sequence[Named]) -> list[Named]:
+        """The likely ones with finer steps, under the noise that the best one leaves."""
+        ranked = sorted(found, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
+        near = 60.0 * GAIN_TIE  # coarse fits are not done
+        close = [each for each in ranked if each[1].cost < ranked[0][1].cost + near][:4]
+        self.progress(f"last fits, {', '.join(_describe(effects) for effects, _ in close)}", 0.75)
+        self.problem = replace(learn_left_noise(self.problem, ranked[0][1]), _lanes={})
+        self.problem = replace(self.problem, steps=FINE_STEPS, _lanes={})
+        fits = self.map_alone(lambda each: self.descend(each[1], ((1.0, 8),)), close)
+        done = list(zip([effects for effects, _ in close], fits, strict=True))
+        best = min(done, key=_get_cost)
+        if not is_noise_left(self.problem, best[1]) and self._is_near(best[1]):
+            self.progress(f"another start, {_describe(best[0])}", 0.9)
+            again = self.map_alone(lambda part: self._restart(best[1], part), (1.0, 0.5))
+            done[done.index(best)] = (best[0], min([best[1], *again], key=lambda f: f.cost))
+        return done
+
+    def _is_near(self, fit: Fit, far: float = 7.0) -> bool:
+        return max(measure_ratios(self.problem, fit)) < far
+
+    def _restart(self, fit: Fit, part: float) -> Fit:
+        """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
+        home = make_start(fit.free, 0.0, FRICTION.healthy, estimate_offsets(self.problem))
+        kept = [f.name in FAULT_PARAMETERS or not np.isfinite(f.prior) for f in fit.free]
+        home[kept] = fit.x[kept]
+        begun = replace(fit, x=fit.x + part * (home - fit.x), cost=np.inf)
+        return self.descend(begun, ((6.0, 4), (1.0, 8)))
+
+    def descend(self, fit: Fit, schedule: Sequence[tuple[float, int]]) -> Fit:
+        """The fit after rounds with the noise so many times as large: (factor, rounds) each."""
+        for factor, rounds in schedule:
+            loud = scale_noise(self.problem, factor)
+            start = replace(fit, covariance=guess_joint_covariance(fit.free), cost=np.inf)
+            fit = descend_valley(replace(loud, workers=1, _lanes={}), start, rounds, self.find_flat(fit.free, fit.x))
+        return fit
+
+    def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
+        """Directions that the data do not see, with what of the effects goes along."""
+        return find_flat_directions(replace(self.problem, workers=1, _lanes={}), free, x, (), EFFECT_POWERS)
+
+    def map_alone(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
+        """By all threads; each fit keeps to one of them."""
+        return map_in_threads(do, items, self.problem.workers)
+
+    def _begin_fit(self, p: Prospect) -> Fit:
+        """Begin at the scan's linear forecast, with the noise first taken for larger."""
+        free = tuple(p.free)
+        none = np.empty((0, 0))
+        fit = Fit(free, p.x, np.inf, np.inf, guess_joint_covariance(free), none, none, none)
+        return self.descend(fit, (NOISE_SCHEDULE[1], (1.0, 3)))
+
+    def _name_added(self, fit: Fit, present: Sequence[str]) -> str:
+        names = {f.name for f in fit.free}
+        return next(e for e in self.effects if e not in present and set(CATALOGUE[e].fitted) & names)
+
+
+def guess_joint_covariance(free: Sequence[Free]) -> Floats:
+    """A first covariance, (p, p): an effect's parameter by the width of its first difference."""
+    guess = guess_covariance(free)
+    for k, f in enumerate(free):
+        if not np.isfinite(f.prior):
+            guess[k, k] = (f.step / 3.0) ** 2
+    return guess
+
+
+def _interleave(prospects: Sequence[Sequence[Prospect]], most: int) -> list[Prospect]:
+    """The best of each list in turn, until there are so many."""
+    mixed = [p for group in zip(*(list(each) + [None] * most for each in prospects), strict=False) for p in group]
+    return [p for p in mixed if p is not None][:most]
+
+
+def _get_cost(each: Named) -> float:
+    return each[1].cost
+
+
+def _describe(effects: Sequence[str]) -> str:
+    return " and ".join(effects) or "the faults alone"
+
+
+def _excludes(effect: str, present: Sequence[str]) -> bool:
+    return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
+
+
+def _takes_fair_share(before: Fit, after: Fit) -> bool:
+    """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
+    noise = float(np.count_nonzero(before.white))
+    return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
