@@ -21,7 +21,7 @@ _SIGNALS = ("com", "xj", "cor", "p12", "xs", "load")
 
 @dataclass(frozen=True, kw_only=True)
 class PythonSegment(Timed):
-    """A demand that a function computes: `f(t, start, **arguments)`.
+    """A demand that a function computes: f(t, start, **arguments).
 
     The function gets the times of the cycles in s from the segment's start, and the demand where it starts; it returns
     a demand in m (N for a load) for each. The time after the last cycle is among them: the next segment starts there.
@@ -76,7 +76,7 @@ class Window(NamedTuple):
 class PythonCheck(Check):
     """A number that a function of yours measures.
 
-    It is called as `f(window, **arguments)` and returns the number in the check's unit, which may be any text.
+    It is called as f(window, **arguments) and returns the number in the check's unit, which may be any text.
     """
 
     kind, si = "python", "1"
@@ -123,7 +123,7 @@ class StepRun(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """A function that runs before the bus is opened, or after the log is closed: `f(run, **arguments)`."""
+    """A function that runs before the bus is opened, or after the log is closed: f(run, **arguments)."""
 
     python: str
     when: Literal["before", "after"]
