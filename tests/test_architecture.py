@@ -26,7 +26,7 @@ MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": 
 # Inside fdi and rig: the folders, and single modules, that each folder may import beside itself. All may import SHARED.
 SHARED = {"fdi.output", "fdi.progress", "fdi.sources", "fdi.thresholds"}
 BENCH = {f"rig.{part}" for part in ("network", "device", "nodes", "firmware", "run", "sequences", "recorder", "view",
-                                    "doctor")}
+                                    "live", "doctor")}
 ESTIMATOR = {"fdi.trace", "fdi.estimation", "fdi.comparison"}
 FOLDER_MAY_IMPORT = {
     **{module: set() for module in SHARED},
@@ -48,8 +48,9 @@ FOLDER_MAY_IMPORT = {
     "rig.sequences": {"rig.network", "rig.device"},
     "rig.nodes": {"rig.network", "rig.device", "rig.sequences"},
     "rig.recorder": {"rig.network"},
-    "rig.run": BENCH - {"rig.run", "rig.view", "rig.doctor"},
+    "rig.run": BENCH - {"rig.run", "rig.view", "rig.live", "rig.doctor"},
     "rig.view": {"rig.sequences"},
+    "rig.live": {"rig.network", "rig.sequences", "rig.recorder"},
     "rig.doctor": {"rig.network", "rig.run"},
     "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
     "rig.studies": {*BENCH, "rig.junit"},
@@ -82,6 +83,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "rig/studies/benchmarks/responders.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/lateness.py", "rig/cli/commands/",
+    "rig/live/",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time
     "rig/view/viewer.py",  # waits for the viewer to come up
 )

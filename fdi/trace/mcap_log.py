@@ -40,7 +40,11 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 @dataclass(frozen=True)
 class Log:
-    """An MCAP file: its channels, attachments (name -> bytes) and metadata (record -> names and values)."""
+    """An MCAP file: its channels, attachments (name -> bytes) and metadata (record -> names and values).
+
+    A log of this rig counts its times from the start of the run. In the file they are counted from 1970, and the
+    metadata record `clock` holds the start (`epoch_ns`); older logs have none and begin at 0.
+    """
 
     path: Path
     schemas: Mapping[int, Schema]
@@ -48,6 +52,7 @@ class Log:
     attachments: Mapping[str, bytes]
     metadata: Mapping[str, Mapping[str, str]]
     _chunks: tuple[ChunkIndex, ...]
+    epoch_ns: int = 0  # of the start of the run, since 1970
 
     def read_messages(self, *topics: str, most: int | None = None) -> Iterator[tuple[str, int, Any]]:
         """(topic, time in ns, protobuf message) of the topics, by time; equal times in the order of the file.
@@ -67,7 +72,7 @@ class Log:
                     if not index.message_index_offsets or decode.keys() & index.message_index_offsets.keys():
                         for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
                             if channel in decode:
-                                out.append((time_ns, channel, data))
+                                out.append((time_ns - self.epoch_ns, channel, data))
             out.sort(key=lambda item: item[0])
             for time_ns, channel, data in out[:most]:
                 topic, parse = decode[channel]
@@ -116,6 +121,7 @@ class Log:
         table = np.concatenate(parts)
         if not all((table[name] == value).all() for name, value in tags.items()):
             return None
+        table["time_ns"] -= self.epoch_ns
         table = table[np.argsort(table["time_ns"], kind="stable")]
         return {name: table[name].copy() for name in dtype.names or () if not name.startswith(".")}
 
@@ -128,7 +134,7 @@ class Log:
         with self.path.open("rb") as stream:
             for index in self._chunks:
                 for channel, time_ns, _, data in scan_messages(_read_chunk(self.path, stream, index)):
-                    yield channel, time_ns, data
+                    yield channel, time_ns - self.epoch_ns, data
 
     def read_units(self, topic: str) -> dict[str, str]:
         """Field -> unit, from the channel's metadata."""
@@ -165,7 +171,16 @@ def open_log(path: Path) -> Log:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
     except (McapError, struct.error, ValueError, EOFError, StopIteration) as error:
         raise InputError(path, "", "a complete MCAP log; if its writer died, rig recover brings it back") from error
-    return Log(path, summary.schemas, summary.channels, attachments, metadata, tuple(summary.chunk_indexes))
+    return Log(path, summary.schemas, summary.channels, attachments, metadata, tuple(summary.chunk_indexes),
+               _read_epoch(path, metadata))
+
+
+def _read_epoch(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> int:
+    """The start of the run, ns since 1970; 0 in a log without the record `clock`. Raises InputError."""
+    text = metadata.get("clock", {}).get("epoch_ns", "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 20 and int(text) < 2**63):
+        raise InputError(path, "metadata clock.epoch_ns", f"nanoseconds since 1970, not {text[:40]!r}")
+    return int(text)
 
 
 def _check_sizes(path: Path, summary: Summary, size: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+import time
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,6 +27,13 @@ def collect_provenance(**given: object) -> dict[str, str]:
         **{f"version.{name}": _read_version(name) for name in RECORDED_PACKAGES},
         **_read_git_state(Path(__file__).parents[2]),
     }
+
+
+def read_epoch_ns() -> int:
+    """The date now, ns since 1970 (UTC); SOURCE_DATE_EPOCH, whole seconds, replaces it, for logs that are equal."""
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    is_date = given.isascii() and given.isdecimal() and len(given) < 11
+    return int(given) * 10**9 if is_date else time.time_ns()
 
 
 def _read_version(name: str) -> str:

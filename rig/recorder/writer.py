@@ -11,6 +11,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,10 @@ def list_channels() -> tuple[list[Schema], list[Channel]]:
 class Recorder:
     """Writes one run to `path`, attachments and metadata first so that they outlive a crash.
 
-    attachments: name -> (media type, bytes); metadata: name -> text. Times are ns since the run's start.
+    attachments: name -> (media type, bytes); metadata: name -> text. Times are ns since the run's start. In the file
+    they are counted from `epoch_ns`, ns since 1970, which the metadata record `clock` holds: other programs then show
+    dates, and two runs with the same seed still differ in this one number only. `observe` is called by the writing
+    thread with each time and record but raw frames.
     Raises RecorderError when the file cannot be made; later, once, from `cycle` or `put` when it cannot be written, or
     from `close` if neither was called since. After that everything is accepted and dropped, so that the loop
     can still bring the run to rest.
@@ -66,8 +70,10 @@ class Recorder:
 
     frame: Callable[[Frame], None]  # record a raw frame; the queue's own append, so it costs 30 ns
 
-    def __init__(self, path: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str]) -> None:
+    def __init__(self, path: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
+                 epoch_ns: int = 0, observe: Callable[[int, Record], None] | None = None) -> None:
         self.path = path
+        self._epoch_ns, self._observe = epoch_ns, observe
         self._failure: RecorderError | None = None
         self._told = False
         self._queue: deque[Any] = deque()
@@ -79,6 +85,9 @@ class Recorder:
             for name, (media_type, data) in attachments.items():
                 self._file.write_attachment(name, media_type, data, time.time_ns())
             self._file.write_metadata("run", metadata)
+            if epoch_ns:
+                start = datetime.fromtimestamp(epoch_ns // 10**9, UTC).isoformat()
+                self._file.write_metadata("clock", {"epoch_ns": str(epoch_ns), "start": start})
         except OSError as error:
             raise _describe_failure(path, error) from error
         self._packers = {record: make_packer(record) for record in TOPICS.values()}
@@ -146,7 +155,7 @@ class Recorder:
             self._queue.clear()
 
     def _drain(self) -> None:
-        queue, packers = self._queue, self._packers
+        queue, packers, epoch_ns, observe = self._queue, self._packers, self._epoch_ns, self._observe
         waiting = len(queue)
         if waiting > QUEUE_LIMIT:
             raise OSError(0, f"the disk is too slow: {waiting} records waiting")
@@ -154,14 +163,16 @@ class Recorder:
         for _ in range(waiting):
             item = queue.popleft()
             if len(item) == 3:
-                self._add(item[0], frames, pack_frame(item[0], item))
+                self._add(item[0] + epoch_ns, frames, pack_frame(item[0] + epoch_ns, item))
                 continue
             t_ns, record = item
             pack = packers.get(type(record))
             if pack is None:
                 self._file.write_metadata(*record)
             else:
-                self._add(t_ns, CHANNELS[type(record)], pack(t_ns, record))
+                self._add(t_ns + epoch_ns, CHANNELS[type(record)], pack(t_ns + epoch_ns, record))
+                if observe is not None:
+                    observe(t_ns, record)
 
     def _add(self, t_ns: int, channel: int, raw: bytes) -> None:
         if not self._parts:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +15,11 @@ if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
+    from rig.recorder import Record
     from rig.run.job import Job
     from rig.run.job_choice import JobChoice
     from rig.run.outcome import Outcome
+    from rig.run.runner import Observe
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
     add("--jobs", type=options.parse_count, default=None, metavar="N",
         help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN bus)")
+    add("--live", action="store_true",
+        help="show the run while it runs: nodes, command and position, checks, timing; without a terminal a line "
+             "every 2 s")
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run recorded in this log")
 
 
@@ -74,13 +80,16 @@ def run_command(args: argparse.Namespace) -> int:
     junit = choose_junit(args)
     clock = WallClock()
     with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
-        with announce_run(job, why, is_silent=args.json or args.quiet) as progress:
+        with (announce_run(job, why, is_silent=args.json or args.quiet or args.live) as progress,
+              choose_observer(job, is_live=args.live) as observe):
             prepare = pages.wait_until_loaded if job.realtime else do_nothing
             diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
-            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose)
+            outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observe)
             progress("report", 0.0)
             pages.start_page(folder / "trace.mcap", folder / "report.html")
             report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
+        if args.live and not (args.json or args.quiet):
+            print_settings(job, why)
         with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
             show_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
         pages.finish_page()
@@ -154,10 +163,42 @@ def do_nothing() -> None:
 
 
 @contextlib.contextmanager
+def choose_observer(job: Job, *, is_live: bool) -> Iterator[Observe]:
+    """What looks at the records of a run: the screen of --live, and the lines on standard error about dead nodes."""
+    if not is_live:
+        yield announce_dead_node
+        return
+    from rig.live.dead_node import find_dead_node
+    from rig.live.live_process import show_live
+    from rig.live.live_run import make_live_plan
+    from rig.recorder import Event
+
+    deaths: list[Event] = []
+    with show_live(make_live_plan(job.sequence, job.pace), last_cpu_is_taken=job.realtime) as feed:
+        def observe(t_ns: int, record: Record) -> None:
+            feed.observe(t_ns, record)
+            if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
+                deaths.append(record)
+
+        yield observe
+    for event in deaths:  # the screen that showed them is gone
+        announce_dead_node(0, event)
+
+
+def announce_dead_node(t_ns: int, record: Record) -> None:
+    """Print a line on standard error, at once, when a node has died."""
+    from rig.live.dead_node import find_dead_node
+    from rig.recorder import Event
+
+    if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
+        clear = "\r\033[K" if sys.stderr.isatty() else ""
+        print(f"{clear}rig run: {record.text}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
 def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
     """Show the progress bar of a run, and say on standard output what runs on which bus and `why` on that."""
     from rig.cli.progress_bar import show_progress
-    from rig.cli.terminal import open_console
 
     is_announced = is_silent
     with show_progress(is_silent=is_silent, is_realtime=job.realtime) as update:
@@ -165,11 +206,18 @@ def announce_run(job: Job, why: str, *, is_silent: bool) -> Iterator[Progress]:
             nonlocal is_announced
             if not is_announced:  # not before there is a bus and a place for the results: an error is one line
                 is_announced = True
-                text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
-                open_console().print(text, markup=False, soft_wrap=True)
+                print_settings(job, why)
             update(stage, share)
 
         yield announce
+
+
+def print_settings(job: Job, why: str) -> None:
+    """Say on standard output what runs on which bus and `why` on that."""
+    from rig.cli.terminal import open_console
+
+    text = f"{job.sequence.title}, {job.sequence.duration:g} s, {job.pace}, seed {job.seed}, {why}"
+    open_console().print(text, markup=False, soft_wrap=True)
 
 
 def add_outcome(report: Report, outcome: Outcome) -> Report:

@@ -6,6 +6,7 @@ import shutil
 import struct
 import time
 from dataclasses import fields
+from itertools import islice
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -16,6 +17,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
+from fdi.trace.mcap_log import open_log
+from plant.errors import InputError
 from rig.network.frame import Frame
 from rig.recorder import U32, CanFrame, Check, Event, NmtState, Recorder, RecorderError, Signals, Timing
 from rig.recorder.schema import TOPICS, encode_schema, make_packer
@@ -159,3 +162,35 @@ def test_path_that_cannot_be_made(tmp_path: Path) -> None:
 def test_defaults_of_a_check_are_no_limits() -> None:
     check = Check(name="a", signal="xj", value=1.0, unit="m", passed=True)
     assert math.isnan(check.low) and math.isnan(check.high) and math.isnan(check.t0)
+
+
+def test_times_are_dates_for_others_and_seconds_of_the_run_for_us(tmp_path: Path) -> None:
+    """MCAP's log and publish times count from 1970; our own readers count from the start, as in a log without dates."""
+    epoch_ns = 1_790_000_000_123_456_789
+    for name, epoch in (("dated", epoch_ns), ("old", 0)):
+        recorder = Recorder(tmp_path / f"{name}.mcap", {}, {"period": "0.001"}, epoch)
+        for t_ns, frames, signals, timing in islice(build_cycles(), 400):
+            for frame in frames:
+                recorder.frame(frame)
+            recorder.cycle(t_ns, signals, timing)
+        recorder.put(250_000_000, Event("INFO", "phase", "main"))
+        recorder.close()
+    with (tmp_path / "dated.mcap").open("rb") as stream:
+        times = [(m.log_time, m.publish_time) for _, _, m in make_reader(stream).iter_messages(topics=["/signals"])]
+    assert times == [(epoch_ns + k * 1_000_000,) * 2 for k in range(400)]
+    dated, old = open_log(tmp_path / "dated.mcap"), open_log(tmp_path / "old.mcap")
+    assert dated.metadata["clock"] == {"epoch_ns": str(epoch_ns), "start": "2026-09-21T14:13:20+00:00"}
+    assert list(dated.list_raw_messages()) == list(old.list_raw_messages())
+    assert {name: column.tolist() for name, column in dated.read_columns("/signals").items()} == \
+        {name: column.tolist() for name, column in old.read_columns("/signals").items()}
+    assert [t for _, t, _ in dated.read_messages("/events", "/can")] == \
+        [t for _, t, _ in old.read_messages("/events", "/can")]
+
+
+@pytest.mark.parametrize("text", ["-1", "1e9", "99999999999999999999", "²"])
+def test_a_start_that_is_no_date_is_refused(tmp_path: Path, text: str) -> None:
+    recorder = Recorder(tmp_path / "x.mcap", {}, {})
+    recorder.metadata("clock", {"epoch_ns": text})
+    recorder.close()
+    with pytest.raises(InputError, match=r"clock\.epoch_ns"):
+        open_log(tmp_path / "x.mcap")

@@ -36,9 +36,11 @@ QUIET = {f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spoo
 
 
 def messages(folder: Path) -> list[tuple[int, bytes]]:
-    """Time and bytes of each /signals message."""
+    """Time since the start of the run and bytes of each /signals message."""
     with (folder / "trace.mcap").open("rb") as stream:
-        return [(m.log_time, m.data) for _, _, m in make_reader(stream).iter_messages(topics=["/signals"])]
+        reader = make_reader(stream)
+        clock = next(record.metadata for record in reader.iter_metadata() if record.name == "clock")
+        return [(m.log_time - int(clock["epoch_ns"]), m.data) for _, _, m in reader.iter_messages(topics=["/signals"])]
 
 
 def columns(folder: Path) -> np.ndarray:

@@ -1,0 +1,82 @@
+"""The showing process, as the rig starts and ends it."""
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+from rig.live.feed import LiveFeed, make_shared_file
+from rig.live.live_run import LivePlan
+
+
+@contextlib.contextmanager
+def show_live(plan: LivePlan, last_cpu_is_taken: bool, patience: float = 20.0) -> Iterator[LiveFeed]:
+    """Start the showing process, wait until it is ready, and give the feed to fill; end the process afterwards.
+
+    The process has normal priority. It ignores Ctrl-C, which ends the run and through it the process; what it leaves of
+    the screen if it is killed is cleared here.
+
+    Args:
+        plan: of the run.
+        last_cpu_is_taken: the loop runs on the last CPU; the process gets the others, where there are any.
+        patience: s to wait for the process; without it the run begins anyway.
+    """
+    with make_shared_file() as file:
+        feed = LiveFeed(file.fileno())
+        with _ignore_interrupt():
+            process = subprocess.Popen([sys.executable, "-m", "rig.live.dashboard", str(file.fileno())],
+                                       stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
+        try:
+            _send_plan(process, plan, last_cpu_is_taken)
+            deadline = time.monotonic() + patience
+            while not feed.is_read and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.02)
+            yield feed
+        finally:
+            feed.end()
+            _end_process(process)
+
+
+def _send_plan(process: subprocess.Popen[bytes], plan: LivePlan, last_cpu_is_taken: bool) -> None:
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(pickle.dumps(plan))
+        process.stdin.flush()
+    cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if last_cpu_is_taken and len(cpus) > 1:
+        with contextlib.suppress(OSError):  # it has ended
+            os.sched_setaffinity(process.pid, cpus[:-1])
+
+
+def _end_process(process: subprocess.Popen[bytes]) -> None:
+    """Let the process end by itself, kill it if it does not, and restore the screen if it could not."""
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+    try:
+        process.wait(3.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.returncode != 0 and sys.stderr.isatty():
+        sys.stderr.write("\033[?1049l\033[?25h")  # leave the second screen, show the cursor
+        sys.stderr.flush()
+
+
+@contextlib.contextmanager
+def _ignore_interrupt() -> Iterator[None]:
+    """A process that is started meanwhile ignores Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,191 @@
+"""What is known of a run while it runs: signals of main, states of the nodes, checks as far as they can be judged."""
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from math import isnan, nan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant import Columns
+from plant.segments import RATE
+from rig.live.dead_node import find_dead_node
+from rig.live.feed import COLUMNS, Message
+from rig.network.node_objects import CONTROLLER, PLANT, RIG
+from rig.sequences import Sequence
+from rig.sequences.checks import Check
+from rig.sequences.run_data import MAIN, RunData
+
+PHASES = ("set-up", "main", "clean-up")
+_COLUMN = {name: number for number, name in enumerate(COLUMNS)}
+_AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames
+_GROWS = ("never_exceeds", "max_error", "event_never")  # kinds whose number only grows: a limit passed stays passed
+
+
+class Event(NamedTuple):
+    """An event, `t` in s of main."""
+
+    t: float
+    level: str
+    kind: str
+    text: str
+
+
+class LivePlan(NamedTuple):
+    """What the showing process knows of the run before it begins."""
+
+    title: str
+    duration: float  # s of main
+    pace: str
+    checks: tuple[Check, ...]
+    unknown_checks: tuple[str, ...]  # names of checks that only the run itself can judge
+    sections: dict[str, slice]
+    starts: dict[str, float]
+
+
+def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
+    """The plan of a sequence; checks that cannot be sent to another process (Python of a user) keep their names."""
+    known, unknown = [], []
+    for check in sequence.checks:
+        try:
+            pickle.dumps(check)
+            known.append(check)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            unknown.append(check.name)
+    return LivePlan(sequence.title, sequence.duration, pace, tuple(known), tuple(unknown), sequence.sections(),
+                    dict(sequence.fault_starts()))
+
+
+class CheckState(NamedTuple):
+    """A check on the screen. `word`: waits, measures, PASS, FAIL, or, for one judged at the end only, after the run."""
+
+    name: str
+    word: str
+    value: float = nan
+    unit: str = ""
+    is_final: bool = False  # said by the run itself
+    detail: str = ""
+
+
+class LiveRun:
+    """Collects rows and messages of a run."""
+
+    def __init__(self, plan: LivePlan) -> None:
+        self.plan = plan
+        self._table = np.empty((1 << 14, len(COLUMNS)))
+        self._count = 0
+        self._main_from = -1  # row at which main begins
+        self._main_until = -1
+        self._zero_ns = 0.0  # log time of that row
+        self.states = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
+        self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
+        self.events: deque[Event] = deque(maxlen=5000)
+        self.checks = {check.name: CheckState(check.name, "waits" if check.kind not in _AFTER_RUN else "after the run")
+                       for check in plan.checks}
+        self.checks |= {name: CheckState(name, "after the run") for name in plan.unknown_checks}
+        self.overruns = 0
+
+    # ------------------------------------------------------------------------------------ what comes in
+
+    def add_rows(self, rows: NDArray[np.float64]) -> None:
+        """Append cycles."""
+        if not len(rows):
+            return
+        while self._count + len(rows) > len(self._table):
+            self._table = np.concatenate((self._table, np.empty_like(self._table)))
+        self._table[self._count:self._count + len(rows)] = rows
+        self._count += len(rows)
+        self.overruns += int(rows[:, _COLUMN["overrun"]].sum())
+        phase = self._table[:self._count, _COLUMN["phase"]]
+        if self._main_from < 0 and (phase[-len(rows):] >= 1).any():
+            self._main_from = int(np.argmax(phase >= 1))
+            self._zero_ns = float(self._table[self._main_from, _COLUMN["t_ns"]])
+        if self._main_from >= 0 and self._main_until < 0 and (phase[-len(rows):] >= 2).any():
+            self._main_until = self._main_from + int(np.argmax(phase[self._main_from:] >= 2))
+
+    def add_message(self, message: Message) -> None:
+        """Take in an event, a state of a node or a check."""
+        fields = message.fields
+        if message.kind == "NmtState":
+            self.states[int(fields["node"])] = str(fields["name"])
+        elif message.kind == "Check":
+            self.checks[fields["name"]] = CheckState(fields["name"], "PASS" if fields["passed"] else "FAIL",
+                                                     fields["value"], fields["unit"], True, fields["detail"])
+        elif message.kind == "Event":
+            t = (message.t_ns - self._zero_ns) * 1e-9 if self._main_from >= 0 else nan
+            event = Event(t, fields["level"], fields["kind"], fields["text"])
+            self.events.append(event)
+            node = find_dead_node(event.level, event.kind, event.text)
+            if node:
+                self.troubles[node] = event.text.partition(": ")[2] or "is silent"
+            elif event.kind == "heartbeat" and event.level == "INFO" and event.text.startswith("node "):
+                self.troubles.pop(int(event.text.split()[1]), None)
+
+    # ------------------------------------------------------------------------------------ what is shown
+
+    @property
+    def cycles(self) -> int:
+        """Cycles so far, without those that were missed."""
+        return self._count
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the last cycle has been played."""
+        return any(event.kind == "phase" and event.text == "end" for event in self.events)
+
+    @property
+    def phase(self) -> str:
+        """Name of the phase of the last cycle."""
+        return PHASES[min(int(self._table[self._count - 1, _COLUMN["phase"]]), 2)] if self._count else "bring-up"
+
+    @property
+    def t(self) -> float:
+        """Time of the last cycle, s of main; NaN before main."""
+        return (self._table[self._count - 1, _COLUMN["t_ns"]] - self._zero_ns) * 1e-9 if self._main_from >= 0 else nan
+
+    @property
+    def section(self) -> str:
+        """The section of main that is played, else the phase."""
+        row = self._count - 1 - self._main_from
+        if self.phase == "main":
+            return next((name for name, rows in self.plan.sections.items() if rows.start <= row < rows.stop), "main")
+        return self.phase
+
+    def read_last(self, name: str, cycles: int) -> NDArray[np.float64]:
+        """The last values of a column, at most so many."""
+        return self._table[max(self._count - cycles, 0):self._count, _COLUMN[name]]
+
+    def judge_checks(self) -> None:
+        """Judge the checks whose window is over, and those whose number has passed its limit already."""
+        rows = (self._main_until if self._main_until >= 0 else self._count) - self._main_from
+        if self._main_from < 0 or rows < 1:
+            return
+        table = self._table[self._main_from:self._main_from + rows]
+        columns = [table[:, _COLUMN[name]] for name in Columns._fields[1:]]
+        data = RunData(Columns(np.arange(rows) / RATE, *columns), self.plan.sections, tuple(self.events),
+                       self.plan.starts)
+        for check in self.plan.checks:
+            state = self.checks[check.name]
+            if state.is_final or state.word in ("PASS", "FAIL", "after the run"):
+                continue
+            start, stop = _find_window(check, self.plan.sections, self.plan.duration)
+            if rows >= stop:
+                result = check.judge(data)
+                word = "PASS" if result.passed else "FAIL"
+                self.checks[check.name] = CheckState(check.name, word, result.value, result.unit, detail=result.detail)
+            elif rows > start:
+                self.checks[check.name] = state._replace(word="measures")
+                if check.window == MAIN and check.kind in _GROWS:
+                    result = check.judge(data)
+                    word = "measures" if result.passed or isnan(result.value) else "FAIL"
+                    self.checks[check.name] = CheckState(check.name, word, result.value, result.unit)
+
+
+def _find_window(check: Check, sections: dict[str, slice], duration: float) -> tuple[int, int]:
+    """First row of a check's window and the one behind its last."""
+    if isinstance(check.window, tuple):
+        return round(check.window[0] * RATE), round(check.window[1] * RATE)
+    rows = sections.get(check.window)
+    return (rows.start, rows.stop) if rows else (0, round(duration * RATE))
