@@ -72,6 +72,8 @@ def run_command(args: argparse.Namespace) -> int:
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
     if not args.source and is_suite(args.sequence):
+        if args.live:
+            raise InputError("--live", "", "one sequence; runs of a suite run side by side")
         return start_suite(args)
     job = read_job(args.source, args) if args.source else build_job(build_choice(args), is_trusted=args.trust)
     bus, why = choose_bus_of_run(args, job.bus if args.source else args.bus, job.controller)

@@ -101,3 +101,9 @@ def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
     assert rig.stderr.readline() == "rig run: node 3 plant: its process was ended by SIGKILL\n"
     assert rig.poll() is None  # its report is still to come
     assert "ABORTED" in rig.communicate()[0] and rig.returncode == 1
+
+
+def test_a_suite_is_not_shown(tmp_path: Path) -> None:
+    done = subprocess.run([*COMMAND, "preflight", "lost_sync", "--live"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "rig run: --live: expected one sequence; runs of a suite run side by side\n"
