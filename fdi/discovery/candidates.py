@@ -4,7 +4,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from fdi.thresholds import (
 )
 from plant.effects import CATALOGUE
 from plant.model import Model, find_quantity, list_searched_effects
+
+if TYPE_CHECKING:
+    from fdi.discovery.laws.find_law import LawSearch
 
 
 class Value(NamedTuple):
@@ -89,6 +92,8 @@ class Answer:
     ledger: tuple[tuple[str | None, Mapping[str, float], Mapping[str, float]], ...]  # effect, error, holdout
     pattern: str = ""
     separate: Mapping[str, Any] = field(default_factory=dict)
+    law: LawSearch | None = None  # where more than noise is left
+    law_effects: tuple[str, ...] = ()  # of the effect file that was written
 
     @property
     def verdict(self) -> str:

@@ -16,6 +16,7 @@ from fdi.discovery.search import WholeRuns, choose_search_excerpt
 from fdi.estimation.excerpt import PIECE, can_be_cut, cut_excerpt, make_excerpt
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes, compile_kernels
 from plant.model import Model, list_searched_effects
@@ -23,20 +24,24 @@ from plant.run import report_law_errors
 from plant.starts import ensure_starts
 
 if TYPE_CHECKING:
+    from fdi.discovery.laws.find_law import Law, LawSearch
     from fdi.discovery.residual_pattern import Pattern
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
 
 
 def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = None,
-                 progress: Progress = ignore_progress) -> tuple[Answer, Pattern | None]:
+                 progress: Progress = ignore_progress, law_file: str | Path | None = None
+                 ) -> tuple[Answer, Pattern | None]:
     """Find the physical effect that a model lacks.
 
     Args:
         runs: the model and the measured runs, from `runs.read_runs`.
         seed: of the simulated runs behind the p-values.
-        effect_file: where to write the shape of the residual as an effect to edit and add; None for nowhere.
+        effect_file: where to write the law of the residual as an effect to add, or the residual's curve where no law
+            holds; None for nowhere.
         progress: called with the stage and the share done.
+        law_file: where to write the law if one holds and there is no `effect_file`; None for nowhere.
 
     Returns the answer, and the shape of the residual where it was looked for.
 
@@ -45,11 +50,36 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
     """
     prepare_effects(runs, progress=progress)
     explanation = explain_recording(runs, progress)
+    law = look_for_law(explanation, runs.holdout, progress)
     progress("writing the answer", 0.95)
-    shape = look_for_pattern(explanation, effect_file)
+    holding = law.law if law is not None and law.law is not None and law.law.holds else None
+    file = effect_file or law_file
+    names = write_law_file(holding, file) if holding is not None and file else {}
+    shape = look_for_pattern(explanation, None if holding else effect_file)
     is_pattern_reported = shape is not None and explanation.verdict in PATTERN_VERDICTS
     pattern = str(shape) if is_pattern_reported else ""
-    return assess_explanation(explanation, seed, pattern, discriminate(explanation)), shape
+    answer = assess_explanation(explanation, seed, pattern, discriminate(explanation))
+    return replace(answer, law=law, law_effects=tuple(names.values())), shape
+
+
+def look_for_law(explanation: Explanation, holdout: Trace | None, progress: Progress) -> LawSearch | None:
+    """The law behind what the catalogue leaves; None where it leaves nothing."""
+    if explanation.verdict not in PATTERN_VERDICTS or explanation.base.is_at_floor:
+        return None
+    from fdi.discovery.laws.law_file import find_law_beside  # takes half a second to import
+
+    return find_law_beside(explanation, holdout, progress)
+
+
+def write_law_file(law: Law, path: str | Path) -> dict[str, str]:
+    """Write a law as an effect file; the names of its effects, by balance.
+
+    Raises:
+        InputError: a place that cannot be written.
+    """
+    from fdi.discovery.laws import law_file
+
+    return law_file.write_law_file(law, path)
 
 
 def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:

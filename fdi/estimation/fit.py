@@ -51,7 +51,7 @@ def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = 
 def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
-        gradient, hessian = _normal_equations(now)
+        gradient, hessian = form_normal_equations(now)
         trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
         white = problem.compute_white_residuals(now.free, trials)
         costs = compute_misfit(white) + (trials**2) @ _prior_weights(now.free)
@@ -92,7 +92,7 @@ def _prior_weights(free: Sequence[Free]) -> Floats:
     return np.array([f.prior**-2 for f in free])
 
 
-def _normal_equations(fit: Fit) -> tuple[Floats, Floats]:
+def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
     heavy = fit.jacobian * compute_weights(fit.white)
     prior = _prior_weights(fit.free)

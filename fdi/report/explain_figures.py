@@ -26,13 +26,13 @@ from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.trace import Trace, rms
 
 if TYPE_CHECKING:
-
+    from fdi.discovery.laws.find_law import LawCurve
     from fdi.discovery.residual_pattern import Pattern
 
 Floats = NDArray[np.float64]
 
 AXES = {"position": (1e3, "mm"), "speed": (1e3, "mm/s"), "pressure": (1e-5, "bar"), "spool": (1e6, "um"),
-        "current": (1e3, "mA"), "time": (1.0, "s")}
+        "current": (1e3, "mA"), "time": (1.0, "s"), "spool_speed": (1e3, "mm/s"), "way": (1e3, "mm")}
 BEFORE, AFTER, HELD, FLOOR = "#9aa4b1", "#1f6feb", "#d9730d", "#2b8a3e"
 
 
@@ -141,3 +141,21 @@ def draw_pattern(p: Pattern, t: Floats) -> str:
         along.plot(*thin_line(t[:n], p.trace[:n]), color=HELD, lw=0.8)
         along.set_xlabel("time [s]")
         return to_svg(figure, "shape")
+
+
+def draw_law(c: LawCurve) -> str:
+    """What is missing over the law's first state, in bins with two standard errors, and what the law says there."""
+    with start_figure(3.2) as figure:
+        ax = figure.subplots()
+        scale, unit = AXES.get(c.state, (1e3, "mm"))
+        low, high = c.height - 2.0 * c.doubt, c.height + 2.0 * c.doubt
+        ax.fill_between(scale * c.at, low, high, color=HELD, alpha=0.25, lw=0.0, label="two standard errors")
+        ax.plot(scale * c.at, c.height, "o", color=HELD, ms=3.5, label="measured")
+        ax.plot(scale * c.at, c.law, color=AFTER, lw=1.4, label="law")
+        name = "distance since the last reversal" if c.state == "way" else c.state.replace("_", " ")
+        folded = f", folded on {scale * c.period:.4g} {unit}" if c.period else ""
+        ax.set_xlabel(f"{name} [{unit}]{folded}")
+        sign = f", times the sign of the {'speed' if c.along == 'direction' else c.along}" if c.along else ""
+        ax.set_ylabel(f"missing {c.place} [{c.unit}]{sign}", fontsize=8)
+        ax.legend(loc="best", frameon=False)
+        return to_svg(figure, "law")

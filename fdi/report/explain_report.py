@@ -11,6 +11,7 @@ from fdi.discovery.candidates import Answer, Candidate, Suspicious, Value
 from fdi.discovery.model_file import Row
 from fdi.discovery.runs import Source
 from fdi.report import explain_figures
+from fdi.report.law_report import collect_law_data, describe_law, list_law_sections
 from fdi.report.numbers import (
     NO_NUMBER,
     SIGNAL_NAMES,
@@ -54,6 +55,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("Candidates", [_tabulate_candidates(a)] if a.candidates else []),
         Section("Parameters of the missing effect", [parameters] if parameters.rows else [], medium=Medium.PAGE),
         Section("Findings", describe_findings(a)),
+        *(list_law_sections(a.law) if a.law is not None else []),
         *_show_figures(a, pattern),
         *list_suspicious(a.suspicious),
         Section("What this test cannot detect", [_tabulate_blind(a)] if a.blind else [], medium=Medium.PAGE),
@@ -167,6 +169,8 @@ def describe_findings(a: Answer) -> list[Line]:
         lines.append(Line("to discriminate", "no sensor and no command that was tried discriminates between them"))
     if a.pattern:
         lines.append(Line("residual", a.pattern))
+    if a.law is not None:
+        lines += describe_law(a.law)
     if a.suspicious:
         lines.append(Line("suspicious", describe_suspicious(a.suspicious)))
     lines += [Line("held-out run", text) for text in _describe_undecided(a)]
@@ -319,6 +323,8 @@ def collect_data(a: Answer) -> dict[str, Any]:
     held = e.unseen.get(a.best.effects)
     if held is not None and held.decided:
         data["undecided"] = {"share": held.undecided, "holdout": dict(held.decided)}
+    if a.law is not None:
+        data["law_search"] = collect_law_data(a.law, a.law_effects)
     if e.excerpt:
         data["excerpt"] = e.excerpt
     if len(e.effects) > 1 and e.verdict != "AMBIGUOUS":

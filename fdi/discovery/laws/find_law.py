@@ -1,0 +1,453 @@
+"""A sparse law for what no effect of the catalogue explains: proposed by regression, chosen and judged by replay.
+
+Terms join the law one by one. Regressions on the balances propose them; replays of the whole plant rank them; a term
+stays if it lowers the error of pieces of the run that its fit did not see. The held-out run then judges the law, and
+takes no part in its choice.
+"""
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.discovery.balance import EDGE, Balance, States, compute_balances
+from fdi.discovery.laws.dependence import Dependence, find_dependences
+from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
+from fdi.discovery.laws.regression import THINNED, Proposal, evaluate_columns, propose_terms, select_rows
+from fdi.discovery.laws.terms import Term, find_states
+from fdi.discovery.scan import absorb_shift, prepare_slope
+from fdi.discovery.search import Hypothesis, Search
+from fdi.estimation.fit import Fit, continue_fit, form_normal_equations, linearise, step_within_bounds
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.unknowns import silence_readings
+from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import (
+    EFFECT_INTERVAL_FACTOR,
+    EFFECT_SYSTEMATIC_SD,
+    ERROR_PARTLY_EXPLAINED,
+    FURTHER_EFFECT_SHARE,
+    GAIN_CONVINCES,
+    GAIN_TIE,
+    INTERVAL_95_SD,
+    PATTERN_VISIBLE_RATIO,
+    WHITE_SQUARE_POOR,
+)
+from fdi.trace.trace import Trace
+
+Floats = NDArray[np.float64]
+
+MOST_TERMS = 3
+PROPOSED = 14  # terms of each balance that a replay looks at
+FITTED = 5  # that get a fit
+SIZES = (0.3, 0.6, 1.0, 1.5)  # times the regression's coefficient: the tolerances of the base fit hide a part of it
+FOLD_SECONDS = 0.7  # pieces of a run that go to the two halves in turn
+SCREENED = ("position", "speed", "pressure", "spool", "current", "command", "direction", "way", "time")
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Terms fitted by replay: `cost` on the whole run, `unseen` on pieces left out of the fit."""
+
+    terms: tuple[Term, ...]
+    fit: Fit
+    unseen: float = np.inf
+
+    @property
+    def cost(self) -> float:
+        """-2 log likelihood with priors."""
+        return self.fit.cost
+
+    @property
+    def size(self) -> int:
+        """Number of the law's parameters."""
+        return sum(len(t.fields) for t in self.terms)
+
+
+@dataclass(frozen=True)
+class LawValue:
+    """A parameter of a law with its 95 % interval, SI."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A law and how it does: RMS errors in SI units, by signal."""
+
+    terms: tuple[Term, ...]
+    values: Mapping[str, LawValue]  # by field
+    holds: bool
+    reason: str  # why it holds, or why not
+    hypothesis: Hypothesis
+    holdout: Mapping[str, float]
+    equals: tuple[str, ...] = ()  # terms that would do as well as the first one
+
+
+@dataclass(frozen=True, eq=False)
+class Missing:
+    """One balance: how much is missing there, and what it follows."""
+
+    balance: Balance
+    visible: bool
+    dependences: tuple[Dependence, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LawCurve:
+    """What is missing over a state, in bins, and what the law says there: (k,) each."""
+
+    place: str
+    unit: str
+    state: str
+    along: str  # "" or the state whose sign both curves are multiplied by
+    period: float  # of a wave, on which the state is folded; 0 for none
+    at: Floats
+    height: Floats
+    doubt: Floats  # standard error of the height
+    law: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class LawSearch:
+    """What a search for a law found."""
+
+    missing: tuple[Missing, ...]
+    hidden: Mapping[str, str]  # balances that the measured signals do not show, with the reason
+    law: Law | None
+    base: Hypothesis  # without the law
+    catalogue: Hypothesis | None  # the catalogue's best
+    holdout: Mapping[str, Mapping[str, float]]  # errors of "base" and "catalogue" on the held-out run
+    floor: Mapping[str, float]
+    curve: LawCurve | None = None
+
+
+HIDDEN = {"force": ("p12", "a missing force and a missing flow look alike without P12"),
+          "current": ("xs", "the current balance needs XS")}
+"""Balances that need a signal, and why."""
+
+
+def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, holdout: Trace | None,
+             floor: Mapping[str, float], progress: Progress = ignore_progress) -> LawSearch:
+    """The sparse law that explains the residual of `base`, if there is one that holds.
+
+    Args:
+        search: the runs, with the steps of its last fits.
+        base: the model without the law.
+        catalogue: the best that the catalogue can do; the law must do better.
+        holdout: a run of another command; it judges the law and takes no part in its choice.
+        floor: noise floor of each signal, SI.
+        progress: called with each stage and the share done.
+    """
+    progress("which states the residual follows", 0.85)
+    unseen = _make_unseen_problem(search, holdout) if holdout is not None else None
+    balances, states = compute_balances(search, base, floor=floor)
+    there = compute_balances(search, base, unseen, floor) if unseen is not None else None
+    missing = tuple(_describe_balance(b, states, there) for b in balances)
+    outputs = search.problem.trace.outputs
+    hidden = {place: why for place, (signal, why) in HIDDEN.items()
+              if signal not in outputs and any(b.place == place for b in balances)}
+    places = [m.balance.place for m in missing if m.balance.place not in hidden]
+    with registered_library():
+        worker = _Worker(search, base, places, floor)
+        trial, equals = worker.choose_terms(progress)
+        law = None
+        if trial is not None:
+            progress("last fit of the law", 0.93)
+            law = worker.judge_law(trial, equals, catalogue, holdout, floor)
+    errors = {}
+    if holdout is not None:
+        errors = {name: _measure(search, h, holdout) for name, h in (("base", base), ("catalogue", catalogue)) if h}
+    curve = None if law is None else draw_curve(law, balances, states, search, base)
+    return LawSearch(missing, hidden, law, base, catalogue, errors, floor, curve)
+
+
+def _describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
+    if b.ratio < PATTERN_VISIBLE_RATIO:
+        return Missing(b, False)
+    unseen = None
+    if there is not None:
+        same = next(other for other in there[0] if other.place == b.place)
+        unseen = _screen_rows(same, there[1])
+    return Missing(b, True, tuple(find_dependences(*_screen_rows(b, states), unseen)))
+
+
+def _screen_rows(b: Balance, states: States) -> tuple[Floats, dict[str, Floats]]:
+    inner = np.arange(EDGE, len(b.missing) - EDGE, THINNED)
+    inner = inner[b.smooth[inner]]
+    y = b.missing[inner]
+    return (np.clip(y, *np.percentile(y, [0.5, 99.5])), {name: getattr(states, name)[inner] for name in SCREENED})
+
+
+def _make_unseen_problem(search: Search, trace: Trace) -> Problem:
+    return replace(search.problem, trace=trace, also=(), _lanes={})
+
+
+def _measure(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
+    """RMS residual of the typical block of a held-out run, SI."""
+    left = _make_unseen_problem(search, trace).compute_residuals(h.fit.free, h.fit.x[None])[0]
+    return dict(zip(trace.outputs, compute_typical_rms(left).tolist(), strict=True))
+
+
+def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:
+    """Squared error above the squared floor, summed over the signals, in squared floors."""
+    return float(sum(max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in errors.items()))
+
+
+class _Ranked(NamedTuple):
+    """A proposal at a size on top of a fit: `cost` after the fit's unknowns, (p,), have moved to `x`."""
+
+    cost: float
+    proposal: Proposal
+    factor: float
+    fit: Fit
+    x: Floats
+
+
+class _Worker:
+    """The replays of one search: a problem with quick steps for each set of balances that the law has terms of."""
+
+    def __init__(self, search: Search, base: Hypothesis, places: Sequence[str], floor: Mapping[str, float]) -> None:
+        self.search, self.base, self.places, self.floor = search, base, places, floor
+        self._problems: dict[tuple[str, ...], Problem] = {}
+
+    def problem(self, terms: Sequence[Term], more: str = "") -> Problem:
+        """The run with quick steps, and a plant that has the terms' balances in its library."""
+        places = tuple(sorted({t.place for t in terms} | ({more} if more else set())))
+        if places not in self._problems:
+            own = self.search.problem
+            effects = [*self.base.effects, *(LIBRARY[p] for p in places)]
+            model = silence_readings(self.search.model.with_effects(effects))
+            self._problems[places] = replace(own, model=model, bare=None, steps=10, also=(), workers=1, _lanes={})
+        return self._problems[places]
+
+    def choose_terms(self, progress: Progress) -> tuple[Trial | None, tuple[str, ...]]:
+        """Terms added one by one as long as left-out pieces of the run want them, and what would do as well."""
+        start = continue_fit(self.problem(()), linearise(self.problem(()), self.base.fit.free, self.base.fit.x), 2)
+        now = Trial((), start)
+        now = replace(now, unseen=self.measure_unseen(now))
+        equals: tuple[str, ...] = ()
+        samples = float(np.isfinite(self.search.problem.trace.measurements).sum())
+        for count in range(MOST_TERMS):
+            if now.fit.misfit < WHITE_SQUARE_POOR * samples:
+                break  # only noise is left
+            progress(f"looking for term {count + 1} of a law", 0.86 + 0.02 * count)
+            tried = self.add_each_term(now)
+            if not tried or tried[0].cost > now.cost - GAIN_CONVINCES:
+                break
+            close = [t for t in tried if t.cost < tried[0].cost + 0.1 * (now.cost - tried[0].cost)][:3]
+            judged = self.search.map_parallel(lambda t: replace(t, unseen=self.measure_unseen(t)), close)
+            best = min(judged, key=lambda t: t.unseen + GAIN_TIE * t.size)
+            gain = now.unseen - best.unseen
+            if gain < max(GAIN_CONVINCES, FURTHER_EFFECT_SHARE * (now.unseen - samples)):
+                break
+            if count == 0:
+                equals = tuple(t.terms[-1].name for t in judged if t is not best
+                               and t.unseen < best.unseen + GAIN_TIE)
+            now = best
+        if len(now.terms) > 1:
+            now = self.drop_terms(now)
+        return (now, equals) if now.terms else (None, ())
+
+    def add_each_term(self, now: Trial) -> list[Trial]:
+        """The law with one more term, the promising ones fitted, best first.
+
+        Tolerances that have moved to make up for what is missing hide it: proposals come from the healthy unit too.
+        """
+        problem = self.problem(now.terms)
+        known = np.array([np.isfinite(f.prior) for f in now.fit.free])
+        healthy = linearise(problem, now.fit.free, np.where(known, 0.0, now.fit.x))
+        ranked: list[_Ranked] = []
+        for fit in (now.fit, healthy):
+            ranked += self.rank_terms(now.terms, fit)
+        best: dict[str, _Ranked] = {}
+        for each in sorted(ranked, key=lambda r: r.cost):
+            best.setdefault(each.proposal.term.name, each)
+        worth = [each for each in best.values() if each.cost < now.cost - GAIN_CONVINCES][:FITTED]
+        fits = self.search.map_parallel(lambda each: self.fit_term(now.terms, each), worth)
+        return sorted(fits, key=lambda t: t.cost)
+
+    def rank_terms(self, terms: tuple[Term, ...], fit: Fit) -> list[_Ranked]:
+        """Every proposal on top of a fit, with what a replay says that it would leave."""
+        worker = copy.copy(self.search)
+        worker.problem = replace(self.problem(terms), workers=self.search.workers)
+        balances, states = compute_balances(worker, Hypothesis(self.base.effects, fit, {}), floor=self.floor)
+        ranked: list[_Ranked] = []
+        for b in balances:
+            if b.place in self.places:
+                rows = select_rows(b, states, {**worker.problem.model.values, **fit.values})
+                proposals = propose_terms(b.place, rows, terms)[:PROPOSED]
+                ranked += self.rank_by_replay(terms, fit, b.place, proposals)
+        return ranked
+
+    def rank_by_replay(self, terms: Sequence[Term], fit: Fit, place: str, proposals: Sequence[Proposal]
+                       ) -> list[_Ranked]:
+        """Cost of each proposal at each of `SIZES`, after the tolerances have moved linearly."""
+        if not proposals:
+            return []
+        problem = self.problem(terms, place)
+        tried = [(p, factor) for p in proposals for factor in SIZES]
+        own = [{name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0) for f, v in p.values.items()}
+               for p, factor in tried]
+        names = list(dict.fromkeys([f.name for f in fit.free] + [n for values in own for n in values]))
+        usual = {n: problem.model.values[n] for n in names} | fit.values
+        rows = np.array([[values.get(n, usual[n]) for n in names] for values in own])
+        steep = prepare_slope(fit)
+
+        def rank_rows(part: NDArray[np.int64]) -> list[_Ranked]:
+            white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
+            shifted = [absorb_shift(fit, steep, w, set(), fit.x) for w in white]
+            return [_Ranked(cost, tried[i][0], tried[i][1], fit, x)
+                    for i, (cost, x) in zip(part.tolist(), shifted, strict=True)]
+
+        parts = np.array_split(np.arange(len(rows)), max(1, -(-len(rows) // 16)))
+        return [each for several in self.search.map_parallel(rank_rows, parts) for each in several
+                if np.isfinite(each.cost)]
+
+    def fit_term(self, terms: tuple[Term, ...], r: _Ranked) -> Trial:
+        """The law with one more term, fitted with all tolerances from where the ranking has left them, or before it."""
+        terms = (*terms, r.proposal.term)
+        problem = self.problem(terms)
+        free = (*r.fit.free, *_make_unknowns(r.proposal, r.factor))
+        added = np.zeros(len(free) - len(r.fit.free))
+        begun = [linearise(problem, free, np.concatenate([x, added])) for x in (r.x, r.fit.x)]
+        fits = [continue_fit(problem, fit, 2) for fit in begun]
+        return Trial(terms, continue_fit(problem, min(fits, key=lambda fit: fit.cost), 4))
+
+    def drop_terms(self, now: Trial) -> Trial:
+        """The law without the terms that left-out pieces of the run do not want."""
+        while len(now.terms) > 1:
+            shorter = [replace(t, unseen=self.measure_unseen(t))
+                       for t in self.search.map_parallel(partial(self.fit_without, now), now.terms)]
+            best = min(shorter, key=lambda t: t.unseen)
+            if best.unseen > now.unseen + GAIN_CONVINCES:
+                break
+            now = best
+        return now
+
+    def fit_without(self, now: Trial, gone: Term) -> Trial:
+        """The law without a term."""
+        terms = tuple(t for t in now.terms if t is not gone)
+        own = {name_parameter(gone, f) for f in gone.fields}
+        kept = np.array([f.name not in own for f in now.fit.free])
+        free = tuple(f for f, keep in zip(now.fit.free, kept, strict=True) if keep)
+        problem = self.problem(terms)
+        return Trial(terms, continue_fit(problem, linearise(problem, free, now.fit.x[kept]), 5))
+
+    def measure_unseen(self, t: Trial) -> float:
+        """-2 log likelihood of each half of the run's pieces under a fit to the other half, one step from the whole."""
+        problem, white = self.problem(t.terms), t.fit.white
+        piece = np.arange(white.shape[1]) // max(round(FOLD_SECONDS / problem.trace.period), 1)
+        total = 0.0
+        for half in (0, 1):
+            mask = (piece % 2 == half).astype(float)
+            fitted = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
+            gradient, hessian = form_normal_equations(fitted)
+            x = step_within_bounds(fitted, hessian, gradient, 1e-3)
+            there = problem.compute_white_residuals(t.fit.free, x[None]) * (1.0 - mask)
+            total += float(compute_misfit(there)[0])
+        return total
+
+    def judge_law(self, t: Trial, equals: tuple[str, ...], catalogue: Hypothesis | None, holdout: Trace | None,
+                  floor: Mapping[str, float]) -> Law:
+        """The law with last fits, fine steps and repeats, judged on the held-out run."""
+        last = copy.copy(self.search)
+        model = self.problem(t.terms).model
+        last.problem = replace(self.search.problem, model=model, bare=None, _lanes={})
+        last.fine = replace(last.problem, steps=(self.search.fine or last.problem).steps, _lanes={})
+        last.repeats = [replace(p, model=model, bare=None, _lanes={}) for p in self.search.repeats]
+        h = last.finish_hypothesis(last.judge_fit(self.base.effects, t.fit), 2)
+        h = last.judge_on_all([h], last.problem.steps)[0]
+        values = {f: _read_value(h.fit, name_parameter(term, f), unit)
+                  for term in t.terms for f, unit in zip(term.fields, term.units, strict=True)}
+        left = _measure(last, h, holdout) if holdout is not None else {}
+        holds, reason = self.decide(h, left, catalogue, holdout, floor)
+        return Law(t.terms, values, holds, reason, h, left, equals)
+
+    def decide(self, h: Hypothesis, left: Mapping[str, float], catalogue: Hypothesis | None, holdout: Trace | None,
+               floor: Mapping[str, float]) -> tuple[bool, str]:
+        """Whether the law holds, and why."""
+        before, after = (measure_excess(each.errors, floor) for each in (self.base, h))
+        if after > ERROR_PARTLY_EXPLAINED**2 * before:
+            return False, "the law lowers the error of its own run too little"
+        if holdout is None:
+            return True, "no held-out run: judged on pieces of the run that its fit did not see"
+        unseen = measure_excess(left, floor)
+        bare = measure_excess(_measure(self.search, self.base, holdout), floor)
+        if unseen > ERROR_PARTLY_EXPLAINED**2 * bare:
+            return False, "the law does not lower the error of the held-out run"
+        if catalogue is not None and unseen > measure_excess(_measure(self.search, catalogue, holdout), floor):
+            return False, "an effect of the catalogue does better on the held-out run"
+        return True, "the held-out run, which took no part in the choice, confirms the law"
+
+
+def _make_unknowns(p: Proposal, factor: float) -> list[Free]:
+    """The parameters of a term as unknowns, centred where they begin."""
+    free = []
+    for name, value in p.values.items():
+        full = name_parameter(p.term, name)
+        if name == p.term.name:
+            free.append(Free(full, factor * value, abs(value), np.inf, -np.inf, np.inf, 0.05))
+        elif name.endswith("_phase"):
+            free.append(Free(full, value, 0.3, np.inf, -100.0, 100.0, 0.1))
+        else:
+            step = 0.01 if p.term.is_wave else 0.1
+            free.append(Free(full, value, value, np.inf, value / 4.0, 4.0 * value, step))
+    return free
+
+
+def _read_value(fit: Fit, name: str, unit: str) -> LawValue:
+    value = fit.values[name]
+    half = INTERVAL_95_SD * float(np.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(name), EFFECT_SYSTEMATIC_SD * value))
+    return LawValue(value, value - half, value + half, unit)
+
+
+def draw_curve(law: Law, balances: Sequence[Balance], states: States, search: Search, base: Hypothesis) -> LawCurve:
+    """Bin means of what is missing under the model without the law, and of the law, over the first term's state."""
+    term = law.terms[0]
+    balance = next(b for b in balances if b.place == term.place)
+    rows = select_rows(balance, states, {**search.problem.model.values, **base.fit.values})
+    along = {"damping": "speed", "dry": "direction", "conductance": "pressure", "area": "speed"}.get(term.part, "")
+    own = find_states(term)
+    state = own[0] if own else (along or "time")
+    state = "speed" if state == "direction" else state
+    is_odd = bool(along) and state != along and not (along == "direction" and state == "speed")
+    side = np.sign(rows.states[along]) if is_odd else 1.0
+    said = side * evaluate_law(law, term.place, rows.states)
+    x, period = rows.states[state], 0.0
+    if term.is_wave and term.shape is not None:
+        shape = law.values[f"{term.name}_{term.shape.name}"].value
+        period = shape if term.shape.kind == "period" else 1.0 / shape
+        x = np.mod(x, period)
+    bins = 24
+    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)))
+    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
+    curves = [average_bins(place, len(edges) - 1, column) for column in (x, side * rows.missing, said)]
+    return LawCurve(term.place, balance.unit, state, along if is_odd else "", period, curves[0][0], curves[1][0],
+                    curves[1][1], curves[2][0])
+
+
+def average_bins(place: NDArray[np.int64], bins: int, y: Floats, neighbours: int = 20) -> tuple[Floats, Floats]:
+    """Means of `y` (n,) in bins, and their standard errors where so many neighbouring rows are alike: (bins,) each."""
+    count = np.maximum(np.bincount(place, minlength=bins), 1)
+    mean = np.bincount(place, y, bins) / count
+    group = (np.arange(len(y)) // neighbours) * bins + place
+    sums = np.bincount(group, y - mean[place], (len(y) // neighbours + 1) * bins).reshape(-1, bins)
+    return mean, np.sqrt((sums**2).sum(axis=0)) / count
+
+
+def evaluate_law(law: Law, place: str, at: Mapping[str, Floats]) -> Floats:
+    """What the law says is missing in a balance, (n,), along measured states."""
+    total = np.zeros(len(at["time"]))
+    for term in law.terms:
+        if term.place == place:
+            values = {f: law.values[f].value for f in term.fields}
+            total += values[term.name] * evaluate_columns(term, values, at)[:, 0]
+    return total

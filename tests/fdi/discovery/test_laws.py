@@ -1,0 +1,236 @@
+"""Laws outside the catalogue: terms that regressions propose, replays choose and a held-out run judges."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from effect_files import HEAD, restored_catalogue
+from short_runs import STEPS, build_command, build_other_command
+
+from fdi.discovery.balance import Balance, States, measure_way
+from fdi.discovery.laws.dependence import find_dependences
+from fdi.discovery.laws.effect_source import format_formula, write_effects, write_law
+from fdi.discovery.laws.find_law import LawSearch, find_law
+from fdi.discovery.laws.law_file import write_law_file
+from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
+from fdi.discovery.laws.regression import evaluate_columns, propose_terms, select_rows
+from fdi.discovery.laws.terms import PARTS, STATES, TERMS, find_states
+from fdi.discovery.runs import collect_runs
+from fdi.discovery.search import Search
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+from plant.effects import CATALOGUE, combine_laws, load_effects
+from plant.state import Drag, Input, Line, State
+
+BY_NAME = {term.name: term for term in TERMS}
+
+
+def draw_states(seed: int = 0, n: int = 6000) -> dict[str, np.ndarray]:
+    """States as a run might have them: smooth, of usual sizes."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) * 1e-3
+
+    def wander(size: float) -> np.ndarray:
+        waves = [rng.normal() * np.sin(2 * np.pi * rng.uniform(0.1, 3.0) * t + rng.uniform(0, 6)) for _ in range(8)]
+        return size * np.sum(waves, axis=0) / 2.0
+
+    position = wander(4e-3)
+    speed = np.gradient(position, 1e-3)
+    return {"position": position, "speed": speed, "pressure": wander(3e6), "spool": wander(2e-4),
+            "current": wander(2e-3), "time": t, "spool_speed": wander(1e-2), "command": wander(4e-3),
+            "direction": np.clip(speed / 2e-4, -1.0, 1.0), "way": measure_way(position, speed),
+            "acceleration": np.gradient(speed, 1e-3)}
+
+
+def test_terms_are_well_formed() -> None:
+    names = [field for term in TERMS for field in term.fields]
+    assert len(names) == len(set(names)), "each field names one parameter"
+    for term in TERMS:
+        assert set(find_states(term)) <= set(STATES) and term.part in PARTS
+        assert (term.shape is None) == ("{" not in term.factor)
+
+
+@pytest.mark.parametrize("name", ["spring_difference", "cogging", "drag_square", "friction_pressure", "contact",
+                                  "friction_run_in", "leakage_root", "leakage_slope", "flow_square", "feedback_cube",
+                                  "dead_band", "gain_drift", "ripple"])
+def test_the_regression_ranks_the_right_term_first(name: str) -> None:
+    term, states = BY_NAME[name], draw_states()
+    rng = np.random.default_rng(1)
+    values: dict[str, float] = {name: 1.0}
+    if term.shape is not None:
+        usual = {"position": 2.1e-3, "current": 8e-4, "time": 37.25, "way": 8e-4}
+        values[f"{name}_{term.shape.name}"] = usual[term.shape.state]
+    if term.is_wave:
+        values[f"{name}_phase"] = 0.7
+    column = evaluate_columns(term, values, states)[:, 0]
+    missing = column / column.std() + 0.3 * rng.standard_normal(len(column))
+    balance = Balance(term.place, "N", missing, 0.3, 3.0, np.ones(len(missing), bool))
+    rows = select_rows(balance, States(**states), {**Model().values, "jack.area": 1e-9})
+    best = propose_terms(term.place, rows)[0]
+    assert best.term.name == name
+    assert best.values[name] * column.std() == pytest.approx(1.0, rel=0.15)
+    for field, value in values.items():
+        if field.endswith(("length", "frequency")) and term.is_wave:
+            assert best.values[field] == pytest.approx(value, rel=0.03)
+
+
+def test_what_the_residual_follows_is_tested_on_rows_that_the_curve_never_saw() -> None:
+    states, other = draw_states(2), draw_states(3)
+    names = ("position", "speed", "pressure", "spool", "current")
+    rng = np.random.default_rng(5)
+    there = {name: states[name] for name in names}
+    unseen = {name: other[name] for name in names}
+    noise = rng.standard_normal(len(states["time"]))
+    product = there["position"] * there["pressure"] / 1e4
+    held = unseen["position"] * unseen["pressure"] / 1e4
+    found = find_dependences(product + 0.3 * product.std() * noise, there, (held, unseen))
+    assert found[0].states == ("position", "pressure") and found[0].share > 0.5
+    assert found[0].holdout is not None and found[0].holdout > 0.4 and found[0].p_value < 0.02
+    coloured = np.convolve(noise, np.ones(200), "same")
+    assert find_dependences(coloured, there, None)[0].p_value > 0.05, "slow noise follows nothing"
+
+
+SIZES = {"cogging": 400.0, "cogging_length": 2e-3, "cogging_phase": 0.3, "drag_square": 3e5, "friction_run_in": 200.0,
+         "friction_run_in_length": 1e-3, "flow_square": 200.0, "leakage_outer": 2e-9, "area_slope": 0.02,
+         "dead_band": 0.4, "dead_band_width": 2e-4, "feedback_cube": 1e6}
+LAWS = {"force": ("cogging", "drag_square", "friction_run_in"), "flow": ("flow_square", "leakage_outer", "area_slope"),
+        "current": ("dead_band", "feedback_cube")}
+
+
+@pytest.mark.parametrize("place", LIBRARY)
+def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) -> None:
+    """Bit for bit: what was chosen with the library is what the file adds; at its off values it changes no bit."""
+    terms = [BY_NAME[name] for name in LAWS[place]]
+    values = {field: SIZES[field] for term in terms for field in term.fields}
+    states = draw_states(7, 300)
+    with registered_library(), restored_catalogue():
+        (tmp_path / "law.py").write_text(write_effects({place: "own_law"}, terms, values, "A law."))
+        assert load_effects(tmp_path / "law.py") == ["own_law"]
+        library = Model().with_effects([LIBRARY[place]]).replace(
+            {name_parameter(t, f): values[f] for t in terms for f in t.fields})
+        own = Model().with_effects(["own_law"])
+        models = [library, own.replace({f"own_law.{f}": v for f, v in values.items()}), own]
+        signal = {"force": Drag(0.0, 0.0, 800.0, 500.0), "flow": Line(1e6, 2e9, 2e7, 1e6), "current": 3e-4}[place]
+        outputs: list[list[object]] = []
+        for model in models:
+            record, port = model.build_record()[0], CATALOGUE[model.effects[0]].port
+            law, memory = combine_laws(port, model.effects)
+            outputs.append([])
+            for k in range(300):
+                s = State(spool_position=states["spool"][k], spool_speed=states["spool_speed"][k],
+                          jack_position=states["position"][k], jack_speed=states["speed"][k],
+                          pressure=states["pressure"][k])
+                x, memory = law(signal, memory, s, Input(current=states["current"][k], t=1e-3 * k, h=1e-3), record)
+                outputs[-1].append(x)
+    assert outputs[0] == outputs[1] and outputs[1] != outputs[2]
+    assert all(x == signal for x in outputs[2])
+
+
+def test_a_law_reads_as_a_formula() -> None:
+    assert format_formula([BY_NAME["drag_square"]]) == "force + drag_square * abs(speed) * speed"
+    assert format_formula([BY_NAME["contact"]]) == \
+        "force + contact * (max(position - contact_gap, 0.0) - max(-position - contact_gap, 0.0))"
+    text = write_law("own", [BY_NAME["cogging"]], {"cogging": 700.0, "cogging_length": 2e-3, "cogging_phase": 0.1})
+    assert '@effect("load", Own,' in text and 'Quantity("N", low=0, high=10000)' in text
+    assert 'Quantity("m", low=0.0004, high=0.01)] = 0.002' in text
+
+
+HIDDEN = HEAD + '''
+from plant.state import Drag, Line
+
+class Hidden(NamedTuple):
+    size: Annotated[float, Quantity("1")] = 0.0
+
+@effect("{port}", Hidden, law="hidden")
+def hidden_law(x, s, u, p):
+    size = p.hidden_law.size
+    return {law}
+'''
+
+
+class Outside(NamedTuple):
+    """A law outside the catalogue: where it acts, what it does, the term that it is, and its size."""
+
+    port: str
+    law: str
+    term: str
+    size: float
+
+
+OUTSIDE: Mapping[str, Outside] = {
+    "cogging": Outside("load", "x + size * sin(2.0 * pi * s.jack_position / 1.1e-3 + 0.5)", "cogging", 900.0),
+    "cubic feedback spring": Outside("current", "x - size * s.spool_position ** 3", "feedback_cube", 2e6),
+    "quadratic drag": Outside("jack_drag", "Drag(x.force, x.damping + size * abs(s.jack_speed), x.static, x.dynamic)",
+                              "drag_square", 6e5),
+    "stiffness of one side": Outside("load", "x + size * abs(s.jack_position)", "spring_difference", 6e5),
+    "friction that grows with the pressure": Outside(
+        "jack_drag", "Drag(x.force, x.damping, x.static + size * abs(s.pressure), x.dynamic + size * abs(s.pressure))",
+        "friction_pressure", 3e-4),
+    "dead band of the current": Outside("current", "x - size * min(max(u.current, -3e-4), 3e-4)", "dead_band", 0.3),
+    "displacement that grows along the stroke": Outside(
+        "valve", "Line(x.offset, x.slope * (1.0 + size / p.jack.area * s.jack_position), x.limit, x.drive)",
+        "area_slope", 0.05),
+}
+QUICK = ("cogging",)
+
+
+def find_hidden(port: str, law: str, size: float, tmp_path: Path) -> LawSearch:
+    """The search for a law on short runs of a plant with a law of our own; white noise of the sensors."""
+    (tmp_path / "hidden.py").write_text(HIDDEN.format(port=port, law=law))
+    with restored_catalogue():
+        load_effects(tmp_path / "hidden.py")
+        model = Model().replace({"hidden_law.size": size})
+        traces = []
+        for seed, com in enumerate((build_command(), build_command(), build_other_command()), 1):
+            columns = simulate(model, com, None, seed, STEPS)
+            traces.append(Trace.from_columns(columns._asdict(), 1e-3, {}))
+    runs = collect_runs(Model(), traces[0], traces[1:2], traces[2])
+    search = Search(runs.model, runs.est, runs.repeats, [])
+    base = search.fit_base()
+    search.learn_noise(base)
+    search.refine_steps(10, 20)
+    base = search.judge_fit((), base.fit)
+    return find_law(search, base, None, runs.holdout, search.estimate_floor(base))
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+                                  for name in OUTSIDE])
+def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> None:
+    outside = OUTSIDE[name]
+    found = find_hidden(outside.port, outside.law, outside.size, tmp_path)
+    print(name, describe_search(found))
+    assert found.law is not None and found.law.holds, found.law
+    assert [term.name for term in found.law.terms] == [outside.term]
+    for signal, error in found.law.holdout.items():
+        assert error < 1.2 * found.floor[signal]
+    worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
+    assert found.law.hypothesis.errors[worst] < 0.5 * found.base.errors[worst]
+    value = found.law.values[outside.term]
+    assert value.low < outside.size < value.high
+    with restored_catalogue():
+        names = write_law_file(found.law, tmp_path / "law.py")
+        assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{found.law.terms[0].place}"]
+        assert CATALOGUE[names[found.law.terms[0].place]].starts
+
+
+def describe_search(found: LawSearch) -> str:
+    """A row of the table in docs/laws.md."""
+    worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
+    floor = found.floor[worst]
+    if found.law is None:
+        return f"{worst}: {found.base.errors[worst] / floor:.2f} floors, no law"
+    values = ", ".join(f"{f} {v.value:.4g} ({v.low:.4g} to {v.high:.4g})" for f, v in found.law.values.items())
+    return (f"{worst}: {found.base.errors[worst] / floor:.2f} -> {found.law.hypothesis.errors[worst] / floor:.2f}, "
+            f"held-out {found.holdout['base'][worst] / floor:.2f} -> {found.law.holdout[worst] / floor:.2f} floors; "
+            f"{values}; holds {found.law.holds}: {found.law.reason}")
+
+
+def test_a_healthy_run_has_no_law(tmp_path: Path) -> None:
+    found = find_hidden("load", "x + size", 0.0, tmp_path)
+    assert found.law is None
+    assert not any(m.visible for m in found.missing)
+
+
