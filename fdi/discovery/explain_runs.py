@@ -63,9 +63,11 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
 
 
 def look_for_law(explanation: Explanation, holdout: Trace | None, progress: Progress) -> LawSearch | None:
-    """The law behind what the catalogue leaves; None where it leaves nothing."""
+    """The law behind what the catalogue leaves; None where it leaves nothing, and for plants driven by a pump."""
     if explanation.verdict not in PATTERN_VERDICTS or explanation.base.is_at_floor:
         return None
+    if explanation.search.model.plant != "eha":
+        return None  # the terms have been tried on the reference model's balances only
     from fdi.discovery.laws.law_file import find_law_beside  # takes half a second to import
 
     return find_law_beside(explanation, holdout, progress)
