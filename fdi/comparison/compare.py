@@ -22,6 +22,7 @@ from fdi.comparison.residuals import (
 )
 from fdi.estimation.noise import Floor, find_floors, sensor_floors, simulate_reading_noise
 from fdi.estimation.preparation import Repeat, align_columns, find_repeat, match_period, prepare_trace
+from fdi.estimation.repeat_noise import describe_doubtful_repeats
 from fdi.estimation.replay import (
     Columns,
     Replay,
@@ -41,7 +42,6 @@ from fdi.thresholds import (
     LAG_MISFIT_RATIO,
     LOWER_BOUND_ERROR_RATIO,
     REPEAT_DIFFERENCE_RATIO,
-    REPEAT_FLOOR_RATIO,
     SECTION_ERROR_SD,
     SIGNAL_ERROR_RATIO,
     SOLVER_HIDES_RATIO,
@@ -129,7 +129,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
     table = {name: _measure_signal(name, r, floor[name], noise[name], closed[name], replay)
              for name, r in judged.items()}
-    doubtful = _describe_doubtful_repeats(floor, noise)
+    doubtful = describe_doubtful_repeats(floor, noise)
     progress("blocks", 4 / STAGES)
     ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, found, noise)
     progress("where", 5 / STAGES)
@@ -158,19 +158,6 @@ def _find_undecided(replay: Replay) -> NDArray[np.bool_]:
     """Rows that hang on a knife's edge, unless that is half the trace."""
     out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     return out
-
-
-def _describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor]) -> str:
-    """What makes a noise floor from repeats larger than the sensors' own noise explains; empty if nothing does."""
-    def limit(name: str) -> float:  # the data's own noise is a lower bound: coloured noise has less of it
-        return REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if noise[name].lower_bound else 1.0)
-
-    above = [f"{SIGNALS[name].symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
-             if f.source == "repeats" and f.value > limit(name) * noise[name].value]
-    if not above:
-        return ""
-    return (f"the repeats differ by more than the noise of the sensors: {', '.join(above)} times. Use repeats of the "
-            "same unit; if its sensors are so noisy, set sensors.*_noise of the model")
 
 
 def _measure_signal(name: str, residual: Floats, floor: Floor, noise: Floor, closed: Floats,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.estimation.preparation import SAME_PERIOD, align_repeat, find_repeat, hold_inputs, match_period, prepare_trace
+from fdi.estimation.repeat_noise import check_repeats
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -65,7 +66,8 @@ def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Sourc
     model = match_period(model, est, SAME_PERIOD)
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
     unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
-    return Runs(model, est, others, unseen, tuple(sources), est.notes)
+    doubt = check_repeats(est, others, model) if model.plant == "eha" else ""
+    return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
 
 
 def hash_columns(trace: Trace) -> str:

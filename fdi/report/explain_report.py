@@ -63,7 +63,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
     notes = [*notes, *([a.explanation.excerpt] if a.explanation.excerpt else [])]
     return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
-                  next_command, files, collect_data(a))
+                  next_command, files, collect_data(a, notes))
 
 
 def describe_verdict(a: Answer) -> str:
@@ -309,8 +309,8 @@ def _tabulate_blind(a: Answer) -> Table:
                  "Tolerances of a healthy unit make up for these effects, so this test says nothing about them.")
 
 
-def collect_data(a: Answer) -> dict[str, Any]:
-    """The answer of `rig explain --json`; SI units."""
+def collect_data(a: Answer, notes: Sequence[str] = ()) -> dict[str, Any]:
+    """The answer of `rig explain --json`, with notes on the runs; SI units."""
     e = a.explanation
     data: dict[str, Any] = {
         "verdict": e.verdict, "effects": list(e.effects), "candidates": [_candidate_data(c) for c in a.candidates],
@@ -319,7 +319,8 @@ def collect_data(a: Answer) -> dict[str, Any]:
                       "usual": b.usual, "revealed_by": b.revealed_by} for b in a.blind],
         "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
         "separate": dict(a.separate), "pattern": a.pattern,
-        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor}}
+        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor},
+        "notes": list(notes)}
     held = e.unseen.get(a.best.effects)
     if held is not None and held.decided:
         data["undecided"] = {"share": held.undecided, "holdout": dict(held.decided)}

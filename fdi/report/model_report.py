@@ -172,5 +172,5 @@ def collect_data(update: ModelUpdate, path: Path | None, page: Path | None) -> d
             "floor": dict(update.provenance.floor or {}),
             "parameters": {name: v._asdict() for name, v in update.parameters.items()},
             "effects": list(update.provenance.effects), "helps": update.helps,
-            "suspicious": [s._asdict() for s in update.suspicious],
+            "suspicious": [s._asdict() for s in update.suspicious], "notes": list(update.notes),
             "report": str(page) if page is not None and is_fitted else None}
