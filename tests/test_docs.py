@@ -5,7 +5,6 @@ import argparse
 import ast
 import importlib
 import inspect
-import json
 import re
 import runpy
 import shlex
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rig_command import rig
-from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
 from plant import Model, load_model, simulate
 from plant.effects import CATALOGUE, effect, load_effects
@@ -213,57 +211,6 @@ def test_the_catalogue_in_the_physics_page_is_complete(name: str) -> None:
 
 
 JSON = (ROOT / "docs" / "json.md").read_text()
-NAMED_BY_DATA = {"precursors", "inputs", "parameters", "moved", "others"}  # their keys are parameters, inputs, features
-
-
-def json_keys(value: object, parent: str = "") -> Iterator[str]:
-    """Every key of an answer, at any depth, that does not come from the data."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            if parent not in NAMED_BY_DATA:
-                yield key
-            yield from json_keys(inner, key if parent not in NAMED_BY_DATA else "")
-    elif isinstance(value, list):
-        for inner in value:
-            yield from json_keys(inner)
-
-
-def assert_documented(answer: object, heading: str) -> None:
-    section = next(part for part in JSON.split("\n## ") if part.startswith(heading))
-    undocumented = set(json_keys(answer)) - set(re.findall(r"`(\w+)`", section)) - {"xj", "p12", "xs", "cor"}
-    assert not undocumented, f"docs/json.md, {heading}"
-
-
-def test_the_keys_of_a_run_are_documented(preflight: Path) -> None:
-    answer = json.loads((preflight / "verdict.json").read_text())
-    assert answer.pop("fdi") == {}
-    assert_documented(answer, "rig run")
-
-
-def test_the_keys_of_a_dry_run_are_documented() -> None:
-    assert_documented(rig("check", "preflight", "--json").json, "rig check")
-
-
-def test_the_keys_of_a_diagnosis_are_documented(preflight: Path) -> None:
-    assert_documented(rig("fdi", preflight, "--json").json, "rig fdi")
-
-
-@pytest.fixture(scope="module")
-def short_runs_with_a_null_bias(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return write_measured_runs(tmp_path_factory.mktemp("documented"), HIDDEN)
-
-
-def test_the_keys_of_a_comparison_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
-    runs = short_runs_with_a_null_bias
-    answer = rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json
-    assert answer["where"] and answer["tolerances"] and answer["diagnostics"]
-    assert_documented(answer, "rig compare")
-
-
-def test_the_keys_of_an_explanation_are_documented(short_runs_with_a_null_bias: dict[str, Path]) -> None:
-    answer = rig("explain", *list_trace_arguments(short_runs_with_a_null_bias), "--json").json
-    assert answer["candidates"] and answer["blind_to"]
-    assert_documented(answer, "rig explain")
 
 
 def test_the_glossary_has_every_verdict() -> None:

@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from answer_schemas import check_answer
+
 from rig.cli.main import main
 
 
@@ -20,27 +22,31 @@ class Said(NamedTuple):
     status: int
     out: str
     err: str
+    words: tuple[str, ...] = ()  # of the command line
 
     @property
     def json(self) -> dict[str, Any]:
-        """Standard output as exactly one JSON object, without NaN or Infinity."""
+        """Standard output as exactly one JSON object, without NaN or Infinity, as the schema of the command says."""
         def refuse(word: str) -> None:
             raise AssertionError(f"{word} is not JSON")
 
         value = json.loads(self.out, parse_constant=refuse)
         assert isinstance(value, dict)
+        if self.words:
+            check_answer(self.words, value)
         return value
 
 
 def rig(*words: object) -> Said:
     """The command in this process."""
     out, err = io.StringIO(), io.StringIO()
+    typed = tuple(map(str, words))
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            status = main([str(word) for word in words])
+            status = main(list(typed))
         except SystemExit as end:
             status = int(end.code or 0)
-    return Said(status, out.getvalue(), err.getvalue())
+    return Said(status, out.getvalue(), err.getvalue(), typed)
 
 
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
@@ -52,7 +58,8 @@ def started(*words: object, **options: Any) -> subprocess.Popen[str]:
 def finished(process: subprocess.Popen[str], timeout: float = 60.0) -> Said:
     """Wait for it."""
     out, err = process.communicate(timeout=timeout)
-    return Said(process.returncode, out or "", err or "")
+    typed = process.args[3:] if isinstance(process.args, list) else ()  # after python -m rig.cli.main
+    return Said(process.returncode, out or "", err or "", tuple(map(str, typed)))
 
 
 def grown(path: Path, size: int, timeout: float = 30.0) -> None:

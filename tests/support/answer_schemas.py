@@ -1,0 +1,74 @@
+"""The schemas of the JSON answers in docs/schema, and the check of an answer against its schema.
+
+The published schemas allow further keys, because a new version may add some. The check does not: a key that the schema
+lacks is an error here, so that the schemas stay complete.
+"""
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from places import ROOT
+
+try:
+    from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import best_match
+    from referencing import Registry, Resource
+except ImportError:  # test_answer_schemas.py fails then; other tests need not
+    Draft202012Validator = None  # type: ignore[assignment,misc]
+
+FOLDER = ROOT / "docs" / "schema"
+KINDS_OF_BENCH = ("realtime", "recordings", "robustness", "faults", "explain")
+
+
+def load_schemas() -> dict[str, dict[str, Any]]:
+    """All schemas by the name of their file, such as "compare.json"."""
+    return {path.name: json.loads(path.read_text()) for path in sorted(FOLDER.glob("*.json"))}
+
+
+def name_schema(words: Sequence[str]) -> str:
+    """The schema of the answer to a command line, given without "rig"."""
+    command = words[0]
+    if command == "bench":
+        kind = [word for word in words[1:2] if word in KINDS_OF_BENCH]
+        return "_".join(["bench", *kind]) + ".json"
+    for name, option in (("fdi", "--learn-bands"), ("trend", "--score")):
+        if command == name and option in words:
+            return f"{name}_{option.strip('-').replace('-', '_')}.json"
+    return f"{command}.json"
+
+
+def refuse_other_keys(schema: Any) -> Any:
+    """The same schema, in which an object may have no other keys than those described."""
+    if isinstance(schema, list):
+        return [refuse_other_keys(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    out = {key: refuse_other_keys(value) for key, value in schema.items()}
+    is_object = isinstance(schema.get("properties"), dict) and isinstance(schema.get("type"), str | list)
+    return {"additionalProperties": False, **out} if is_object else out
+
+
+@cache
+def build_validator(name: str) -> Any:
+    """The validator of one schema without other keys."""
+    closed = {file: refuse_other_keys(schema) for file, schema in load_schemas().items()}
+    registry = Registry().with_resources((file, Resource.from_contents(schema)) for file, schema in closed.items())
+    return Draft202012Validator(closed[name], registry=registry)
+
+
+def check_answer(words: Sequence[str], answer: Any) -> None:
+    """Fail unless the answer to a command line is as its schema says.
+
+    Raises:
+        AssertionError: the answer differs; it names the schema, the place and the difference.
+    """
+    if Draft202012Validator is None:
+        return
+    name = name_schema(words)
+    error = best_match(build_validator(name).iter_errors(answer))
+    if error is not None:
+        place = "/".join(map(str, error.absolute_path)) or "the answer"
+        raise AssertionError(f"docs/schema/{name}, {place}: {error.message[:400]}")

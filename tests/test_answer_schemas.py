@@ -1,0 +1,178 @@
+"""The JSON answers have schemas: published in docs/schema, complete, and true of what the commands print.
+
+Every test that reads an answer with `rig_command.Said.json` checks it against its schema as well.
+"""
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from answer_schemas import KINDS_OF_BENCH, build_validator, check_answer, load_schemas, name_schema
+from jsonschema import Draft202012Validator
+from places import ROOT
+from rig_command import rig
+from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
+
+from rig.cli.command_list import HELP_OF_COMMAND
+
+PAGE = (ROOT / "docs" / "json.md").read_text()
+SCHEMAS = load_schemas()
+
+PROMISED = {  # keys that other programs rely on
+    "run": "verdict trace checks timing fdi",
+    "compare": "verdict signals solver_error where blocks",
+    "explain": "verdict effects candidates baseline blind_to separate pattern",
+    "add": "model ledger floor",
+    "fdi": "level ruling events precursors grid refined",
+}
+PROMISED_BELOW = {
+    ("run", "timing"): "cycles overruns lateness_us response_us scheduler",
+    ("compare", "signals"): "unit error floor ratio closed_loop_error",
+    ("compare", "where"): "section t0 t1 share condition",
+    ("compare", "blocks"): "controller servovalve jack sensor",
+    ("explain", "candidates"): "effect parameters error holdout ratio evidence p_value word",
+    ("explain", "baseline"): "error holdout floor",
+    ("explain", "blind_to"): "effect smallest_visible unit",
+    ("add", "ledger"): "effect error holdout",
+    ("fdi", "events"): "band signal t_in t_out",
+    ("fdi", "grid"): "step ramp merged",
+    ("fdi", "refined"): "kintas fss method simulations",
+}
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: str) -> None:
+    Draft202012Validator.check_schema(SCHEMAS[name])
+    assert SCHEMAS[name]["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert f"schema/{name}" in PAGE
+    for reference in re.findall(r'"\$ref": "([^"]+)"', json.dumps(SCHEMAS[name])):
+        file, _, place = reference.partition("#")
+        found: Any = SCHEMAS[file or name]
+        for key in place.strip("/").split("/") if place else []:
+            found = found[key]
+        assert found["type"], reference
+
+
+def test_every_command_that_answers_in_json_has_a_schema() -> None:
+    commands = {*HELP_OF_COMMAND} - {"node"}  # it runs until it is ended
+    words = [[command] for command in commands] + [["bench", kind] for kind in KINDS_OF_BENCH]
+    more = {"common.json", "fdi_learn_bands.json", "trend_score.json"}
+    assert {name_schema(each) for each in words} | more == set(SCHEMAS)
+    assert name_schema(["bench", "--json"]) == "bench.json"
+    assert name_schema(["fdi", "--learn-bands", "a.csv"]) == "fdi_learn_bands.json"
+
+
+@pytest.mark.parametrize("command", PROMISED)
+def test_the_promised_keys_are_required(command: str) -> None:
+    schema = SCHEMAS[f"{command}.json"]
+    assert set(PROMISED[command].split()) <= set(schema["required"])
+    for (owner, key), keys in PROMISED_BELOW.items():
+        if owner == command:
+            inner = schema["properties"][key]
+            inner = next((each for each in inner.get("anyOf", []) if "properties" in each), inner)
+            inner = inner.get("items") or inner.get("additionalProperties") or inner
+            assert set(keys.split()) <= set(inner["required"]), key
+
+
+def list_keys(schema: Any) -> Iterator[str]:
+    """Every key that a schema describes, at any depth; not the keys of its references."""
+    if isinstance(schema, dict):
+        properties = schema.get("properties")
+        if isinstance(properties, dict) and "type" in schema:
+            yield from properties
+        for value in schema.values():
+            yield from list_keys(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from list_keys(value)
+
+
+@pytest.mark.parametrize("command", ["run", "compare", "explain", "add", "identify", "fdi", "trend"])
+def test_the_page_explains_every_key(command: str) -> None:
+    section = next(part for part in PAGE.split("\n## ") if part.startswith(f"rig {command}"))
+    known = {*re.findall(r"`(\w+)`", section), "filter_clogging", "spool_friction"}
+    assert set(list_keys(SCHEMAS[f"{command}.json"])) <= known
+
+
+def keys_of(answer: Any) -> set[str]:
+    if isinstance(answer, dict):
+        return {*answer} | {key for value in answer.values() for key in keys_of(value)}
+    return {key for value in answer for key in keys_of(value)} if isinstance(answer, list) else set()
+
+
+def assert_all_seen(name: str, *answers: Any) -> None:
+    """No key of a schema is one that no answer has."""
+    for answer in answers:
+        check_answer([name], answer)
+    assert set(list_keys(SCHEMAS[f"{name}.json"])) <= keys_of(list(answers))
+
+
+def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
+    answers = [json.loads((folder / "verdict.json").read_text()) for folder in (preflight, aborted)]
+    assert answers[1]["cause"] is not None and answers[1]["nodes"].keys() == {"2", "3"}
+    # what these two runs do not have; the tests of real-time runs check it in their answers
+    answers[1]["consequences"] = [{"t": 0.0, "source": "node 2 controller", "kind": "stopped", "text": "silent"}]
+    answers[1]["fdi"] = {"verdict": "CANNOT_TELL", "sentence": "not judged: too short"}
+    answers[1]["judged"]["lateness"] = [{"t": 0.0, "cycle": 1, "last": 1, "source": "rig", "text": "late"}]
+    answers[1]["limits"] = [{"parameter": "p", "signal": "xj", "limit": 1.0, "t": 0.0, "seconds": 1.0}]
+    assert_all_seen("run", *answers)
+
+
+def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("command.csv").write_text("t,com\n0,0\n0.001,1e-3\n0.002,1e-3\n")
+    simulated = rig("simulate", "--command", "command.csv", "--out", "run.csv", "--json").json
+    samples = {"traces": ["run.csv", "run2.csv", "held.csv"]}
+    assert_all_seen("simulate", simulated, samples)
+    kinds = ("parameters", "signals", "sequences", "effects", "checks", "models")
+    assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
+    assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
+    assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json)
+    assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
+    imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
+    check_answer(["import"], imported)
+    assert_all_seen("doctor", rig("doctor", "--json").json)
+
+
+@pytest.fixture(scope="module")
+def short_runs_with_a_null_bias(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return write_measured_runs(tmp_path_factory.mktemp("measured"), HIDDEN)
+
+
+def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
+    answer = rig("fdi", preflight, "--json").json
+    assert answer["events"] == []
+    event = {"band": "most", "signal": "speed", "section": "step", "t_in": 0.0, "t_out": 0.1, "excess": 1e-3}
+    row = dict.fromkeys(("kintas", "fss", "left", "error_kintas", "error_fss")) | {"method": "genetic algorithm"}
+    assert_all_seen("fdi", answer, {**answer, "events": [event], "methods": [row]})
+
+
+def test_the_answer_of_a_comparison(short_runs_with_a_null_bias: dict[str, Path]) -> None:
+    runs = short_runs_with_a_null_bias
+    assert_all_seen("compare", rig("compare", runs["est"], "--repeat", runs["repeat"], "--json").json)
+
+
+def test_the_answer_of_an_explanation(short_runs_with_a_null_bias: dict[str, Path]) -> None:
+    answer = rig("explain", *list_trace_arguments(short_runs_with_a_null_bias), "--json").json
+    assert answer["candidates"] and answer["blind_to"] and answer["notes"] == []
+
+
+def test_a_key_that_a_schema_lacks_and_one_that_an_answer_lacks_are_found() -> None:
+    answer = {"report": "report.html"}
+    check_answer(["report"], answer)
+    with pytest.raises(AssertionError, match=r"docs/schema/report\.json, the answer: .*'pages' was unexpected"):
+        check_answer(["report"], {**answer, "pages": 1})
+    with pytest.raises(AssertionError, match="'report' is a required property"):
+        check_answer(["report"], {})
+    with pytest.raises(AssertionError, match=r"doctor\.json, verdict: 'GOOD' is not one of"):
+        check_answer(["doctor"], {"verdict": "GOOD", "findings": []})
+
+
+def test_a_newer_version_may_add_keys() -> None:
+    """The published schema accepts what the tests refuse."""
+    Draft202012Validator(SCHEMAS["report.json"]).validate({"report": "report.html", "pages": 1})
+    assert not build_validator("report.json").is_valid({"report": "report.html", "pages": 1})
