@@ -1,5 +1,6 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
 #   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
+#   make newcomer every line of README and tutorial, bad inputs, Ctrl-C; ARGS=inputs a part (shown, inputs, interruptions)
 #   make bench    the project's benchmarks     make clean                what was made here, but for runs/
 PYTHON ?= python3
 VENV   ?= .venv
@@ -10,7 +11,7 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
 
-.PHONY: env env-test preflight lint pytest test bench clean help
+.PHONY: env env-test preflight lint pytest test newcomer bench clean help
 .DELETE_ON_ERROR:
 
 preflight: env
@@ -27,6 +28,9 @@ lint: env-test
 	@echo "== ruff, then mypy --strict"
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
+
+newcomer: env-test
+	@PYTHONPATH=tests/support:tests/newcomer $(BIN)/python tests/newcomer/play_newcomer.py $(ARGS)
 
 bench: env-test
 	@$(BIN)/rig bench

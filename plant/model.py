@@ -162,7 +162,8 @@ def load_model(source: str | Path = "eha") -> Model:
     path = find_shipped_model(str(source)) or Path(source)
     if not path.is_file():
         names = ", ".join((*plants.list_plants(), *SHIPPED_MODELS))
-        raise InputError(source, "", f"a model file, or one of {names}")
+        missing = "; it does not exist" if path.suffix == ".toml" else ""
+        raise InputError(source, "", f"a model file, or one of {names}{missing}")
     return parse_model(read_toml(path), path, path.stem)
 
 
@@ -229,7 +230,7 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     """
     known = {e.name: e for e in list_offered_effects(plant)}
     if name not in known:
-        hint = suggest_name(name, known) or f": {', '.join(known)}"
+        hint = suggest_name(name, known) or " (rig effects lists them)"
         raise InputError("effect", name, f"an effect of the catalogue{hint}")
     return known[name]
 

@@ -50,8 +50,10 @@ def load_bands(path: str | Path) -> Bands:
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "--bands", "a readable file of bands") from error
+    except OSError as error:
+        raise InputError(path, "--bands", f"a readable file of bands ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "--bands", "a file of bands, as text in UTF-8") from error
     return parse_bands(text, path)
 
 

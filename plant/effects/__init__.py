@@ -169,7 +169,7 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     """
     path = path.absolute()  # as the code of its functions will say where it comes from
     if not path.is_file():
-        raise InputError(path, "", "a Python file with effects")
+        raise InputError(path, "", "a Python file with effects; it does not exist")
     module = ModuleType(f"effects_of_{path.stem}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # where annotations written as text are looked up

@@ -29,6 +29,8 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.recorder.convert import RAW_SUFFIXES
 
     source = Path(args.file)
+    if not source.exists():
+        raise InputError(source, "", "a file that can be read; it does not exist")
     _check_options(args, source, source.suffix in RAW_SUFFIXES)
     if args.guess:
         return _guess(args, source)

@@ -137,7 +137,10 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
 
 
 def _find_sized_effect(name: str, model: Model, where: object) -> Effect:
-    found = find_effect(name, model.plant)
+    try:
+        found = find_effect(name, model.plant)
+    except InputError as error:
+        raise InputError(where, name, error.expected) from error
     if not found.fitted:
         raise InputError(where, name, "an effect with a size; this one is noise of the bench")
     return found

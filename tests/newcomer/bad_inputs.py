@@ -1,0 +1,171 @@
+"""What a newcomer gets wrong: 80 command lines and files, and what the one line of the answer has to name."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from short_sequences import SHORT
+
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+
+HEADER = "t,com,xj,cor\n"
+ROWS = "".join(f"{k / 1000:.3f},{1e-3 * (k > 50):g},0,0\n" for k in range(200))
+FILES = {
+    "empty.csv": "",
+    "no_rows.csv": HEADER,
+    "no_com.csv": "t,xj,cor\n" + "0,0,0\n0.001,0,0\n",
+    "word.csv": HEADER + "0,0,0,0\n0.001,0,zero,0\n" + ROWS[200:],
+    "ragged.csv": HEADER + "0,0,0,0\n0.001,0\n",
+    "backwards.csv": HEADER + "0,0,0,0\n0.002,0,0,0\n0.001,0,0,0\n0.003,0,0,0\n",
+    "millimetres.csv": HEADER + "".join(f"{k / 1000:.3f},{5 * (k > 50)},{5 * (k > 60)},0\n" for k in range(200)),
+    "picture.csv": "\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00",
+    "broken.mcap": "not a log",
+    "notes.txt": "call Bob\n",
+    "broken.toml": "title = \n",
+    "new_key.toml": SHORT.replace("title =", "colour = 1\ntitle ="),
+    "new_kind.toml": SHORT.replace('kind = "step"', 'kind = "jump"'),
+    "no_time.toml": SHORT.replace('kind = "hold", time = 0.05 },\n  { name = "step"',
+                                  'kind = "hold" },\n  { name = "step"'),
+    "other_window.toml": SHORT.replace('window = "step"', 'window = "leap"'),
+    "word_time.toml": SHORT.replace("to = 1e-3, time = 0.2", 'to = 1e-3, time = "long"'),
+    "new_group.toml": 'name = "x"\nplant = "eha"\n[rocket]\nthrust = 1.0\n',
+    "new_field.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_fricton = 35.0\n',
+    "negative.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_friction = -3.0\n',
+    "word_value.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_friction = "high"\n',
+    "unit.toml": 'name = "x"\nplant = "eha"\n[spool]\nstatic_friction = 6.0\n',
+    "no_colon.py": "def drag(x, s, u, p)\n    return x\n",
+    "no_effect.py": "x = 1\n",
+    "map.toml": '[time]\nsource = "t"\nunit = "s"\n' + "".join(
+        f'[signals.{name}]\nsource = "{source}"\nunit = "{unit}"\n'
+        for name, source, unit in (("com", "Sollweg", "mm"), ("xj", "xj", "m"), ("cor", "cor", "A"))),
+    "matrix.toml": '[[case]]\nfault = "gremlin"\nsizes = [1.0]\n',
+    "dates/dates.csv": "file,date\nrun.csv,yesterday\n",
+}
+
+
+class BadInput(NamedTuple):
+    """A command line, and words that its one line of error has to hold."""
+
+    words: str
+    named: tuple[str, ...]
+
+
+def bad(words: str, *named: str) -> BadInput:
+    return BadInput(words, named)
+
+
+BAD_INPUTS = [
+    # command lines
+    bad("fly", "COMMAND", "fly", "compare"),
+    bad("compare", "TRACE", "required"),
+    bad("compare run.csv --repat run2.csv", "--repat"),
+    bad("run --seed -1", "--seed", "whole number", "-1"),
+    bad("run --seed many", "--seed", "whole number", "many"),
+    bad("run --pace fast", "--pace", "fast", "lockstep"),
+    bad("run --max-overruns 2", "--max-overruns", "0 to 1", "2"),
+    bad("run --set filter.cloging=0.5", "filter.cloging", "field of filter", "did you mean clogging"),
+    bad("run --set filter.clogging", "--set", "filter.clogging", "GROUP.FIELD=VALUE"),
+    bad("run --set filter.clogging=2", "filter.clogging", "below 1", "not 2"),
+    bad("run --set filter.clogging=much", "filter.clogging", "much", "number"),
+    bad("run --set filter.clogging=nan", "filter.clogging", "nan"),
+    bad("run --model boeing", "boeing", "eha"),
+    bad("run --model absent.toml", "absent.toml", "model file", "does not exist"),
+    bad("run --bus socketcan:can9", "can9"),
+    bad("run --bus carrier_pigeon:1", "carrier_pigeon"),
+    bad("run --out notes.txt", "notes.txt", "folder"),
+    bad("run --from absent.mcap", "absent.mcap", "does not exist"),
+    bad("list gremlins", "gremlins", "parameters"),
+    bad("doctor now", "now"),
+    bad("node pilot", "pilot", "plant"),
+    bad("bench warp", "warp", "realtime"),
+    bad("conformance controller --bus virtual --eds absent.eds", "absent.eds", "No such file"),
+    bad("conformance 200 --bus virtual", "200", "127"),
+    bad("effects null_bais", "null_bais", "null_bias"),
+    bad("simulate --out s.txt", "--out", "s.txt", ".csv"),
+    bad("simulate --out run.csv", "--out", "run.csv", "--force"),
+    bad("simulate --out absent/s.csv", "absent/s.csv", "No such file"),
+    bad("simulate --steps 0", "--steps", "0"),
+    bad("compare run.csv --out page.pdf", "--out", "page.pdf", ".html"),
+    bad("compare run.csv --out absent/page.html", "absent/page.html", "No such file"),
+    # sequences
+    bad("run absent.toml", "absent.toml", "No such file"),
+    bad("run preflite", "preflite", "preflight"),
+    bad("run broken.toml", "broken.toml:1", "TOML"),
+    bad("run new_key.toml", "new_key.toml", "colour"),
+    bad("run new_kind.toml", "new_kind.toml", "main[1]", "jump", "step"),
+    bad("run no_time.toml", "no_time.toml", "main[0]", "time"),
+    bad("run other_window.toml", "other_window.toml", "checks[0]", "leap"),
+    bad("run word_time.toml", "word_time.toml", "main[1]", "time", "number"),
+    # models and effects
+    bad("compare run.csv --model new_group.toml", "new_group.toml", "rocket"),
+    bad("compare run.csv --model new_field.toml", "new_field.toml", "static_fricton", "static_friction"),
+    bad("compare run.csv --model negative.toml", "negative.toml", "spool.static_friction", "at least 0 N", "not -3"),
+    bad("compare run.csv --model word_value.toml", "word_value.toml", "spool.static_friction", "number"),
+    bad("compare run.csv --model broken.toml", "broken.toml", "line 1"),
+    bad("compare run.csv --effects absent.py", "absent.py", "does not exist"),
+    bad("compare run.csv --effects no_colon.py", "no_colon.py", "line 1"),
+    bad("compare run.csv --effects no_effect.py", "no_effect.py", "effect"),
+    # recordings
+    bad("compare absent.csv", "absent.csv", "does not exist"),
+    bad("compare empty.csv", "empty.csv"),
+    bad("compare no_rows.csv", "no_rows.csv", "rows"),
+    bad("compare no_com.csv", "no_com.csv", "com"),
+    bad("compare word.csv", "word.csv", "line 3", "zero"),
+    bad("compare ragged.csv", "ragged.csv", "line 3"),
+    bad("compare backwards.csv", "backwards.csv", "t"),
+    bad("compare millimetres.csv", "millimetres.csv", "m"),
+    bad("compare picture.csv", "picture.csv"),
+    bad("compare broken.mcap", "broken.mcap"),
+    bad("compare notes.txt", "notes.txt", ".csv"),
+    bad("compare dates", "dates", "trace.mcap"),
+    bad("compare run.csv --signals xj,speed", "--signals", "speed", "xj"),
+    bad("compare run.csv --repeat other.csv", "other.csv", "com"),
+    bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "again"),
+    bad("explain run.csv --holdout run.csv", "--holdout", "run.csv"),
+    bad("add run.csv", "effect", "rig effects"),
+    bad("add null_bais run.csv", "null_bais", "null_bias"),
+    bad("add null_bias", "TRACE", "rig add"),
+    bad("add null_bias run.csv --out model.txt", "model.txt", ".toml"),
+    bad("remove null_bias", "--model"),
+    bad("remove null_bias --model unit.toml", "null_bias", "it has none"),
+    bad("identify", "RUN", "required"),
+    bad("fdi run.csv --bands absent.toml", "absent.toml", "No such file"),
+    bad("fdi run.csv --bands unit.toml", "unit.toml"),
+    bad("trend absent", "absent"),
+    bad("trend dates", "dates.csv", "yesterday"),
+    bad("campaign absent.toml", "absent.toml", "No such file"),
+    bad("campaign --fault gremlin=1", "--fault", "gremlin"),
+    bad("campaign matrix.toml", "matrix.toml", "fault", "rig effects"),
+    bad("import absent.dat", "absent.dat", "does not exist"),
+    bad("import run.csv --map map.toml", "Sollweg"),
+    bad("import notes.txt", "notes.txt"),
+    bad("export run.csv --out run.pdf", "run.pdf", ".csv"),
+    bad("view absent.mcap", "absent.mcap", "does not exist"),
+    bad("report absent.mcap", "absent.mcap", "does not exist"),
+    bad("recover notes.txt", "notes.txt"),
+]
+
+
+def write_bad_files(folder: Path) -> None:
+    """Write the files of these command lines, and run.csv and other.csv, which are right, into a folder."""
+    (folder / "dates").mkdir()
+    for name, text in FILES.items():
+        (folder / name).write_text(text, encoding="latin-1")
+    for name, size in (("run.csv", 1e-3), ("other.csv", -2e-3), ("dates/run.csv", 1e-3)):
+        command = [size * (k > 50) for k in range(400)]
+        columns = simulate(Model(), command, None, 1, 20)
+        Trace.from_columns(columns._asdict(), 1e-3, {}).write_csv(folder / name)
+
+
+def find_faults(case: BadInput, status: int, out: str, err: str) -> list[str]:
+    """What is wrong with the answer to bad input; empty if nothing is."""
+    lines, command = err.splitlines(), case.words.split()[0]
+    faults = [f"status {status}"] if status != 2 else []
+    if out:
+        faults.append("prints on standard output")
+    if len(lines) != 1:
+        faults.append(f"{len(lines)} lines of error")
+    if not err.startswith(("rig: ", f"rig {command}: ")):
+        faults.append("does not begin with the command")
+    return faults + [f"does not name {word}" for word in case.named if word not in err]
