@@ -64,5 +64,5 @@ $(VENV)/.run: pyproject.toml $(MADE)
 
 $(VENV)/.test: pyproject.toml $(MADE)
 	@echo "== installing what the tests and the viewer need into $(VENV) (once, about two minutes)"
-	@$(PIP) -e '.[dev,view,fleet,learn,measure,shell]'
+	@$(PIP) -e '.[dev,view,plots,fleet,learn,measure,shell]'
 	@touch $@ $(VENV)/.run

@@ -6,19 +6,23 @@ turned into the dictionary that the command of the same name prints with --json.
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from fdi.foreign_code import load_effects_of_model
-from fdi.output import write_text
+from fdi.output import write_text, write_whole
 from fdi.report.report import Figure, Medium, Report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
     from fdi.comparison.compare import Comparison
     from fdi.diagnosis.diagnosis import Diagnosis
     from fdi.discovery.candidates import Answer
@@ -35,25 +39,67 @@ class Plot(str):
     """A figure as SVG text, with its caption. A notebook shows it as a picture."""
 
     caption: str
+    _draw: Callable[[], str]
 
-    def __new__(cls, svg: str, caption: str) -> Plot:
+    def __new__(cls, svg: str, caption: str, draw: Callable[[], str]) -> Plot:
         plot = super().__new__(cls, svg)
-        plot.caption = caption
+        plot.caption, plot._draw = caption, draw
         return plot
+
+    @cached_property
+    def figure(self) -> MatplotlibFigure:
+        """The matplotlib figure, with all points of its lines, to change and to save."""
+        from fdi.report.drawing import Drawing, keep_all_points
+
+        with keep_all_points():
+            drawing = self._draw()
+        if not isinstance(drawing, Drawing):
+            raise InputError("plot", self.caption, "a figure that matplotlib has drawn")
+        return drawing.figure
+
+    def to_plotly(self) -> Any:
+        """The figure as a `plotly.graph_objects.Figure`, which can be zoomed and read off.
+
+        Raises:
+            InputError: plotly is not installed.
+        """
+        from fdi.report.plotly_figure import convert_figure
+
+        return convert_figure(self.figure)
+
+    def write(self, path: str | Path) -> None:
+        """Write the figure: .svg as a page shows it; .png, .pdf and what else matplotlib writes; .html by plotly.
+
+        Raises:
+            InputError: a path that cannot be written, a format that matplotlib does not know, or no plotly for .html.
+        """
+        if Path(path).suffix in ("", ".svg"):
+            write_text(path, str(self), "path")
+        elif Path(path).suffix == ".html":
+            write_text(path, self.to_plotly().to_html(include_plotlyjs=True), "path")
+        else:
+            _save_figure(self.figure, Path(path))
 
     def _repr_svg_(self) -> str:
         return str(self)
 
-    def write(self, path: str | Path) -> None:
-        """Write the figure as an SVG file.
-
-        Raises:
-            InputError: a path that cannot be written.
-        """
-        write_text(path, str(self), "path")
+    def __repr__(self) -> str:
+        return f"<Plot: {shorten(self.caption, 90, placeholder=' ..')}>"
 
 
-@dataclass(frozen=True, eq=False)
+def _save_figure(figure: MatplotlibFigure, path: Path, resolution: int = 150) -> None:
+    """Write a figure in the format of the suffix, `resolution` in dots per inch. Raises InputError."""
+    known = figure.canvas.get_supported_filetypes()
+    if path.suffix[1:] not in known:
+        raise InputError("path", str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
+    try:
+        with write_whole(path) as part:
+            figure.savefig(part, dpi=resolution)
+    except OSError as error:
+        raise InputError("path", str(path), f"a file that can be written ({error.strerror})") from error
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """What an analysis found: a verdict in a word and in a sentence, tables, figures, and the JSON answer."""
 
@@ -88,7 +134,7 @@ class Result:
         for figure in chosen:
             svg = figure.draw()
             if svg:
-                return Plot(svg, figure.caption)
+                return Plot(svg, figure.caption, figure.draw)
         raise InputError("plot", title or "", "a figure for which the trace has data")
 
     def _list_figures(self) -> list[tuple[str, Figure]]:
@@ -129,19 +175,22 @@ class Result:
     def __str__(self) -> str:
         return self.to_text()
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.verdict}: {shorten(self.sentence, 90, placeholder=' ..')}>"
+
     def _repr_html_(self) -> str:
         page = html.escape(self.to_html(), quote=True)
         return f'<iframe srcdoc="{page}" style="width: 100%; height: 720px; border: 0"></iframe>'
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ComparisonResult(Result):
     """A model compared with a trace; `comparison` holds every number, as numpy columns where it has many."""
 
     comparison: Comparison = field(repr=False)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ExplanationResult(Result):
     """Which effect is missing from a model."""
 
@@ -153,7 +202,7 @@ class ExplanationResult(Result):
         return self.answer.explanation.effects
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelResult(Result):
     """A model with one more effect, fitted to a trace."""
 
@@ -180,7 +229,7 @@ class ModelResult(Result):
         write_model_file(self.update, path)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IdentificationResult(Result):
     """The parameters of an actuator, from its runs."""
 
@@ -202,7 +251,7 @@ class IdentificationResult(Result):
         write_identified_model(self.identification, path, "fdi.identify")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DiagnosisResult(Result):
     """Levels and sizes of the two faults of a servovalve."""
 

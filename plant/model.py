@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,12 @@ class Model:
     effects: tuple[str, ...] = ()
     plant: str = "eha"
     design: Mapping[str, float] = field(default_factory=dict)  # nominal values of an actuator of another size
+
+    def __repr__(self) -> str:
+        effects = f" with {', '.join(self.effects)}" if self.effects else ""
+        changes = ", ".join(f"{name} = {value:g}" for name, value in self.list_changes().items())
+        text = f"Model {self.name} of plant {self.plant}{effects}: {changes or 'nominal'}"
+        return f"<{shorten(text, 140, placeholder=' ..')}>"
 
     @property
     def nominal(self) -> Mapping[str, float]:

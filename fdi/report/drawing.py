@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,7 @@ LEVELS = {"xj": ("mm", 1e3), "cor": ("mA", 1e3), "load": ("kN", 1e-3), "p12": ("
 ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "frameon": False, "borderaxespad": 0.0}
 """Place of a legend above the axes, off the data."""
 LINE_COLUMNS = 7300  # a line is drawn by its extremes in this many columns: each sample of a run of 14 s, for zooming
+_keeps_all_points = ContextVar("keeps_all_points", default=False)
 
 
 def choose_drawn_unit(name: str, size: float) -> tuple[str, float]:
@@ -48,6 +50,22 @@ def choose_drawn_unit(name: str, size: float) -> tuple[str, float]:
     """
     scale, unit = choose_unit(SIGNAL_UNITS[name], size)
     return unit, 1.0 / scale
+
+
+class Drawing(str):
+    """A figure as SVG text, and the matplotlib figure that it was made from."""
+
+    figure: Figure
+
+
+@contextmanager
+def keep_all_points() -> Iterator[None]:
+    """Draw lines with all their points: a figure that is zoomed shows more than a page does."""
+    token = _keeps_all_points.set(True)
+    try:
+        yield
+    finally:
+        _keeps_all_points.reset(token)
 
 
 @contextmanager
@@ -83,7 +101,7 @@ def label_log_axis(axis: Axis) -> None:
 
 def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     """The smallest and largest value in each of `LINE_COLUMNS` pieces, in order of time: looks like the whole line."""
-    if len(t) <= 2 * LINE_COLUMNS:
+    if len(t) <= 2 * LINE_COLUMNS or _keeps_all_points.get():
         return t, values
     starts = _piece_starts(len(t))
     length = np.diff(starts, append=len(t))
@@ -104,7 +122,7 @@ def _piece_starts(rows: int) -> NDArray[np.intp]:
     return np.cumsum([0, *[short + 1] * longer, *[short] * (LINE_COLUMNS - longer - 1)])
 
 
-def to_svg(figure: Figure, salt: str) -> str:
+def to_svg(figure: Figure, salt: str) -> Drawing:
     """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures.
 
     An attribute data-axes tells the page's script (figure.js) what it needs for zoom and cursor.
@@ -117,7 +135,9 @@ def to_svg(figure: Figure, salt: str) -> str:
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = shorten_svg(out.getvalue(), 2)
     notes = html.escape(json.dumps(_describe_axes(figure, salt), separators=(",", ":")))
-    return f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}'
+    drawing = Drawing(f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}')
+    drawing.figure = figure
+    return drawing
 
 
 def _name_artists(figure: Figure, salt: str) -> None:

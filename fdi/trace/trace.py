@@ -235,6 +235,12 @@ class Trace:
         """The same trace with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
+    def __repr__(self) -> str:
+        source = self.provenance.get("source", "")
+        measured = ", ".join(name for name in OUTPUTS if name in self.signals)
+        of = f" of {source}" if source else ""
+        return f"<Trace{of}: {len(self)} cycles of {1e3 * self.period:g} ms, {len(self) * self.period:g} s, {measured}>"
+
     def with_delays(self, com: int = 0, cor: int = 0) -> Trace:
         """The same trace with Com and Cor delayed by so many cycles (negative: advanced)."""
         return replace(self, com=shift_rows(self.com, com), cor=shift_rows(self.cor, cor))

@@ -1,14 +1,18 @@
 """The public Python interface: the lines of docs/python.md as they stand there, and what results can do."""
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from effect_files import restored_catalogue
 from short_runs import HIDDEN, write_measured_runs
@@ -21,7 +25,8 @@ from plant import InputError, Model
 from plant.effects import CATALOGUE
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
-EXAMPLE = re.sub(r"^    ", "", re.findall(r"(?:^    .*\n|^\n(?=    ))+", PAGE, re.MULTILINE)[0], flags=re.MULTILINE)
+EXAMPLES = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in
+            re.findall(r"(?:^    .*\n|^\n(?=    ))+", PAGE.split("## Functions")[0], re.MULTILINE)]
 FEW = {"null_bias", "spool_friction", *(suspect.effect for suspect in SUSPECTS)}  # what `diagnose` needs
 
 
@@ -32,13 +37,19 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def lines(runs: dict[str, Path]) -> Iterator[dict[str, Any]]:
-    """The names that the first block of docs/python.md leaves, run beside short traces with a small catalogue."""
+    """The names that the six examples of docs/python.md leave, run beside short traces with a small catalogue."""
     names: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch, restored_catalogue():
         patch.chdir(runs["est"].parent)
         for name in set(CATALOGUE) - FEW:
             del CATALOGUE[name]
-        exec(EXAMPLE, names)
+        for name, source in (("run", "est"), ("run2", "repeat"), ("held", "holdout")):
+            shutil.copy(runs[source], f"{name}.csv")
+        names["printed"] = []
+        for example in EXAMPLES:
+            with contextlib.redirect_stdout(io.StringIO()) as out:
+                exec(example, names)
+            names["printed"].append(out.getvalue())
         yield names
 
 
@@ -55,9 +66,63 @@ def test_the_lines_of_the_page_find_the_hidden_effect(lines: dict[str, Any], run
     assert "Faults" in (folder / "diagnosis.html").read_text()
 
 
-def test_the_example_is_short() -> None:
-    assert "fdi.diagnose" in EXAMPLE
-    assert len([line for line in EXAMPLE.splitlines() if line and not line.startswith("import")]) <= 10
+def test_there_are_six_short_examples_and_they_print_what_they_say(lines: dict[str, Any]) -> None:
+    assert len(EXAMPLES) == len(re.findall(r"^\*\*\d\. ", PAGE, re.MULTILINE)) == 6
+    assert all(len(example.splitlines()) <= 7 for example in EXAMPLES)
+    compared, plotted, explained, diagnosed, simulated, table = lines["printed"]
+    assert compared.startswith("MODEL_INCOMPLETE") and "times the noise floor" in compared
+    assert plotted == simulated == ""
+    assert explained.splitlines() == ["EXPLAINED ('null_bias',)", "WITHIN_FLOOR"]
+    assert diagnosed.startswith("<DiagnosisResult ") and "'low'" in diagnosed
+    assert [row.split()[:2] for row in table.splitlines()] == [
+        ["nominal", "MODEL_INCOMPLETE"], ["fitted", "WITHIN_FLOOR"], ["clogged", "MODEL_INCOMPLETE"]]
+
+
+def test_a_plot_is_a_matplotlib_figure_and_files(lines: dict[str, Any], runs: dict[str, Path], tmp_path: Path) -> None:
+    plot = lines["comparison"].plot()
+    residual = plot.figure.axes[2]
+    drawn = max((len(line.get_xdata()) for line in residual.lines), default=0)
+    assert residual.get_ylabel() == "residual of\nXJ [um]" and drawn == len(lines["trace"]), "all points"
+    assert (runs["est"].parent / "close_up.png").read_bytes().startswith(b"\x89PNG")
+    for name, begin in (("a.svg", b"<svg"), ("a.png", b"\x89PNG"), ("a.pdf", b"%PDF")):
+        plot.write(tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(begin)
+    with pytest.raises(InputError, match=r"a\.xyz: expected a name that ends in \.html or"):
+        plot.write(tmp_path / "a.xyz")
+    with pytest.raises(InputError, match="No such file"):
+        plot.write(tmp_path / "none" / "a.png")
+
+
+def test_a_plot_converts_to_plotly(lines: dict[str, Any], tmp_path: Path) -> None:
+    pytest.importorskip("plotly")
+    comparison = lines["comparison"]
+    found = comparison.plot().to_plotly()
+    residual = comparison.comparison.replay.residual["xj"]
+    curves = [curve for curve in found.data if curve.yaxis == "y3"]
+    assert any(np.allclose(curve.y, 1e6 * residual, equal_nan=True) for curve in curves)
+    assert found.layout.xaxis3.matches == "x" and found.layout.yaxis3.title.text == "residual of<br>XJ [um]"
+    assert {curve.name for curve in found.data if curve.showlegend} >= {"measured", "model, from the current"}
+    assert [shape for shape in found.layout.shapes if shape.xref == "x3 domain"], "the band of the noise floor"
+    shares = comparison.plot("Where")
+    shares.write(tmp_path / "where.html")
+    assert "Plotly.newPlot" in (tmp_path / "where.html").read_text()
+    assert len(shares.to_plotly().layout.yaxis.ticktext) == len(comparison.comparison.where)
+
+
+def test_without_plotly_the_message_says_what_to_install(
+        lines: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(InputError, match=r"pip install 'eha-rig\[plots\]'"):
+        lines["comparison"].plot("Where").to_plotly()
+
+
+def test_values_have_a_short_repr(lines: dict[str, Any]) -> None:
+    texts = [repr(lines[name]) for name in ("comparison", "explanation", "result", "diagnosis", "trace", "plot")]
+    texts += [repr(Model()), repr(lines["result"].model)]
+    assert all(len(text) < 180 and "\n" not in text and text[0] == "<" for text in texts), texts
+    assert texts[0].startswith("<ComparisonResult MODEL_INCOMPLETE: The model does not explain")
+    assert texts[4] == "<Trace of run.csv: 4000 cycles of 1 ms, 4 s, xj, p12, xs>"
+    assert texts[6] == "<Model eha of plant eha: nominal>" and texts[7].startswith("<Model eha of plant eha with null_bias: ")
 
 
 def test_every_result_prints_shows_plots_and_converts(lines: dict[str, Any]) -> None:

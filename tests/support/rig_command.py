@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,13 +17,21 @@ from answer_schemas import check_answer
 from rig.cli.main import main
 
 
-class Said(NamedTuple):
-    """What a command left behind."""
-
+class _Said(NamedTuple):
     status: int
     out: str
     err: str
-    words: tuple[str, ...] = ()  # of the command line
+
+
+class Said(_Said):
+    """What a command left behind."""
+
+    words: tuple[str, ...]  # of the command line
+
+    def __new__(cls, status: int, out: str, err: str, words: Iterable[object]) -> Said:
+        said = super().__new__(cls, status, out, err)
+        said.words = tuple(map(str, words))
+        return said
 
     @property
     def json(self) -> dict[str, Any]:
@@ -40,13 +49,12 @@ class Said(NamedTuple):
 def rig(*words: object) -> Said:
     """The command in this process."""
     out, err = io.StringIO(), io.StringIO()
-    typed = tuple(map(str, words))
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            status = main(list(typed))
+            status = main([str(word) for word in words])
         except SystemExit as end:
             status = int(end.code or 0)
-    return Said(status, out.getvalue(), err.getvalue(), typed)
+    return Said(status, out.getvalue(), err.getvalue(), words)
 
 
 def started(*words: object, **options: Any) -> subprocess.Popen[str]:
@@ -59,7 +67,7 @@ def finished(process: subprocess.Popen[str], timeout: float = 60.0) -> Said:
     """Wait for it."""
     out, err = process.communicate(timeout=timeout)
     typed = process.args[3:] if isinstance(process.args, list) else ()  # after python -m rig.cli.main
-    return Said(process.returncode, out or "", err or "", tuple(map(str, typed)))
+    return Said(process.returncode, out or "", err or "", typed)
 
 
 def grown(path: Path, size: int, timeout: float = 30.0) -> None:
