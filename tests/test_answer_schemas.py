@@ -91,7 +91,7 @@ def list_keys(schema: Any) -> Iterator[str]:
             yield from list_keys(value)
 
 
-@pytest.mark.parametrize("command", ["run", "compare", "explain", "add", "identify", "fdi", "trend"])
+@pytest.mark.parametrize("command", ["run", "diff", "compare", "explain", "add", "identify", "fdi", "trend"])
 def test_the_page_explains_every_key(command: str) -> None:
     section = next(part for part in PAGE.split("\n## ") if part.startswith(f"rig {command}"))
     known = {*re.findall(r"`(\w+)`", section), "filter_clogging", "spool_friction"}
@@ -135,6 +135,7 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
     imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
     check_answer(["import"], imported)
+    assert_all_seen("diff", rig("diff", preflight, "run.csv", "--json").json)
     assert_all_seen("doctor", rig("doctor", "--json").json)
 
 

@@ -120,6 +120,8 @@ BAD_INPUTS = [
     bad("compare notes.txt", "notes.txt", ".csv"),
     bad("compare dates", "dates", "trace.mcap"),
     bad("compare run.csv --signals xj,speed", "--signals", "speed", "xj"),
+    bad("diff run.csv", "B", "required"),
+    bad("diff run.csv absent.csv", "absent.csv", "does not exist"),
     bad("compare run.csv --repeat other.csv", "other.csv", "com"),
     bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "again"),
     bad("explain run.csv --holdout run.csv", "--holdout", "run.csv"),

@@ -19,6 +19,7 @@ LONG_COMMANDS = {  # run2.csv repeats run.csv, held.csv has another command, lon
     "run in real time": "run --pace realtime --out run",
     "run, C firmware": "run --controller c --bus udp_multicast:{group} --out run",
     "simulate": "simulate --command long_command.csv --out simulated.csv",
+    "diff": "diff run.csv run2.csv --out page.html",
     "compare": "compare run.csv --repeat run2.csv --out page.html",
     "explain": "explain run.csv --repeat run2.csv --holdout held.csv --out page.html",
     "add": "add null_bias jack_friction run.csv --repeat run2.csv --holdout held.csv --out model.toml",
@@ -123,6 +124,8 @@ def find_damage(path: Path) -> str:
         elif path.suffix == ".html":
             return "" if path.read_text().rstrip().endswith("</html>") else "no end"
     except Exception as error:  # whatever a reader finds
+        if "at least one cycle" in str(error):  # a whole log: the run had not begun
+            return ""
         return f"{type(error).__name__}: {error}"
     return ""
 
