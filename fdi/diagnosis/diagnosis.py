@@ -111,7 +111,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         raise InputError(source, "com",
                          f"a ram that moves {1e3 * MOVING_RAM:g} mm or more: at rest it shows neither fault")
     notes = list(trace.notes)
-    progress("bands", 0.25)
+    progress("bands", 0.03)
     if bands is None:
         bands = _find_own_bands(trace, model, notes)
     elif other := describe_other_model(bands, model):
@@ -123,7 +123,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         band_verdict = judge_trace(trace, bands, model)
         notes += band_verdict.notes
     precursors = measure_precursors(trace, bands)
-    progress("grid", 0.5)
+    progress("grid", 0.05)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
     fitted = trace
     if is_long(trace):
@@ -131,8 +131,10 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         fitted = cut_excerpt(trace, excerpt)
         notes.append(excerpt.describe(trace))
     grid = _search_grid(fitted, model, notes)
-    progress("refinement", 0.1 if with_effects else 0.75)
-    refinement = refine_sizes(model, fitted, (*_list_starts(grid), *COARSE_STARTS), floor, workers, whole=trace)
+    if with_effects:
+        progress("refinement", 0.07)
+    refinement = refine_sizes(model, fitted, (*_list_starts(grid), *COARSE_STARTS), floor, workers, trace,
+                              ignore_progress if with_effects else progress)
     sizes = _widen_intervals(refinement)
     beside = None
     if with_effects:

@@ -29,7 +29,7 @@ from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typ
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
 from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import all_unknowns, effect_unknowns, silence_readings
-from fdi.progress import Progress, ignore_progress
+from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
@@ -173,6 +173,7 @@ class CountedProblem(LogProblem):
     """A problem that counts the runs it makes, and knows static friction by its ratio."""
 
     counts: list[int] = field(default_factory=list)  # shared by the problem's copies and threads
+    stage: Stage = NO_STAGE  # takes a step with each round of a fit
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
@@ -200,7 +201,8 @@ def choose_size_excerpt(model: Model, trace: Trace, floor: Mapping[str, float], 
 
 
 def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float]] = COARSE_STARTS,
-                 floor: Mapping[str, float] | None = None, workers: int = 2, whole: Trace | None = None) -> Refinement:
+                 floor: Mapping[str, float] | None = None, workers: int = 2, whole: Trace | None = None,
+                 progress: Progress = ignore_progress) -> Refinement:
     """Fault sizes by least squares from the best of some starts.
 
     Args:
@@ -210,8 +212,11 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float
         floor: RMS noise by signal, SI; default the model's sensors.
         workers: threads.
         whole: the recording that `trace` was cut from: the fit is judged on it.
+        progress: called with the stage and the share of a diagnosis that is done.
     """
-    problem = make_problem(model, trace, floor, workers)
+    usual_rounds = 44  # from two starts; a fit that is restarted takes twice as many
+    stage = Stage(progress, "refinement", 0.3, 0.97, usual_rounds)
+    problem = replace(make_problem(model, trace, floor, workers), stage=stage)
     free = list_unknowns(model)
     first = _fit_coarsely(problem, free, starts)
     problem = learn_left_noise(problem, first)
@@ -244,7 +249,7 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     fine = replace(problem, steps=FINE_STEPS, _lanes={})
     last = first
     for rounds in (4, 8):
-        last = descend_valley(fine, last, rounds, find_flat_directions(problem, first.free, last.x))
+        last = descend_valley(fine, last, rounds, find_flat_directions(problem, first.free, last.x), problem.stage)
         if is_noise_left(problem, last):
             return last
     signals = problem.trace.outputs
@@ -271,7 +276,7 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     def fit_from(part: float) -> Fit:
         begun = _fit_in_stages(alone, free, found.x + part * (home - found.x))
         flat = find_flat_directions(alone, free, begun.x)
-        return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat)
+        return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat, problem.stage)
 
     return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
@@ -287,7 +292,7 @@ def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> 
 def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
     start = replace(found, covariance=guess_covariance(found.free))
     flat = find_flat_directions(problem, found.free, found.x)
-    return descend_valley(scale_noise(problem, factor), start, rounds, flat)
+    return descend_valley(scale_noise(problem, factor), start, rounds, flat, problem.stage)
 
 
 def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:

@@ -15,7 +15,7 @@ from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation.excerpt import is_long
 from fdi.estimation.likelihood import Problem, compute_typical_rms
-from fdi.progress import Progress, ignore_progress
+from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,
     FURTHER_EFFECT_SHARE,
@@ -90,13 +90,12 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     search.whole = whole
     if tooth:
         search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
-    progress("fitting the tolerances", 0.05)
+    progress("fitting the tolerances", 0.03)
     base = search.fit_base()
     if base.is_at_floor:
         search.learn_noise(base)
         base = search.refit_hypothesis(base)
     levels = _search_levels(search, base, holdout, progress)
-    progress("last fits, with finer steps", 0.8)
     return _conclude(search, levels, found, controller, holdout, progress)
 
 
@@ -105,8 +104,10 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
     most_effects = 3  # effects looked for one after the other
+    shares = (0.07, 0.3, 0.4, 0.5)  # of the whole work, before each of them
     for count in range(1, most_effects + 1):
-        progress(f"looking for effect {count}", 0.1 + 0.25 * (count - 1))
+        fits = 40 if count == 1 else 20 * len(beam)
+        search.stage = Stage(progress, f"looking for effect {count}", shares[count - 1], shares[count], fits)
         tried: list[Hypothesis] = []
         for parent in beam:
             tried = _drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
@@ -177,9 +178,11 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
         depth = 1
     depth = _prune_level(search, levels, depth)
     search.refine_steps(FINE, TRUEST)
-    # where no effect helps, the base is fitted until that is beyond doubt
-    base = search.finish_hypothesis(levels[0][0], 2 if depth or levels[0][0].is_at_floor else LONG)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
+    # where no effect helps, the base is fitted until that is beyond doubt
+    rounds = 2 if depth or levels[0][0].is_at_floor else LONG
+    search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
+    base = search.finish_hypothesis(levels[0][0], rounds)
     close = sorted(search.map_parallel(search.finish_hypothesis, close), key=lambda h: h.cost + h.repeat_cost)
     if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
         base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
@@ -209,7 +212,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
     hidden: tuple[Detectable, ...] = ()
     if verdict in NOISE_LEFT:
-        progress("what this test cannot see", 0.9)
+        progress("what this test cannot see", 0.94)
         hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
         hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,

@@ -51,7 +51,7 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
     prepare_effects(runs, progress=progress)
     explanation = explain_recording(runs, progress)
     law = look_for_law(explanation, runs.holdout, progress)
-    progress("writing the answer", 0.95)
+    progress("writing the answer", 0.97)
     holding = law.law if law is not None and law.law is not None and law.law.holds else None
     file = effect_file or law_file
     names = write_law_file(holding, file) if holding is not None and file else {}

@@ -23,7 +23,7 @@ from fdi.estimation.unknowns import (
     effect_unknowns,
     silence_readings,
 )
-from fdi.progress import Progress, ignore_progress
+from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import GAIN_SEEN, WHITE_SQUARE_POOR
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -112,12 +112,13 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     model = lean_model(search.model, replayed)
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
-    progress("fitting the model as it is", 0.1)
+    progress("fitting the model as it is", 0.05)
     chain = [search.judge_fit(tuple(first), _start_fit(search, first, begin or {}))]
     for number, name in enumerate(replayed[len(first):]):
-        progress(f"adding {name}", 0.25 + 0.4 * number / (len(replayed) - len(first)))
+        progress(f"adding {name}", 0.15 + 0.35 * number / (len(replayed) - len(first)))
         chain.append(_add_effect(search, chain[-1], name))
-    progress("last fits, with finer steps", 0.65)
+    rounds = LAST_FIT_ROUNDS + EARLIER_FIT_ROUNDS * (len(chain) - 1)
+    search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.95, rounds)
     chain = search.judge_on_all(_finish_chain(search, chain), LAST_FIT_STEPS)
     steps = _list_steps(search, effects, done, chain, holdout)
     return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search, said)
@@ -129,14 +130,16 @@ def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesi
     coarse = search.problem.steps
     search.refine_steps(LAST_FIT_STEPS, LAST_FIT_STEPS)
     slopes = replace(search.problem, steps=coarse, _lanes={})
-    last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes)
+    last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes, search.stage)
     if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):
         again = replace(last, x=np.where(_have_priors(last.free), 0.0, last.x))
-        last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes), key=lambda fit: fit.cost)
+        last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes, search.stage),
+                   key=lambda fit: fit.cost)
     done = [search.judge_fit(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
         begun = _choose_nearer_start(search, h.fit, done[0].fit)
-        done.insert(0, search.judge_fit(h.effects, finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes)))
+        fit = finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes, search.stage)
+        done.insert(0, search.judge_fit(h.effects, fit))
     return done
 
 

@@ -18,7 +18,7 @@ from fdi.estimation.judgement import Judgement, judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import all_unknowns, complete_model, silence_readings
-from fdi.progress import Progress, ignore_progress
+from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
@@ -92,6 +92,7 @@ class Search:
         self.repeats = [Problem(ready, r, self.noise, bare=bare) for r in repeats]
         self.fine: Problem | None = None  # with the steps of last residuals
         self.effects = [e for e in effects if e not in model.effects or CATALOGUE[e].base]
+        self.stage = NO_STAGE  # of the work: each fit, and each round of a last fit, is a step
 
     def fit_base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
@@ -173,7 +174,12 @@ class Search:
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; what runs in one of them keeps to itself, as `problem` has one worker until `refine`."""
-        return map_in_threads(do, items, self.workers)
+        def do_step(item: T) -> R:
+            found = do(item)
+            self.stage.finish_step()
+            return found
+
+        return map_in_threads(do_step, items, self.workers)
 
     def _continue_begun_fit(self, rounds: int, each: tuple[str, Fit]) -> tuple[str, Fit]:
         return each[0], each[1] if each[1].converged else continue_fit(self.problem, each[1], rounds)
@@ -246,7 +252,7 @@ class Search:
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
-        return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem))
+        return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""

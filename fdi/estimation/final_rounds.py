@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, step_within_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights
 from fdi.estimation.unidentifiable import choose_across, find_tangents, relax_along, relax_fit, remove_slope
+from fdi.progress import NO_STAGE, Stage
 from fdi.thresholds import CONVERGED_GAIN
 
 Floats = NDArray[np.float64]
@@ -29,10 +30,12 @@ DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
-def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | None = None) -> Fit:
+def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | None = None,
+               stage: Stage = NO_STAGE) -> Fit:
     """A fit taken to the end, with a covariance that holds at the width of its own intervals.
 
-    `slopes`: the same problem with coarser steps, for the differences; default `problem` itself.
+    `slopes`: the same problem with coarser steps, for the differences; default `problem` itself. `stage` takes a step
+    with each round.
     """
     now, idle = relax_fit(problem, fit), 0
     _, flat = find_tangents(slopes or problem, now.free, now.x)
@@ -41,6 +44,7 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = there
+        stage.finish_step()
         if idle >= PATIENCE:
             break
     return replace(relax_fit(problem, now), converged=True)
@@ -91,10 +95,10 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
                    white=white[k])
 
 
-def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> Fit:
+def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE) -> Fit:
     """A fit after so many rounds of damped Gauss-Newton steps, fewer if some of them gain nothing.
 
-    `flat` (p, k) are the directions that the data do not see.
+    `flat` (p, k) are the directions that the data do not see. `stage` takes a step with each round.
     """
     now, idle = begun, 0
     for _ in range(rounds):
@@ -102,6 +106,7 @@ def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats) -> F
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = replace(there, covariance=here.covariance)
+        stage.finish_step()
         if idle >= PATIENCE:
             break
     return replace(relax_along(now, flat), converged=True)

@@ -70,5 +70,5 @@ def _show_line() -> Iterator[Progress]:
     try:
         yield update
     finally:
-        sys.stderr.write("\r\033[K")
+        sys.stderr.write("\r\033[K\n" if shown[0] else "\r\033[K")  # the headline begins a line, also in a capture
         sys.stderr.flush()
