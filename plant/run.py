@@ -19,6 +19,7 @@ from plant.machine_code import Advance, StoredCode
 from plant.model import STEPS, Model, build_initial_state, build_kernel, collect_bindings
 from plant.solve import NOISES, advance_flat_state, read_flat_sensors, run_closed_loop, step_cycle
 from plant.state import State
+from plant.threads import run_beside
 
 Array = NDArray[np.float64]
 SENSED, PRESSURE, SPOOL = (State._fields.index(name) for name in ("sensed", "pressure", "spool_position"))
@@ -72,7 +73,11 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     record = model.build_record()
     with report_law_errors(model):
         run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
-        run(model.build_state(), com, force, draw_noise(seed, len(com)) if drawn is None else drawn, record, steps, out)
+        noise = draw_noise(seed, len(com)) if drawn is None else drawn
+        if fast:
+            run_beside(partial(run, model.build_state(), com, force, noise, record, steps, out))
+        else:
+            run(model.build_state(), com, force, noise, record, steps, out)
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
     xj, cor, p12, xs = (out[:, i].copy() for i in range(4))
     return Columns(t, com, xj, cor, p12, xs, force)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -27,6 +28,24 @@ def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> li
         found = list(pool.map(do, work))
     except BaseException:  # Ctrl-C: nobody waits for what is still at work
         pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
+    return found
+
+
+def run_beside(do: Callable[[], R]) -> R:
+    """`do()` in a thread beside the main one, so that Ctrl-C ends the wait for compiled code at once.
+
+    In the main thread, Python notices Ctrl-C only where compiled code hands over its result, and numba 0.6x does not
+    survive an exception there. Called from another thread, `do` runs in it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return do()
+    pool = ThreadPoolExecutor(1, THREAD_NAME)
+    try:
+        found = pool.submit(do).result()
+    except BaseException:  # Ctrl-C: nobody waits for what is still at work
+        pool.shutdown(wait=False)
         raise
     pool.shutdown()
     return found

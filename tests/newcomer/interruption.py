@@ -1,6 +1,7 @@
 """Ctrl-C in every long command: how soon it ends, with which exit status, and what it leaves behind."""
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -74,6 +75,9 @@ def interrupt_command(name: str, words: str, moment: float, folder: Path, enviro
     wall = time.monotonic() - asked
     process.returncode = os.waitstatus_to_exitcode(state)
     cpu = max(0.0, usage.ru_utime + usage.ru_stime - used)
+    if process.returncode in (0, 1, 3) and wall <= MOST_CPU:  # Ctrl-C came when the answer was already printed
+        remove_new_files(folder, before)
+        return Interrupted(name, moment, None, wall, cpu, ())
     faults = [*judge_end(process.returncode, errors), *judge_time(wall, cpu)]
     faults += [f"{path.name}: {fault}" for path in sorted(folder.rglob("*")) if path.is_file() and path not in before
                and (fault := find_damage(path))]
@@ -82,12 +86,18 @@ def interrupt_command(name: str, words: str, moment: float, folder: Path, enviro
 
 
 def read_cpu_time(pid: int) -> float:
-    """CPU time of a process and of its children that have ended, s; proc(5): utime, stime, cutime, cstime."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+    """CPU time of a process and of all processes below it, s; proc(5): ppid, and utime, stime, cutime, cstime."""
+    parents, ticks = {}, {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+                parents[int(entry.name)] = int(fields[1])
+                ticks[int(entry.name)] = sum(map(int, fields[11:15]))
+    family = [pid]
+    for member in family:
+        family += [child for child, parent in parents.items() if parent == member]
+    return sum(ticks.get(member, 0) for member in family) / os.sysconf("SC_CLK_TCK")
 
 
 def judge_end(status: int, errors: str) -> list[str]:

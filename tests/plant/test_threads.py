@@ -1,12 +1,14 @@
 """Work side by side: in order, in this thread where there is nothing to share, and an error is an error."""
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 
 import pytest
 
-from plant.threads import THREAD_NAME, count_threads, map_in_threads
+from plant.threads import THREAD_NAME, count_threads, map_in_threads, run_beside
 
 
 def test_answers_come_in_the_order_of_the_questions() -> None:
@@ -51,6 +53,37 @@ def test_an_error_leaves_what_is_still_at_work() -> None:
         thread.join(10.0)
     assert 1 in done
     assert len(done) < 4  # of 39
+
+
+def test_ctrl_c_ends_a_long_simulation_at_once() -> None:
+    """In a process of its own: numba does not survive an exception where it hands over a result in the main thread."""
+    program = """
+import os, signal, threading
+import numpy as np
+from plant import Model, simulate
+simulate(Model(), np.zeros(10))
+threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    simulate(Model(), np.zeros(2_000_000))  # 4 s
+    print("done")
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+os._exit(0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "interrupted\n"), done.stderr
+
+
+def test_work_beside_gives_its_result_and_its_error() -> None:
+    here = threading.get_ident()
+    assert run_beside(threading.get_ident) != here
+    with pytest.raises(ZeroDivisionError):
+        run_beside(lambda: 1 / 0)
+    found: list[bool] = []
+    thread = threading.Thread(target=lambda: found.append(run_beside(threading.get_ident) == threading.get_ident()))
+    thread.start()
+    thread.join()
+    assert found == [True], "it stays in a thread that is not the main one"
 
 
 def test_a_cluster_tells_its_workers_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
