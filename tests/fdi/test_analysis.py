@@ -84,13 +84,14 @@ def test_a_plot_is_a_matplotlib_figure_and_files(lines: dict[str, Any], runs: di
     drawn = max((len(line.get_xdata()) for line in residual.lines), default=0)
     assert residual.get_ylabel() == "residual of\nXJ [um]" and drawn == len(lines["trace"]), "all points"
     assert (runs["est"].parent / "close_up.png").read_bytes().startswith(b"\x89PNG")
+    shares = lines["comparison"].plot("Where")  # a small one
     for name, begin in (("a.svg", b"<svg"), ("a.png", b"\x89PNG"), ("a.pdf", b"%PDF")):
-        plot.write(tmp_path / name)
+        shares.write(tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(begin)
     with pytest.raises(InputError, match=r"a\.xyz: expected a name that ends in \.html or"):
-        plot.write(tmp_path / "a.xyz")
+        shares.write(tmp_path / "a.xyz")
     with pytest.raises(InputError, match="No such file"):
-        plot.write(tmp_path / "none" / "a.png")
+        shares.write(tmp_path / "none" / "a.png")
 
 
 def test_a_plot_converts_to_plotly(lines: dict[str, Any], tmp_path: Path) -> None:
