@@ -60,7 +60,7 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
     commands = {*HELP_OF_COMMAND} - {"node"}  # it runs until it is ended
     words = [[command] for command in commands] + [["bench", kind] for kind in KINDS_OF_BENCH]
-    more = {"common.json", "fdi_learn_bands.json", "trend_score.json"}
+    more = {"common.json", "fdi_learn_bands.json", "trend_score.json", "suite.json"}
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
     assert name_schema(["bench", "--json"]) == "bench.json"
     assert name_schema(["fdi", "--learn-bands", "a.csv"]) == "fdi_learn_bands.json"
@@ -91,7 +91,7 @@ def list_keys(schema: Any) -> Iterator[str]:
             yield from list_keys(value)
 
 
-@pytest.mark.parametrize("command", ["run", "diff", "compare", "explain", "add", "identify", "fdi", "trend"])
+@pytest.mark.parametrize("command", ["run", "diff", "check", "compare", "explain", "add", "identify", "fdi", "trend"])
 def test_the_page_explains_every_key(command: str) -> None:
     section = next(part for part in PAGE.split("\n## ") if part.startswith(f"rig {command}"))
     known = {*re.findall(r"`(\w+)`", section), "filter_clogging", "spool_friction"}
@@ -135,6 +135,7 @@ def test_the_answers_of_small_commands(preflight: Path, tmp_path: Path, monkeypa
     assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
     imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
     check_answer(["import"], imported)
+    check_answer(["check"], rig("check", "preflight", "--json").json)
     assert_all_seen("diff", rig("diff", preflight, "run.csv", "--json").json)
     assert_all_seen("doctor", rig("doctor", "--json").json)
 

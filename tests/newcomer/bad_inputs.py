@@ -90,6 +90,9 @@ BAD_INPUTS = [
     bad("compare run.csv --out absent/page.html", "absent/page.html", "No such file"),
     # sequences
     bad("run absent.toml", "absent.toml", "No such file"),
+    bad("check", "SEQUENCE", "required"),
+    bad("check absent.toml", "absent.toml", "No such file"),
+    bad("check new_kind.toml", "new_kind.toml", "main[1]", "jump"),
     bad("run preflite", "preflite", "preflight"),
     bad("run broken.toml", "broken.toml:1", "TOML"),
     bad("run new_key.toml", "new_key.toml", "colour"),
