@@ -71,7 +71,7 @@ ONLY_IN = {
     "jax": ("rig/studies/benchmarks/",),
     "progpy": ("rig/studies/benchmarks/",),
     "socket": ("rig/",),
-    "threading": ("rig/",),
+    "threading": ("rig/", "plant/threads.py"),
     "asyncio": (),
     "random": (),
     "tests": (),
