@@ -150,7 +150,11 @@ def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
     assert answer["events"] == []
     event = {"band": "most", "signal": "speed", "section": "step", "t_in": 0.0, "t_out": 0.1, "excess": 1e-3}
     row = dict.fromkeys(("kintas", "fss", "left", "error_kintas", "error_fss")) | {"method": "genetic algorithm"}
-    assert_all_seen("fdi", answer, {**answer, "events": [event], "methods": [row]})
+    explanation = {"effects": ["null_bias"], "probability": 1.0, "parameters": {}, "ratio": {"xj": 1.0},
+                   "level": answer["level"], **{key: answer["refined"][key] for key in ("kintas", "fss")}}
+    beside = {"effects": [], "explained": True, "ambiguous": False, "disputed": [], "marks": {},
+              "explanations": [explanation]}  # of --with-effects, whose search takes a minute
+    assert_all_seen("fdi", answer, {**answer, "events": [event], "methods": [row], "with_effects": beside})
 
 
 def test_the_answer_of_a_comparison(short_runs_with_a_null_bias: dict[str, Path]) -> None:
