@@ -8,7 +8,7 @@ import pytest
 from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
-pytest_plugins = ["plugin_bus_summary", "pytester"]
+pytest_plugins = ["plugin_bus_summary"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell script starts what it puts in the background with Ctrl-C ignored, and children inherit that. The tests of
@@ -19,12 +19,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture(params=["embedded", "virtual", "udp_multicast", "socketcan"])
 def bus_kind(request: pytest.FixtureRequest) -> str:
     """The back end a bus test runs on. Without vcan0 the socketcan ones skip, or fail with EHA_RIG_REQUIRE_VCAN=1."""
-    return require_bus_kind(request.param)
-
-
-@pytest.fixture(params=["udp_multicast", "socketcan"])
-def bus_kind_between_programs(request: pytest.FixtureRequest) -> str:
-    """As `bus_kind`, without the back ends inside one process."""
     return require_bus_kind(request.param)
 
 

@@ -1,5 +1,5 @@
 """What runs where a vcan0 is: the bus tests, one whole preflight run by three processes with candump listening, and a
-minute at 1 kHz with the C firmware.
+minute at 1 kHz, both with the C firmware.
 
     python tests/vcan/inside.py OUT compile|bus|preflight|minute ...
 
@@ -88,14 +88,15 @@ def background(out: Path, name: str, *command: str | Path) -> Iterator[subproces
 
 
 def preflight(out: Path) -> int:
-    """The preflight sequence with plant, controller and sequencer as processes of their own; the run's exit status."""
+    """The preflight with plant, C firmware and sequencer as processes of their own; the run's exit status."""
+    from rig.firmware.build import build_controller
+
     with contextlib.ExitStack() as stack:
         stack.enter_context(background(out, "candump", "candump", "-L", "-r", "16777216", "vcan0"))
         time.sleep(0.5)  # candump says nothing when it is ready
-        nodes = {}
-        for name in ("plant", "controller"):
-            nodes[name] = stack.enter_context(background(out, name, RIG, "node", name, "--bus", BUS))
-        words = ["run", "preflight", "--bus", BUS, "--controller", "external", "--pace", "lockstep", "--seed", "1"]
+        commands = {"plant": [RIG, "node", "plant", "--bus", BUS], "controller": [build_controller(), BUS]}
+        nodes = {name: stack.enter_context(background(out, name, *words)) for name, words in commands.items()}
+        words = ["run", "preflight", "--bus", BUS, "--controller", "external", "--pace", "lockstep"]
         with (out / "run.json").open("wb") as answer, (out / "run.log").open("wb") as log:
             begin = time.monotonic()
             words += ["--json", "--out", str(out / "run")]

@@ -17,6 +17,7 @@ from pathlib import Path
 import dissect
 import numpy as np
 import pytest
+from log_rows import read_row_bytes
 from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTE
 from vcan_host import FOLDER, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
 
@@ -70,7 +71,7 @@ def frames(out: Path) -> list[tuple[int, bytes]]:
 def test_preflight_passes_with_three_processes(
     out: Path, frames: list[tuple[int, bytes]], record_property: Callable[[str, object], None]
 ) -> None:
-    """Plant, controller and sequencer are processes that share nothing but vcan0."""
+    """Plant, firmware in C and sequencer are processes that share nothing but vcan0."""
     facts = json.loads((out / "facts.json").read_text())
     logs = "\n".join(f"{name}: {(out / f'{name}.log').read_text()}" for name in ("plant", "controller", "run"))
     text = (out / "run.json").read_text()
@@ -82,6 +83,14 @@ def test_preflight_passes_with_three_processes(
     counts = Counter(cob_id for cob_id, _ in frames)
     assert counts[0x080] >= answer["timing"]["cycles"] > 1000
     record_property(NOTE, f"vcan0: preflight by three processes, {counts[0x080]} cycles in {facts['seconds']:.0f} s")
+
+
+def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(
+    out: Path, frames: list[tuple[int, bytes]], preflight: Path
+) -> None:
+    """The firmware in C and the compiled plant on vcan0, beside all that is in Python on the embedded bus."""
+    rows = [read_row_bytes(folder) for folder in (out / "run", preflight)]
+    assert rows[0] == rows[1] and len(rows[0]) == 14_500
 
 
 def test_cyclic_frames_are_in_order(frames: list[tuple[int, bytes]]) -> None:
