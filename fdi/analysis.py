@@ -58,7 +58,7 @@ class Plot(str):
         return drawing.figure
 
     def to_plotly(self) -> Any:
-        """The figure as a `plotly.graph_objects.Figure`, which can be zoomed and read off.
+        """The figure as a Figure of plotly, which can be zoomed and read off.
 
         Raises:
             InputError: plotly is not installed.

@@ -8,7 +8,7 @@ import pytest
 from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
-pytest_plugins = ["plugin_bus_summary"]
+pytest_plugins = ["plugin_bus_summary", "pytester"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell script starts what it puts in the background with Ctrl-C ignored, and children inherit that. The tests of

@@ -190,11 +190,23 @@ class JointSearch:
         fits = self.map_alone(lambda each: self.descend(each[1], ((1.0, 8),)), close)
         done = list(zip([effects for effects, _ in close], fits, strict=True))
         best = min(done, key=_get_cost)
+        if len(best[0]) > 1:
+            self.progress(f"last fits without one of {_describe(best[0])}", 0.85)
+            done += self.map_alone(lambda effect: self._leave_out(best, effect), best[0])
         if not is_noise_left(self.problem, best[1]) and self._is_near(best[1]):
             self.progress(f"another start, {_describe(best[0])}", 0.9)
             again = self.map_alone(lambda part: self._restart(best[1], part), (1.0, 0.5))
             done[done.index(best)] = (best[0], min([best[1], *again], key=lambda f: f.cost))
         return done
+
+    def _leave_out(self, named: Named, effect: str) -> Named:
+        """The fit without one of its effects: the search may have needed it only to leave a wrong valley."""
+        effects, fit = named
+        dropped = set(CATALOGUE[effect].fitted)
+        kept = [k for k, f in enumerate(fit.free) if f.name not in dropped]
+        none = np.empty((0, 0))
+        begun = replace(fit, free=tuple(fit.free[k] for k in kept), x=fit.x[kept], cost=np.inf, jacobian=none)
+        return tuple(e for e in effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8)))
 
     def _is_near(self, fit: Fit, far: float = 7.0) -> bool:
         return max(measure_ratios(self.problem, fit)) < far

@@ -20,7 +20,7 @@ MARKERS = {"|": "line-ns-open", "_": "line-ew-open", "s": "square", "D": "diamon
 
 
 def convert_figure(figure: Figure) -> Any:
-    """A matplotlib figure as a `plotly.graph_objects.Figure`: lines, areas, bars, shaded bands, maps and texts.
+    """A matplotlib figure as one of plotly: lines, areas, bars, shaded bands, maps and texts.
 
     Lines that are shared by all plots of a column stay shared when zoomed. Contours and legends' places are left out.
 

@@ -43,8 +43,9 @@ Floats = NDArray[np.float64]
 
 MOST_TERMS = 3
 PROPOSED = 14  # terms of each balance that a replay looks at
-FITTED = 5  # that get a fit
-SIZES = (0.3, 0.6, 1.0, 1.5)  # times the regression's coefficient: the tolerances of the base fit hide a part of it
+MOST_FITTED = 5  # that get a fit
+# Times the regression's coefficient: the tolerances of the base fit hide a part of it.
+TRIED_SIZES = (0.3, 0.6, 1.0, 1.5)
 FOLD_SECONDS = 0.7  # pieces of a run that go to the two halves in turn
 SCREENED = ("position", "speed", "pressure", "spool", "current", "command", "direction", "way", "time")
 
@@ -270,7 +271,7 @@ class _Worker:
         best: dict[str, _Ranked] = {}
         for each in sorted(ranked, key=lambda r: r.cost):
             best.setdefault(each.proposal.term.name, each)
-        worth = [each for each in best.values() if each.cost < now.cost - GAIN_CONVINCES][:FITTED]
+        worth = [each for each in best.values() if each.cost < now.cost - GAIN_CONVINCES][:MOST_FITTED]
         fits = self.search.map_parallel(lambda each: self.fit_term(now.terms, each), worth)
         return sorted(fits, key=lambda t: t.cost)
 
@@ -289,11 +290,11 @@ class _Worker:
 
     def rank_by_replay(self, terms: Sequence[Term], fit: Fit, place: str, proposals: Sequence[Proposal]
                        ) -> list[_Ranked]:
-        """Cost of each proposal at each of `SIZES`, after the tolerances have moved linearly."""
+        """Cost of each proposal at each of `TRIED_SIZES`, after the tolerances have moved linearly."""
         if not proposals:
             return []
         problem = self.problem(terms, place)
-        tried = [(p, factor) for p in proposals for factor in SIZES]
+        tried = [(p, factor) for p in proposals for factor in TRIED_SIZES]
         own = [{name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0) for f, v in p.values.items()}
                for p, factor in tried]
         names = list(dict.fromkeys([f.name for f in fit.free] + [n for values in own for n in values]))

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.balance import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States
+from fdi.discovery.laws.dependence import FOLDS
 from fdi.discovery.laws.terms import PARTS, TERMS, Term
 from fdi.thresholds import UNIT_TOLERANCE
 
 Floats = NDArray[np.float64]
 
 THINNED = 3  # every so many rows: smoothing has made neighbours alike
-FOLDS = 10
 SCALES = (0.02, 0.05, 0.1, 0.2, 0.4)  # of a scale, times the largest state
 TURNS = np.geomspace(1.0, 60.0, 240)  # of a wave over the range of the position
 FUNCTIONS: Mapping[str, Any] = {
