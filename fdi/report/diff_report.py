@@ -76,9 +76,13 @@ def _tabulate_runs(found: RunDifferences) -> Table:
     rows: list[list[Cell | str]] = []
     for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
         trace, word = run.trace, read_verdict(run.trace).word
-        agrees: Cell | str = "" if pair is None else "yes" if pair.has_same_command else Cell("no", "bad")
+        agrees: Cell | str = ""
+        offset = ""
+        if pair is not None:
+            agrees = "yes" if pair.has_same_command else Cell("no", "bad")
+            offset = f"{pair.offset:.6g}"
         rows.append([run.label, run.source, word, f"{len(trace) * trace.period:.3f}", f"{1e3 * trace.period:g}", agrees,
-                     "" if pair is None else f"{pair.offset:.6g}"])
+                     offset])
     return Table(columns, rows, "Offset: time of A minus time of the run in the same cycle.")
 
 

@@ -46,9 +46,17 @@ def _format_value(check: Check | None) -> Cell | str:
 
 
 def _join_verdicts(results: Sequence[Check | None]) -> Cell:
-    words = ["-" if check is None else "pass" if check.passed else "FAIL" for check in results]
-    return Cell(" -> ".join(words) if len(set(words)) > 1 else words[0],
-                "bad" if "FAIL" in words else "good" if "pass" in words else "muted")
+    words = [_name_verdict(check) for check in results]
+    text = " -> ".join(words) if len(set(words)) > 1 else words[0]
+    if "FAIL" in words:
+        return Cell(text, "bad")
+    return Cell(text, "good" if "pass" in words else "muted")
+
+
+def _name_verdict(check: Check | None) -> str:
+    if check is None:
+        return "-"
+    return "pass" if check.passed else "FAIL"
 
 
 def tabulate_facts(heading: str, labels: Sequence[str], facts: Mapping[str, Sequence[str]],

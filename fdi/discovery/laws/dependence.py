@@ -66,7 +66,10 @@ def _cut_range(x: Floats, bins: int) -> Floats:
 
 def _find_bins(choice: Sequence[str], states: Mapping[str, Floats], edges: Mapping[str, Mapping[int, Floats]]
                ) -> Places:
-    bins = PAIR_BINS if len(choice) > 1 else FINE_BINS if choice[0] == "position" else SINGLE_BINS
+    if len(choice) > 1:
+        bins = PAIR_BINS
+    else:
+        bins = FINE_BINS if choice[0] == "position" else SINGLE_BINS
     place = np.zeros(len(states[choice[0]]), np.int64)
     for name in choice:
         place = place * bins + np.searchsorted(edges[name][bins], states[name], side="right")
