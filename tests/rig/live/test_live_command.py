@@ -53,7 +53,7 @@ def test_screen_of_a_run(tmp_path: Path) -> None:
     assert len(plots) >= 3  # it moves
     assert any("node 2 controller operational" in frame and "node 3 plant      operational" in frame for frame in shown)
     assert any("measures " in frame for frame in shown)
-    assert any(re.search(r"PASS {2,}[a-z]", frame) for frame in shown)  # which check depends on the frames drawn in time
+    assert any(re.search(r"PASS {2,}[a-z]", frame) for frame in shown)  # which check: as frames are drawn in time
     assert any(re.search(r"response p50 \d+ p99 \d+ max \d+ us", frame) for frame in shown)
     assert "lockstep" in frames[-1]
 
