@@ -41,6 +41,7 @@ FOLDER_MAY_IMPORT = {
     "fdi.foreign_code": set(),
     "fdi.analysis": {"fdi.foreign_code", *ESTIMATOR, "fdi.discovery", "fdi.identification", "fdi.diagnosis",
                      "fdi.prognosis", "fdi.report"},
+    "rig.interrupts": set(),
     "rig.junit": set(),
     "rig.network": set(),
     "rig.device": {"rig.network"},
@@ -50,10 +51,10 @@ FOLDER_MAY_IMPORT = {
     "rig.recorder": {"rig.network"},
     "rig.run": BENCH - {"rig.run", "rig.view", "rig.live", "rig.doctor"},
     "rig.view": {"rig.sequences"},
-    "rig.live": {"rig.network", "rig.sequences", "rig.recorder"},
+    "rig.live": {"rig.network", "rig.sequences", "rig.recorder", "rig.interrupts"},
     "rig.doctor": {"rig.network", "rig.run"},
     "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
-    "rig.studies": {*BENCH, "rig.junit"},
+    "rig.studies": {*BENCH, "rig.interrupts", "rig.junit"},
     "rig.testing": BENCH,
     "rig.cli": {*BENCH, "rig.conformance", "rig.junit", "rig.studies"},
 }

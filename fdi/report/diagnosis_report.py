@@ -263,10 +263,10 @@ def _tabulate_effects(d: Diagnosis) -> list[Item]:
     rows: list[list[Cell | str]] = []
     for e in b.explanations:
         sizes = "; ".join(_format_parameter(name, size) for name, size in e.parameters.items())
-        judged = d.refinement.is_explained
-        cells = [cell for f in FAULTS for cell in (
-            format_size(f, e.sizes[f.name]),
-            Cell(LEVEL_NAMES[e.levels[f.name] if judged else None], LEVEL_MOODS[e.levels[f.name] if judged else None]))]
+        cells: list[Cell | str] = []
+        for f in FAULTS:
+            level = e.levels[f.name] if d.refinement.is_explained else None
+            cells += [format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level])]
         rows.append([name_explanation(e), f"{100 * e.weight:.0f}", sizes or NO_NUMBER, *cells,
                      format_ratio(max(e.refinement.ratio.values()))])
     words = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if

@@ -4,13 +4,12 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 
+from rig.interrupts import ignore_interrupts
 from rig.live.feed import LiveFeed, make_shared_file
 from rig.live.live_run import LivePlan
 
@@ -29,7 +28,7 @@ def show_live(plan: LivePlan, last_cpu_is_taken: bool, patience: float = 20.0) -
     """
     with make_shared_file() as file:
         feed = LiveFeed(file.fileno())
-        with _ignore_interrupt():
+        with ignore_interrupts():
             process = subprocess.Popen([sys.executable, "-m", "rig.live.dashboard", str(file.fileno())],
                                        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
         try:
@@ -67,16 +66,3 @@ def _end_process(process: subprocess.Popen[bytes]) -> None:
     if process.returncode != 0 and sys.stderr.isatty():
         sys.stderr.write("\033[?1049l\033[?25h")  # leave the second screen, show the cursor
         sys.stderr.flush()
-
-
-@contextlib.contextmanager
-def _ignore_interrupt() -> Iterator[None]:
-    """A process that is started meanwhile ignores Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import pickle
 import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import connection, get_context
@@ -16,6 +15,7 @@ from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import RigError
+from rig.interrupts import ignore_interrupts
 from rig.network.clock import WallClock
 
 Job = TypeVar("Job")
@@ -122,7 +122,7 @@ class _Worker(Generic[Job]):
         context = get_context("spawn")
         self.connection, far_end = context.Pipe()
         self.process = context.Process(target=_serve_jobs, args=(far_end, work), daemon=True)
-        with _ignore_interrupts():
+        with ignore_interrupts():
             self.process.start()
         far_end.close()
         self.job: tuple[Job, int] | None = None
@@ -200,16 +200,3 @@ def _make_picklable(error: Exception) -> Exception:
     except Exception:
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
-
-
-@contextlib.contextmanager
-def _ignore_interrupts() -> Iterator[None]:
-    """Processes started inside ignore Ctrl-C, which the terminal sends to them as well; this process ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
