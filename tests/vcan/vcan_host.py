@@ -41,7 +41,7 @@ def guest_missing() -> str:
     return subprocess.run(["bash", str(GUEST), "--check"], capture_output=True, text=True).stderr.strip()
 
 
-def in_guest(*command: str | Path, timeout_s: int = 800) -> subprocess.CompletedProcess[str]:
+def in_guest(*command: str | Path, timeout_s: int = 1800) -> subprocess.CompletedProcess[str]:
     """Run a command with vcan0 in the project's folder: directly where the kernel can, else in the guest."""
     words = [str(word) for word in command]
     if not kernel_has_vcan0():

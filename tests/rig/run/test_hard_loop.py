@@ -1,12 +1,16 @@
-"""The compiled cycle on a real bus, against nodes that answer as the script says."""
+"""The compiled cycle on a real bus, against nodes that answer as the script says.
+
+Any thread may stand still for half a second here: the machine is shared. So these tests ask for order and number and
+for what follows from what, and where an answer is needed they play on until it has come.
+"""
 from __future__ import annotations
 
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from itertools import pairwise, takewhile
+from itertools import groupby, pairwise
 from math import isnan
 
 import pytest
@@ -74,6 +78,13 @@ class Nodes(threading.Thread):
         self.join()
         self._link.close()
 
+    def wait_for(self, cob_id: int, data: bytes, limit: float = 60.0) -> None:
+        """Until they have heard this frame."""
+        end = time.monotonic() + limit
+        while not any((frame.cob_id, frame.data) == (cob_id, data) for frame in reversed(self.heard[:])):
+            assert time.monotonic() < end, f"the nodes have not heard 0x{cob_id:03X} for {limit:g} s"
+            time.sleep(0.005)
+
     def commands(self) -> list[codec.Command]:
         return [codec.unpack_command(frame.data) for frame in self.heard if frame.cob_id == codec.COMMAND]
 
@@ -106,6 +117,7 @@ class Bench:
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bus = open_raw_bus(where, RECEIVED)
         self.loop = HardLoop(self.master, schedule, self, bus, PERIOD, realtime, ahead)
+        self._markers = 0
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         self.times.append(t_ns)
@@ -117,8 +129,33 @@ class Bench:
         for k in cycles:
             self.loop.cycle(CycleInput(phase, k * 1e-7, float(k), control))
 
+    def play_until(self, is_done: Callable[[], bool], limit: float = 60.0) -> None:
+        """Real time: let cycles pass, with the last demand again, until `is_done()`."""
+        end = time.monotonic() + limit
+        while not is_done():
+            assert time.monotonic() < end, f"not in {limit:g} s of cycles"
+            self.loop.serve()
+
+    def settle(self) -> None:
+        """Until the nodes have heard all that was sent: this frame comes to them behind it."""
+        self._markers += 1
+        marker = 0x7FE, bytes((self._markers,))
+        self.wire.link.send(*marker)
+        self.nodes.wait_for(*marker)
+
     def demands(self) -> list[int]:
         return [round(row.com * 1e7) for row in self.rows]
+
+    def check_demands(self, expected: list[int], idle: Collection[int] = ()) -> None:
+        """These demands in this order, in consecutive cycles. A demand that is not one of `idle` stays for longer only
+        because this program had not queued the next one in time, and each such cycle is an underrun.
+        """
+        demands = self.demands()
+        assert [demand for demand, _ in groupby(demands)] == expected
+        assert [row.cycle for row in self.rows] == list(range(len(demands)))
+        repeated = [k for k in range(1, len(demands)) if demands[k] == demands[k - 1] and demands[k] not in idle]
+        assert self.loop.underruns == len(repeated) <= self.loop.overruns
+        assert all(self.timings[k].overrun for k in repeated)
 
 
 @contextmanager
@@ -138,23 +175,34 @@ paces = pytest.mark.parametrize("realtime", [False, True], ids=["lockstep", "rea
 @raw_kinds
 @paces
 def test_a_row_holds_what_belongs_together(bus_kind: str, realtime: bool) -> None:
+    """Valve state and drive carry the number of their cycle. Feedback does not: a late one is the next cycle's."""
     with bench(bus_kind, realtime) as one:
         one.play(*range(30))
+
+        def whole() -> list[Signals]:
+            """Rows with all three answers, and feedback of their own SYNC."""
+            return [row for row in one.rows if not (isnan(row.xj) or isnan(row.xs) or isnan(row.cor))
+                    and round(row.xj * 1e6) == row.cycle]
+
+        if realtime:
+            assert one.loop.wait_until_played(lambda: False)
+            one.play_until(lambda: bool(whole()))
         one.loop.finish()
-        assert [row.cycle for row in one.rows] == one.demands() == list(range(30))
+        one.check_demands(list(range(30)), idle=[29])
         assert all(later - earlier == PERIOD for earlier, later in pairwise(one.times)) or realtime
-        answered = list(takewhile(lambda row: not (isnan(row.xj) or isnan(row.xs) or isnan(row.cor)), one.rows))
-        assert len(answered) == 30 or realtime  # when the machine stands still, answers are late
-        for row in answered:
+        assert len(whole()) == 30 or realtime
+        for row in one.rows:
             k = row.cycle
-            assert (row.xj, row.p12, row.xs, row.cor) == pytest.approx((k * 1e-6, k * 10.0, k * 1e-9, k * 1e-8))
-            assert (row.phase, row.load, row.control, row.status, row.flags) == (1, float(k), 7, 15, 0)
+            assert isnan(row.xs) or row.xs == pytest.approx(k * 1e-9)
+            assert isnan(row.cor) or (row.cor == pytest.approx(k * 1e-8) and row.status == 15)
+            assert isnan(row.xj) or (row.xj <= (k + 0.5) * 1e-6 and row.p12 == pytest.approx(row.xj * 1e7))
+            assert (row.phase, row.load, row.control, row.flags) == (1, min(float(k), 29.0), 7, 0) or one.loop.underruns
+        feedback = [round(row.xj * 1e6) for row in one.rows if not isnan(row.xj)]
+        assert feedback == sorted(set(feedback))
         assert one.nodes.order()[:6] == ["c0", "s0", "c1", "s1", "c2", "s2"]
         assert all(timing.execution > 0 for timing in one.timings)
-        for timing in (one.timings[row.cycle] for row in answered):
+        for timing in (one.timings[row.cycle] for row in whole()):
             assert 0 < timing.feedback_response <= timing.valve_response <= timing.response <= timing.work
-        if not answered:
-            pytest.skip("the machine stood still in the first cycle: no row has all answers")
 
 
 @raw_kinds
@@ -167,11 +215,18 @@ def test_every_frame_reaches_the_log_once_and_in_order(bus_kind: str, realtime: 
         for k in range(30):
             one.play(k)
             other.send(0x123, bytes([k]))
+
+        def drives() -> list[bytes]:
+            return [frame.data for frame in one.frames if frame.cob_id == codec.DRIVE]
+
+        if realtime:
+            assert one.loop.wait_until_played(lambda: False)
+            one.play_until(lambda: len(drives()) >= 30)
         one.loop.finish()
         other.close()
-        time.sleep(0.1)
         one.wire.poll(0.0)
         one.loop.close()
+        one.settle()
         assert all(earlier.t_ns <= later.t_ns for earlier, later in pairwise(one.frames))
         logged = [(frame.cob_id, frame.data) for frame in one.frames]
         assert [data[0] for cob_id, data in logged if cob_id == 0x123] == list(range(30))
@@ -179,11 +234,8 @@ def test_every_frame_reaches_the_log_once_and_in_order(bus_kind: str, realtime: 
         for cob_id in (codec.COMMAND, codec.SYNC, 0x701):
             mine = [data for each, data in logged if each == cob_id]
             assert mine == [data for each, data in heard if each == cob_id] and mine
-        drives = [data for cob_id, data in logged if cob_id == codec.DRIVE]
-        assert drives == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives))]
-        assert len(drives) == 30 or realtime
-        if len(drives) < 30:
-            pytest.skip("the machine stood still: the last answers came after the loop had ended")
+        assert drives() == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives()))]
+        assert len(drives()) == 30 or (realtime and len(drives()) > 30)
 
 
 @raw_kinds
@@ -203,18 +255,27 @@ def test_nothing_is_compiled_once_the_loop_is_made(bus_kind: str, realtime: bool
 @raw_kinds
 @paces
 def test_commands_lost_and_late(bus_kind: str, realtime: bool) -> None:
+    """A late command is sent before the first SYNC that is due after it."""
     faults = (Lost(frame="command", start=0.001, end=0.002), Late(frame="command", start=0.003, end=0.004, delay=4e-3),
               Late(frame="command", start=0.005, end=0.006, delay=25e-3))
     with bench(bus_kind, realtime, *faults) as one:
         one.play(*range(12))
         one.loop.finish()
-        time.sleep(0.05)
-        order = one.nodes.order()
-        assert [name for name in order if name[0] == "s"] == [f"s{k}" for k in range(12)]
+        one.settle()
+        order, count = one.nodes.order(), len(one.rows)
+        assert [name for name in order if name[0] == "s"] == [f"s{k}" for k in range(count)]
         assert [name for name in order if name[0] == "c" and name not in ("c3", "c5")] == [
-            f"c{k}" for k in range(12) if k not in (1, 3, 5)]
-        assert order.index("s3") < order.index("c3") < order.index("s4")
-        assert order.index("s7") < order.index("c5") < order.index("s8")
+            f"c{k}" for k in range(count) if k not in (1, 3, 5)]
+        due = [one.times[0], *(t_ns + PERIOD for t_ns in one.times)]  # before missed due times are dropped
+        following = []
+        for k, delay in ((3, 4_000_000), (5, 25_000_000)):
+            following.append(next(each for each in range(k + 1, count) if due[each] > one.times[k] + delay))
+            before, after = (order.index(f"s{each}") for each in (following[-1] - 1, following[-1]))
+            assert before < order.index(f"c{k}") < after
+        if all(later - earlier == PERIOD for earlier, later in pairwise(one.times)):
+            assert following == [4, 8]
+        else:
+            assert realtime and one.loop.overruns
 
 
 @raw_kinds
@@ -228,61 +289,86 @@ def test_commands_and_syncs_changed_by_faults(bus_kind: str) -> None:
     with bench(bus_kind, True, *faults) as one:
         one.play(*range(16))
         one.loop.finish()
-        time.sleep(0.05)
+        one.settle()
+        one.check_demands(list(range(16)))
+        more = len(one.rows) - 16  # the last demand again, while this program stood still
+        assert one.demands()[:15] == list(range(15))
         heard = [frame for frame in one.nodes.heard if frame.cob_id in (codec.SYNC, codec.COMMAND)]
-        assert sum(frame.cob_id == codec.SYNC for frame in heard) == 16 - 1 + 1 - 2
+        assert sum(frame.cob_id == codec.SYNC for frame in heard) == 16 - 1 + 1 - 2 + more
         commands = [frame.data for frame in heard if frame.cob_id == codec.COMMAND]
-        plain = [codec.pack_command(k * 1e-7, 7, k) for k in range(16)]
+        plain = [codec.pack_command(min(k, 15) * 1e-7, 7, k) for k in range(16 + more)]
         inverted = bytes(255 - byte for byte in plain[6])
         assert commands == [*plain[:6], inverted, plain[7][:3], plain[8], *plain[8:10], *plain[12:]]
-        assert all(isnan(row.xj) for row in one.rows if row.cycle in (2, 10, 11))
+        for cycle, syncs in ((2, 2), (10, 10), (11, 10)):  # no SYNC in this cycle, so many before
+            answered = {round(row.xj * 1e6) for row in one.rows[:cycle] if not isnan(row.xj)}
+            xj = one.rows[cycle].xj
+            late = not isnan(xj) and syncs - 1 not in answered and round(xj * 1e6) in set(range(syncs)) - answered
+            assert isnan(xj) or late
 
 
 @raw_kinds
-def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str) -> None:
-    with bench(bus_kind, True, Silent(node="rig", start=0.010, end=0.030)) as one:
-        one.master._beat.configure(10, one.wire.clock.now())
-        one.play(*range(60))
+@paces
+def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the cycles of the fault none is sent, before and behind them some are, and the nodes hear no other."""
+    with bench(bus_kind, realtime, Silent(node="rig", start=0.1, end=0.13)) as one:
+        cycles = [0]  # the cycle whose faults the rig goes by, the last one now
+        beats: list[int] = []  # that cycle for each heartbeat
+        set_faults, send = one.loop._set_rig_faults, one.master.send
+
+        def note_cycle(k: int) -> None:
+            cycles.append(k)
+            set_faults(k)
+
+        def note_beat(cob_id: int, data: bytes) -> None:
+            assert cob_id == 0x701
+            beats.append(cycles[-1])
+            send(cob_id, data)
+
+        monkeypatch.setattr(one.loop, "_set_rig_faults", note_cycle)
+        monkeypatch.setattr(one.master, "send", note_beat)
+        one.master._beat.configure(1, one.wire.clock.now())
+        one.play(*range(160))
+        if realtime:
+            assert one.loop.wait_until_played(lambda: False)
+            one.play_until(lambda: bool(beats) and beats[-1] >= 130)
         one.loop.finish()
-        time.sleep(0.05)
-        syncs, beats = 0, set()
-        for frame in one.nodes.heard:
-            syncs += frame.cob_id == codec.SYNC
-            if frame.cob_id == 0x701:
-                beats.add(syncs)
-        assert min(beats) < 11 and max(beats) > 31 and not beats & set(range(13, 29))
+        one.settle()
+        assert cycles == sorted(cycles) and cycles[-1] >= 159
+        assert min(beats) < 100 and max(beats) >= 130 and not set(beats) & set(range(100, 130))
+        assert sum(frame.cob_id == 0x701 for frame in one.nodes.heard) == len(beats)
 
 
 @raw_kinds
 def test_an_empty_queue_holds_the_last_demand(bus_kind: str) -> None:
-    """And each such cycle counts as an overrun, as others may on a busy machine: the bench left its sequence."""
+    """And each such cycle counts as an overrun: the bench left its sequence."""
     with bench(bus_kind, True, ahead=10) as one:
         one.play(*range(5))
-        while one.loop.k < 12:
-            one.loop.serve()
+        one.play_until(lambda: one.loop.k >= 12)
         one.play(20, 21)
         one.loop.finish()
-        held = one.demands().count(4) - 1
-        assert one.demands() == [0, 1, 2, 3, *[4] * (held + 1), 20, 21] and held >= 7
-        assert [row.cycle for row in one.rows] == list(range(held + 7))
-        assert all(timing.overrun for timing in one.timings[5:12])
-        assert one.loop.underruns == held <= one.loop.overruns
+        one.check_demands([0, 1, 2, 3, 4, 20, 21])
+        assert one.loop.underruns == len(one.rows) - 7 >= 12 - 5
         assert {row.control for row in one.rows} == {7}
 
 
 @raw_kinds
 def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
+    """Neither is the hold behind it."""
     with bench(bus_kind, True) as one:
         one.play(*range(10))
         assert one.loop.wait_until_played(lambda: False) and one.loop.waiting == 0
+        underruns, k = one.loop.underruns, one.loop.k
+        one.play_until(lambda: one.loop.k >= k + 3)
         assert one.loop.hold(2) == pytest.approx(9e-7)
-        while one.loop.k < 14:
-            one.loop.serve()
+        held = one.loop.k
+        one.play_until(lambda: one.loop.k >= held + 3)
+        assert one.loop.underruns == underruns
         one.play(30, phase=2)
         one.loop.finish()
-        assert one.loop.underruns == 0
-        assert [row.phase for row in one.rows] == [1] * 10 + [2] * (len(one.rows) - 10)
-        assert one.demands()[-1] == 30 and set(one.demands()[10:-1]) == {9}
+        one.check_demands([*range(10), 30], idle=[9])
+        phases = [row.phase for row in one.rows]
+        assert phases == sorted(phases) and set(phases) == {1, 2}
+        assert set(phases[:10]) == {1} and set(phases[held:]) == {2}
 
 
 @raw_kinds
@@ -290,35 +376,34 @@ def test_hold_discards_what_is_queued(bus_kind: str) -> None:
     """An abort: nothing of the rest is sent, and clean-up begins where the demand was."""
     with bench(bus_kind, True, ahead=500) as one:
         one.play(*range(400))
-        while one.loop.k < 5:
-            one.loop.serve()
+        one.play_until(lambda: one.loop.k >= 5)
         demand = round(one.loop.hold(2) * 1e7)
+        held = one.loop.k
         assert 4 <= demand < 400
         one.play(1000, phase=2)
         one.loop.finish()
-        assert one.demands()[:demand + 1] == list(range(demand + 1))
-        assert set(one.demands()[demand + 1:-1]) <= {demand} and one.demands()[-1] == 1000
-        assert {row.phase for row in one.rows[demand + 1:]} == {2}
-        assert one.loop.underruns == 0
-        time.sleep(0.05)
-        assert max(round(command.position * 1e7) for command in one.nodes.commands()[:-1]) == demand
+        one.check_demands([*range(demand + 1), 1000], idle=[demand])
+        assert {row.phase for row in one.rows[:demand]} == {1} and {row.phase for row in one.rows[held:]} == {2}
+        one.settle()
+        assert [round(command.position * 1e7) for command in one.nodes.commands()] == one.demands()
 
 
 @raw_kinds
 def test_the_control_word_is_overridden_in_the_next_cycle(bus_kind: str) -> None:
     with bench(bus_kind, True, ahead=100) as one:
         one.play(*range(60))
-        while one.loop.k < 5:
-            one.loop.serve()
+        one.play_until(lambda: one.loop.k >= 5)
+        before = one.loop.k
         one.loop.override_control(0)
-        now = one.loop.k
+        after = one.loop.k
         one.play(60, 61, control=3)
         one.loop.finish()
+        one.check_demands(list(range(62)))
         words = [row.control for row in one.rows]
-        first = words.index(0)
-        assert now <= first <= now + 1
-        assert words == [7] * first + [0] * (60 - first) + [3, 3]
-        time.sleep(0.05)
+        assert [word for word, _ in groupby(words)] == [7, 0, 3]
+        assert before <= words.index(0) <= after + 1
+        assert one.demands()[words.index(3)] == 60
+        one.settle()
         assert [command.control for command in one.nodes.commands()] == words
 
 
@@ -328,8 +413,7 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
     with bench(bus_kind, True) as one:
         turn = Turn(one.where.partition(":")[2], PORT)
         one.play(*range(20))
-        while one.loop.k < 5:
-            one.loop.serve()
+        one.play_until(lambda: one.loop.k >= 5)
         turn.take()
         time.sleep(5.2 * PERIOD * 1e-9)
         turn.give()
@@ -340,9 +424,9 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
         late = [k for k, timing in enumerate(one.timings) if timing.lateness > 0.5 * PERIOD * 1e-9]
         assert late and all(one.timings[k].overrun for k in late)
         assert one.loop.overruns >= 4
-        assert [row.cycle for row in one.rows] == list(range(20))
+        one.check_demands(list(range(20)))
         sent = [frame.t_ns for frame in one.frames if frame.cob_id == codec.SYNC]
-        assert len(sent) == 20
+        assert len(sent) == len(one.rows)
 
 
 @raw_kinds
@@ -366,9 +450,13 @@ def test_nodes_that_are_gone_do_not_hold_up_lockstep_for_long(bus_kind: str) -> 
         one.play(*range(25))
         assert one.wire.clock.now() - before < 10e9
         one.nodes.mute = False
-        one.play(25)
+        played = 25
+        while played < 400 and (not one.rows or isnan(one.rows[-1].xj)):
+            one.play(played)
+            played += 1
         one.loop.finish()
-        assert one.rows[-1].xj == pytest.approx(25e-6)
+        answers = [row.xj for row in one.rows if not isnan(row.xj)]
+        assert answers and 24.5e-6 < answers[0] < (played - 0.5) * 1e-6
 
 
 @raw_kinds
@@ -423,4 +511,5 @@ def test_closing_ends_the_thread_whatever_is_queued() -> None:
         one.play(*range(400))
         assert threading.active_count() > before
     assert threading.active_count() == before
-    assert len(one.rows) < 400 and one.demands() == list(range(len(one.rows)))
+    assert len(one.rows) < 400
+    one.check_demands(list(range(len({row.com for row in one.rows}))))
