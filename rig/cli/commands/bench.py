@@ -15,15 +15,16 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
     parser.add_argument("what", nargs="?", default="plant",
-                        choices=("plant", "realtime", "explain", "robustness", "faults", "recordings"),
+                        choices=("plant", "realtime", "live", "explain", "robustness", "faults", "recordings"),
                         help="plant: speed of the plant (default); realtime: lateness and response of the cycle beside "
-                             "cyclictest and C; explain: how often rig explain is right; "
+                             "cyclictest and C; live: both with and without rig run --live; "
+                             "explain: how often rig explain is right; "
                              "robustness: invented frames, killed processes, full disks, long work; "
                              "faults: every fault on the bus in every phase of a motion, a matrix; "
                              "recordings: CPU time and memory of compare, explain and fdi by length of the recording")
     parser.add_argument("--accuracy", action="store_true",
                         help="also the error of the default step size and of others, against 0.2 us (half a minute)")
-    add = parser.add_argument_group("rig bench realtime").add_argument
+    add = parser.add_argument_group("rig bench realtime, rig bench live").add_argument
     add("--bus", default="auto", metavar="INTERFACE:CHANNEL",
         help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)")
     add("--seconds", type=float, default=60.0, metavar="S", help="time for each contender (default: 60)")
@@ -54,6 +55,8 @@ def run_command(args: argparse.Namespace) -> int:
         return _study_robustness(args)
     if args.what == "realtime":
         return _run_realtime(args)
+    if args.what == "live":
+        return _run_live(args)
     if args.what == "faults":
         return _study_bus_faults(args)
     if args.what == "recordings":
@@ -78,33 +81,68 @@ def run_command(args: argparse.Namespace) -> int:
     return 0
 
 
+def choose_bench_bus(args: argparse.Namespace, least_block: float) -> str:
+    """The bus of a benchmark in real time: --bus, or a UDP group of this process's own.
+
+    Raises:
+        InputError: a time for each block below `least_block` s, or no block.
+    """
+    import os
+
+    from plant.errors import InputError
+
+    if args.blocks < 1:
+        raise InputError("--blocks", str(args.blocks), "1 or more")
+    if not args.seconds >= least_block * args.blocks:
+        raise InputError("--seconds", f"{args.seconds:g}", f"{least_block:g} s or more for each block")
+    number = os.getpid()
+    bus: str = args.bus
+    return f"udp_multicast:239.74.{number >> 8 & 255}.{number & 255}" if bus == "auto" else bus
+
+
 def _run_realtime(args: argparse.Namespace) -> int:
     """The cycle in real time; exit status 0 if every target that could be measured is met, 1 otherwise.
 
     Raises:
         InputError: a bus that compiled code cannot use, or a time or number of blocks that is too small.
     """
-    import os
-
     from fdi.output import write_text
-    from plant.errors import InputError
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
     from rig.studies.benchmarks.realtime import measure_realtime
     from rig.studies.benchmarks.realtime_report import build_realtime_report
 
-    if args.blocks < 1:
-        raise InputError("--blocks", str(args.blocks), "1 or more")
-    if not args.seconds >= 0.5 * args.blocks:
-        raise InputError("--seconds", f"{args.seconds:g}", "half a second or more for each block")
-    number = os.getpid()
-    own = f"udp_multicast:239.74.{number >> 8 & 255}.{number & 255}"
+    bus = choose_bench_bus(args, 0.5)
     with show_progress(is_silent=args.json or args.quiet, is_realtime=True) as progress:
-        figures = measure_realtime(own if args.bus == "auto" else args.bus, args.seconds, args.blocks, progress)
+        figures = measure_realtime(bus, args.seconds, args.blocks, progress)
     if args.out is not None:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_realtime_report(figures), args)
     return 0 if all(target["is_met"] for target in figures["targets"] if target["value"] is not None) else 1
+
+
+def _run_live(args: argparse.Namespace) -> int:
+    """Runs with and without the live screen; exit status 0.
+
+    Raises:
+        InputError: a bus that compiled code cannot use, or a time or number of blocks that is too small.
+        RigError: a run that came to no verdict.
+    """
+    from fdi.output import write_text
+    from fdi.report.json import to_json
+    from rig.cli.answer import show_answer
+    from rig.cli.progress_bar import show_progress
+    from rig.studies.benchmarks.live_runs import measure_live_runs
+    from rig.studies.benchmarks.live_runs_report import build_live_runs_report
+
+    bus = choose_bench_bus(args, 1.0)
+    with show_progress(is_silent=args.json or args.quiet, is_realtime=True) as progress:
+        figures = measure_live_runs(bus, args.seconds, args.blocks, progress)
+    report = build_live_runs_report(figures)
+    if args.out is not None:
+        write_text(args.out, to_json(figures) + "\n")
+    show_answer(report, args)
+    return 0
 
 
 def _measure_recordings(args: argparse.Namespace) -> int:

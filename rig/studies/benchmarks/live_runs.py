@@ -1,0 +1,169 @@
+"""Runs in real time that are shown while they run beside runs that are not: lateness and response of their cycles.
+
+Every run is a whole `rig run` process in a terminal of its own. The contenders take turns in short blocks, so that a
+disturbance of the machine hits all of them. Runs without the screen take part twice: how much these two differ is the
+noise of the comparison.
+"""
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import termios
+from collections.abc import Mapping, Sequence
+from fcntl import ioctl
+from math import isfinite, log, nan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.geometric_mean import estimate_geometric_mean
+from fdi.progress import Progress, ignore_progress
+from fdi.trace.trace import Trace
+from plant.errors import InputError, RigError
+from rig.network.raw_bus import can_open
+from rig.run.hard_loop import compile_cycle
+from rig.run.priority import list_cpus
+from rig.studies.benchmarks.realtime import choose_priority, compute_percentiles
+
+Seconds = NDArray[np.float64]
+WITHOUT, AGAIN, LIVE = "without", "without, again", "--live"
+OPTIONS: Mapping[str, tuple[str, ...]] = {WITHOUT: (), AGAIN: (), LIVE: ("--live",)}
+QUANTITIES = ("lateness", "response", "feedback_response")
+SHARES = ("p50", "p99")
+_SEQUENCE = """title = "Live"
+setup = [{{ kind = "hold", time = 0.3 }}]
+main = [{{ name = "sine", kind = "sine", amplitude = 3e-3, frequency = 1.0, time = {seconds:g} }}]
+checks = [
+  {{ name = "tracking", kind = "rms_error", high = 1, unit = "mm" }},
+  {{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" }},
+]
+"""
+
+
+class Ratio(NamedTuple):
+    """How a percentile of a contender compares with that of the runs without a screen: geometric mean over blocks."""
+
+    quantity: str
+    share: str  # p50 or p99
+    contender: str
+    ratio: float
+    low: float  # of the simultaneous 95 % interval of all ratios; NaN with fewer than four blocks
+    high: float
+
+    @property
+    def word(self) -> str:
+        """slower, faster, no difference found, or, with fewer than four blocks, not known."""
+        if not isfinite(self.low):
+            return "not known"
+        if self.low > 1.0:
+            return "slower"
+        return "faster" if self.high < 1.0 else "no difference found"
+
+
+def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Measure all contenders on a bus for `seconds` each, in so many blocks.
+
+    Raises:
+        InputError: a bus that compiled code cannot use.
+        RigError: a run that came to no verdict.
+    """
+    if not can_open(bus):
+        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
+    compile_cycle(realtime=True)
+    found: dict[str, list[dict[str, Seconds]]] = {name: [] for name in OPTIONS}
+    for block in range(blocks):
+        turn = block % len(OPTIONS)  # nobody is always the first
+        names = [*OPTIONS][turn:] + [*OPTIONS][:turn]
+        for number, name in enumerate(names):
+            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(names)) / blocks)
+            found[name].append(play_run(bus, seconds / blocks, OPTIONS[name]))
+    return summarise_live_runs(found) | {
+        "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
+        "missing": {},
+        "ended_early": {name: sum(len(run["lateness"]) < 900.0 * seconds / blocks for run in runs)
+                        for name, runs in found.items()}}
+
+
+def play_run(bus: str, seconds: float, options: Sequence[str]) -> dict[str, Seconds]:
+    """Times of the cycles of main of a run with its emulator; NaN where no answer came.
+
+    Raises:
+        RigError: the run came to no verdict.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        sequence, folder = Path(name) / "live.toml", Path(name) / "run"
+        sequence.write_text(_SEQUENCE.format(seconds=seconds))
+        words = [sys.executable, "-m", "rig.cli.main", "run", str(sequence), "--bus", bus, "--pace", "realtime",
+                 "--max-overruns", "1", "--out", str(folder), *options]
+        status, text = run_in_terminal(words)
+        if status not in (0, 1, 3):  # a verdict, whichever
+            lines = [line for line in text.splitlines() if line.strip()] or ["it printed nothing"]
+            raise RigError(f"rig run {' '.join(options)} ended with status {status}: {lines[-1].strip()}")
+        timing = Trace.read(folder, all=True).timing
+    main = timing.t >= 0.0
+    return {name: getattr(timing, name)[main] for name in (*QUANTITIES, "overrun")}
+
+
+def run_in_terminal(words: Sequence[str], size: tuple[int, int] = (40, 120)) -> tuple[int, str]:
+    """Run a program in a terminal of its own, `size` lines and columns; its exit status and what it wrote last."""
+    ours, theirs = pty.openpty()
+    try:
+        ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", *size, 0, 0))
+        process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+                                   env=os.environ | {"TERM": "xterm-256color"})
+        os.close(theirs)
+        text = b""
+        try:
+            while data := _read_some(ours):
+                text = (text + data)[-4096:]
+        finally:
+            process.send_signal(signal.SIGTERM)  # without effect on one that has ended
+            process.wait()
+    finally:
+        os.close(ours)
+    return process.returncode, text.decode(errors="replace")
+
+
+def _read_some(number: int) -> bytes:
+    try:
+        return os.read(number, 65536)
+    except OSError:  # the other end is closed
+        return b""
+
+
+def summarise_live_runs(found: Mapping[str, Sequence[Mapping[str, Seconds]]]) -> dict[str, Any]:
+    """Percentiles in us by quantity and contender over all blocks and of each block, ratios, overruns.
+
+    Args:
+        found: contender -> of each block, quantity -> times in s, and which cycles are overruns.
+    """
+    pooled = {quantity: {name: compute_percentiles(np.concatenate([block[quantity] for block in blocks]))
+                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    single = {quantity: {name: [compute_percentiles(block[quantity]) for block in blocks]
+                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    return {"times_us": pooled, "blocks_us": single,
+            "ratios": [ratio._asdict() | {"word": ratio.word} for ratio in compare_contenders(single)],
+            "overruns": {name: int(sum(block["overrun"].sum() for block in blocks)) for name, blocks in found.items()},
+            "cycles": {name: sum(len(block["lateness"]) for block in blocks) for name, blocks in found.items()}}
+
+
+def compare_contenders(blocks_us: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> list[Ratio]:
+    """The ratios of all contenders to the runs without a screen, by the logarithms of the blocks' percentiles."""
+    found = []
+    others = [name for name in next(iter(blocks_us.values())) if name != WITHOUT]
+    count = len(QUANTITIES) * len(SHARES) * len([name for name in others if name != AGAIN])
+    for quantity in QUANTITIES:
+        for share in SHARES:
+            logs = {name: np.array([log(block[share]) if block.get(share, 0.0) > 0.0 else nan for block in blocks])
+                    for name, blocks in blocks_us[quantity].items()}
+            for name in others:
+                base = logs[WITHOUT] if name == AGAIN else (logs[WITHOUT] + logs[AGAIN]) / 2
+                found.append(Ratio(quantity, share, name, *estimate_geometric_mean(logs[name] - base, 0.05 / count, 4)))
+    return found
