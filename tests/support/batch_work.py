@@ -51,6 +51,32 @@ def run_sleeping_process(folder: str) -> None:
         subprocess.run(command, stdout=out, check=False)
 
 
+def run_process_without_signals(folder: str) -> None:
+    """The same in a worker that no longer sees SIGTERM, like one in compiled code that does not come to an end."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGALRM})
+    run_sleeping_process(folder)
+
+
+def lose_first_signal(file: str) -> str:
+    """Drop the exception of the first signal, as Python does in a destructor, and write down how the second one ends.
+
+    The job "" is done at once.
+    """
+    if not file:
+        return ""
+    try:
+        Path(file).touch()
+        time.sleep(60)
+    except SystemExit:
+        Path(file).write_text("lost")
+    try:
+        time.sleep(60)
+    except SystemExit as error:
+        Path(file).write_text(f"lost, ended by {error.code}")
+        raise
+    return file
+
+
 def exit_at_import() -> None:
     """Ends a process that unpickles it."""
     raise SystemExit(3)
@@ -67,7 +93,7 @@ class Unpicklable:
         return exit_at_import, ()
 
 
-if __name__ == "__main__":  # a user's process, to be interrupted: batch_work.py FOLDER
+if __name__ == "__main__":  # a user's process, to be interrupted: batch_work.py WORK FOLDER
     from rig.studies.resumable.batch import Workers, run_jobs
 
     def name_failure(job: str, reason: str) -> None:
@@ -75,7 +101,7 @@ if __name__ == "__main__":  # a user's process, to be interrupted: batch_work.py
 
     began = time.monotonic()
     try:
-        for _ in run_jobs(run_sleeping_process, [sys.argv[1]] * 2, Workers(2), name_failure):
+        for _ in run_jobs(globals()[sys.argv[1]], [sys.argv[2]] * 2, Workers(2), name_failure):
             pass
     except KeyboardInterrupt:
         print("interrupted")

@@ -6,11 +6,13 @@ for its memory, crashed in a library), a new worker takes its place and its job 
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import connection, get_context
+from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -25,7 +27,7 @@ Result = TypeVar("Result")
 def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int,
                      describe_failure: Callable[[Job, str], Result], attempts: int = 3,
                      choose_limit: Callable[[Job], float] | None = None,
-                     patience: float = 5.0) -> Iterator[tuple[Job, Result]]:
+                     patience: float = 1.0) -> Iterator[tuple[Job, Result]]:
     """Each job with its result as soon as it is finished, in any order.
 
     Args:
@@ -36,7 +38,8 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
         attempts: a job that this many workers have died of has failed.
         choose_limit: the s that a job may take; the worker of one that takes longer is ended, and the job has failed.
             None: no limit.
-        patience: s that a worker has to end its job when it is told to stop, before it is killed.
+        patience: s that the workers together have to end their jobs when they are told to stop. Then they are killed
+            with the processes that they started: compiled code may run for seconds before Python sees a signal.
 
     Raises:
         RigError: a worker process cannot start.
@@ -85,8 +88,9 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
     finally:
         for worker in workers:  # all at once: each may need its time to come to an end
             worker.ask_to_stop()
+        deadline = clock.now() + round(1e9 * patience)
         for worker in workers:
-            worker.stop(patience)
+            worker.stop(max(0.0, 1e-9 * (deadline - clock.now())))
 
 
 def describe_deaths(attempts: int, exit_code: int | None) -> str:
@@ -153,11 +157,24 @@ class _Worker(Generic[Job]):
             self.process.terminate()
 
     def stop(self, patience: float = 5.0) -> None:
-        """End the process; it is killed after `patience` s."""
+        """End the process; after `patience` s it is killed, with the processes that it started."""
         self.ask_to_stop()
         self.process.join(patience)
+        if self.process.is_alive() and self.process.pid is not None:
+            for number in list_descendants(self.process.pid):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(number, signal.SIGKILL)
         self.process.kill()
         self.process.join()
+
+
+def list_descendants(number: int) -> list[int]:
+    """The processes that a process and their own ones started, where the kernel lists them (Linux)."""
+    found = []
+    for file in Path(f"/proc/{number}/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # the thread has ended
+            found += [int(word) for word in file.read_text().split()]
+    return [*found, *(below for child in found for below in list_descendants(child))]
 
 
 def _find_overdue(workers: Sequence[_Worker[Job]], now_ns: int) -> list[_Worker[Job]]:
@@ -189,8 +206,14 @@ def _serve_jobs(parent: Any, work: Callable[[Any], Any]) -> None:
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:
-    """End by an exception, so that `subprocess.run` in a job ends its own process, too."""
-    raise SystemExit(128 + number)
+    """End by an exception, so that `subprocess.run` in a job ends its own process, too.
+
+    It is raised again and again until the process has ended: Python drops an exception that comes in a destructor or in
+    a function that compiled code calls, as the compiler does.
+    """
+    signal.signal(signal.SIGALRM, _exit_on_signal)
+    signal.setitimer(signal.ITIMER_REAL, 0.3)
+    raise SystemExit(128 + signal.SIGTERM)
 
 
 def _make_picklable(error: Exception) -> Exception:

@@ -72,8 +72,9 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-def test_an_interruption_ends_the_workers_and_the_processes_they_started(tmp_path: Path) -> None:
-    command = [sys.executable, str(Path(batch_work.__file__)), str(tmp_path)]
+@pytest.mark.parametrize("work", ["run_sleeping_process", "run_process_without_signals"])
+def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: str, tmp_path: Path) -> None:
+    command = [sys.executable, str(Path(batch_work.__file__)), work, str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + 60
     while (not (tmp_path / "pids").exists() or len((tmp_path / "pids").read_text().split()) < 4):
@@ -85,6 +86,18 @@ def test_an_interruption_ends_the_workers_and_the_processes_they_started(tmp_pat
     out, err = process.communicate(timeout=30)
     assert (out, err) == ("interrupted\n", "")
     assert not any(is_alive(pid) for pid in pids)
+
+
+def test_a_signal_that_is_lost_in_a_job_comes_again(tmp_path: Path) -> None:
+    results = run_in_processes(batch_work.lose_first_signal, [str(tmp_path / "a"), str(tmp_path / "b"), ""], 3,
+                               fail_test, patience=60.0)
+    assert next(results)[0] == ""  # type: ignore[call-overload]
+    end = time.monotonic() + 60
+    while not ((tmp_path / "a").exists() and (tmp_path / "b").exists()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    results.close()  # type: ignore[attr-defined]
+    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text() == "lost, ended by 143"
 
 
 def make_batch(numbers: range, version: int = 1) -> Batch:
