@@ -1,6 +1,7 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
 #   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
 #   make newcomer every line of README and tutorial, bad inputs, Ctrl-C; ARGS=inputs a part (shown, inputs, interruptions)
+#   make docs     the pages as a searchable site in site/, which needs no network
 #   make bench    the project's benchmarks     make clean                what was made here, but for runs/
 PYTHON ?= python3
 VENV   ?= .venv
@@ -32,12 +33,15 @@ lint: env-test
 newcomer: env-test
 	@PYTHONPATH=tests/support:tests/newcomer $(BIN)/python tests/newcomer/play_newcomer.py $(ARGS)
 
+docs: env-test
+	@$(BIN)/python docs/site/build_site.py site
+
 bench: env-test
 	@$(BIN)/rig bench
 
 clean:
 	@test ! -e $(VENV) -o -e $(VENV)/pyvenv.cfg || { echo "make: $(VENV) is there and is no virtual environment"; exit 2; }
-	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:
@@ -64,5 +68,5 @@ $(VENV)/.run: pyproject.toml $(MADE)
 
 $(VENV)/.test: pyproject.toml $(MADE)
 	@echo "== installing what the tests and the viewer need into $(VENV) (once, about two minutes)"
-	@$(PIP) -e '.[dev,view,plots,fleet,learn,measure,shell]'
+	@$(PIP) -e '.[dev,docs,view,plots,fleet,learn,measure,shell]'
 	@touch $@ $(VENV)/.run

@@ -73,7 +73,7 @@ def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | No
             raise place.at(key).refuse(f"a key: {list_choices(key, known)}")
     for key, f in known.items():
         if key not in pairs and f.default is MISSING and f.default_factory is MISSING:
-            raise place.refuse(f"also the key {key!r}, {_describe(hints[key])}")
+            raise place.refuse(f"also the key {key!r}, {describe_annotation(hints[key])}")
     values = {key: _convert(value, hints[key], place.at(key), kinds) for key, value in pairs.items()}
     try:
         return cls(**values)
@@ -101,7 +101,7 @@ def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
     origin, args = get_origin(bare), get_args(bare)
     if bare in _SCALARS:
         if not _is_scalar(value, bare):
-            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
         return bare(value)
     if origin is Literal:
         if value not in args:
@@ -111,16 +111,16 @@ def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
         for member in (m for m in args if m is not NoneType):
             with suppress(InputError):
                 return _convert(value, member, place, kinds)
-        raise place.refuse(f"{_describe(hint)}, not {value!r}")
+        raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
     if origin is tuple:
         members = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
         if not isinstance(value, list) or len(value) != len(members):
-            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
         return tuple(_convert(item, member, place.at(i), kinds) for i, (item, member) in
                      enumerate(zip(value, members, strict=True)))
     if origin is Mapping:
         if not isinstance(value, dict):
-            raise place.refuse(f"{_describe(hint)}, not {value!r}")
+            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
         return dict(_flatten_names(value, args[1], place, kinds))
     return build_dataclass(bare, value, place, kinds)
 
@@ -144,18 +144,18 @@ def _is_scalar(value: object, kind: Any) -> bool:
     return type(value) is kind
 
 
-def _describe(hint: Any) -> str:
+def describe_annotation(hint: Any) -> str:
     """An annotation in words: what a user should write."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return f"{_describe(args[0])} in {args[1]}"
+        return f"{describe_annotation(args[0])} in {args[1]}"
     if origin is Literal:
         return list_choices(None, args)
     if origin in (Union, UnionType):
-        return " or ".join(_describe(member) for member in args if member is not NoneType)
+        return " or ".join(describe_annotation(member) for member in args if member is not NoneType)
     if origin is tuple:
-        members = [_describe(member) for member in args if member is not Ellipsis]
+        members = [describe_annotation(member) for member in args if member is not Ellipsis]
         return f"a list, each {members[0]}" if args[-1] is Ellipsis else f"[{', '.join(members)}]"
     if origin is Mapping:
-        return f"a table of names, each with {_describe(args[1])}"
+        return f"a table of names, each with {describe_annotation(args[1])}"
     return _SCALARS.get(hint, "a table")

@@ -1,0 +1,67 @@
+"""The reference page of the keys of a sequence, from the classes that read them."""
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterable
+from dataclasses import MISSING, fields
+from typing import Any, get_type_hints
+
+from catalogue_pages import make_plain_table
+from markdown_text import MADE, escape_markup, make_table, quote_code
+
+from plant import Model
+from plant.segments import Segment
+from rig.cli.commands import list as list_command
+from rig.sequences import faults, tables
+from rig.sequences.check import Check
+from rig.sequences.guards import Guard
+from rig.sequences.protocol import ProtocolLimits
+from rig.sequences.python_parts import Step
+from rig.sequences.required_firmware import RequiredFirmware
+from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, Sequence
+from rig.sequences.timing import TimingPolicy
+
+
+def write_sequence_page() -> list[str]:
+    """The page of everything that a sequence file may have."""
+    lines = ["# Keys of sequences", "", MADE, "",
+             "A sequence is a TOML file. [How to write a test](../docs/sequences.md) explains how the parts work "
+             "together."]
+    lines += ["", "## Shipped sequences", *make_plain_table(list_command.list_sequences(Model()))]
+    lines += ["## Tables of the file", *describe_keys(Sequence)]
+    for title, kinds, base in (("Segments", SEGMENT_KINDS, Segment), ("Faults", faults.KINDS, faults.Fault),
+                               ("Checks", CHECK_KINDS, Check)):
+        lines += [f"## {title}", "", describe_class(base), "", f"Keys of all {title.lower()}:", *describe_keys(base)]
+        common = {f.name for f in fields(base)}
+        for name, kind in kinds.items():
+            unit = getattr(kind, "si", None)
+            lines += [f"### {title[:-1]} {name}", "", describe_class(kind)]
+            lines += ["", f"Unit: {unit or 'of the signal'}."] if unit is not None and name != "python" else []
+            lines += describe_keys(kind, without=common)
+    for title, cls in (("Guards", Guard), ("Steps in Python", Step), ("Limits of the protocol checks", ProtocolLimits),
+                       ("Timing", TimingPolicy), ("Firmware", RequiredFirmware)):
+        lines += [f"## {title}", "", describe_class(cls), *describe_keys(cls)]
+    return lines
+
+
+def describe_class(cls: type[Any]) -> str:
+    """The docstring of a class as Markdown."""
+    return escape_markup(inspect.getdoc(cls) or "")
+
+
+def describe_keys(cls: type[Any], without: Iterable[str] = ()) -> list[str]:
+    """The keys of a table of the file, with what may stand there and the default."""
+    hints = get_type_hints(cls, include_extras=True)
+    rows = []
+    for f in fields(cls):
+        if f.metadata.get("key", True) and f.name not in without:
+            is_required = f.default is MISSING and f.default_factory is MISSING
+            default = "required" if is_required else format_default(f.default)
+            rows.append((quote_code(f.name), escape_markup(tables.describe_annotation(hints[f.name])), default))
+    return make_table(("key", "value", "default"), rows)
+
+
+def format_default(value: object) -> str:
+    """A default as TOML has it; "" for none, and for a table, whose keys have their own defaults."""
+    return quote_code(json.dumps(value)) if isinstance(value, bool | int | float | str) else ""
