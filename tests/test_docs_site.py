@@ -54,7 +54,7 @@ def test_the_page_of_a_command_has_what_its_help_has(
     with pytest.raises(SystemExit):
         main([command, "--help"])
     page = (reference / "commands" / f"{command}.md").read_text()
-    options = set(re.findall(r"(?<![\w-])--[a-z][\w-]+", capsys.readouterr().out))
+    options = set(re.findall(r"^ +(?:-\w, )?(--[a-z][\w-]+)", capsys.readouterr().out, re.MULTILINE))
     assert {"--help", "--json", "--out"} <= options
     assert {option for option in options if f"`{option}" not in page} == set()
 
