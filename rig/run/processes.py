@@ -1,9 +1,10 @@
 """The nodes that the rig started, each in a process of its own, and how they ended."""
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 Child = subprocess.Popen[bytes]
 
@@ -25,6 +26,15 @@ class NodeProcesses:
         """Nodes whose process has ended, with its exit status; negative: the signal that ended it."""
         found = {node: child.poll() for node, child in self._children.items()}
         return {node: status for node, status in found.items() if status is not None}
+
+    def wait(self, nodes: Iterable[int], seconds: float = 1.0) -> None:
+        """Wait until the processes of these nodes end, for so long each; other nodes are left out.
+
+        On a busy machine a process takes some time from the signal that kills it to its end.
+        """
+        for child in (self._children[node] for node in nodes if node in self._children):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(seconds)
 
     def stop(self) -> None:
         """Terminate all processes; kill those that do not end within 5 s."""

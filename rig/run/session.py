@@ -380,10 +380,11 @@ class Session:
                 self.loop.wait_until_played(self._must_end)
         finally:
             try:
-                self._demand = self.loop.hold(CLEANUP)
-                self._agenda = [event for event in self._agenda if event[0] < self.loop.queued]
+                self._discard_queue()
                 self._powered = self._restore_nodes()
-                self._run(CLEANUP, self._choose_cleanup())
+                if not self._run(CLEANUP, self._choose_cleanup()):  # a node has died in it
+                    self._discard_queue()
+                    self._run(CLEANUP, self._choose_cleanup())
                 self._play_last_probe()
                 self.loop.finish()
             finally:
@@ -397,6 +398,12 @@ class Session:
                     self.log_event("WARN", "restore", failure)
                 self.log_event("INFO", "phase", "end")
 
+    def _discard_queue(self) -> None:
+        """Discard the cycles that are queued, and their events; clean-up begins with the demand of the last one."""
+        assert self.loop is not None
+        self._demand = self.loop.hold(CLEANUP)
+        self._agenda = [event for event in self._agenda if event[0] < self.loop.queued]
+
     def _choose_cleanup(self) -> Profile:
         """The clean-up of the sequence; a tenth of a second without current if a node does not answer or came late."""
         self._next_look = 0
@@ -409,7 +416,10 @@ class Session:
         """After trouble: find out which nodes still answer, for the first cause depends on it."""
         if self.aborted and not self.interrupted:
             seconds = HEARTBEAT_LIMIT * 1e-3
-            for node in filterfalse(self._is_answering, self._master.find_silent(seconds)):
+            silent = list(filterfalse(self._is_answering, self._master.find_silent(seconds)))
+            self._processes.wait(silent)
+            self._note_ended_processes()
+            for node in silent:
                 self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
 
     def _restore_nodes(self) -> bool:
@@ -424,6 +434,7 @@ class Session:
         """Some cycles into clean-up: a node that had to be started again may have no errors any more by now."""
         assert self.loop is not None
         self.loop.wait_until_played(lambda: False)
+        self._note_ended_processes()
         self._powered = self._may_power and not self.gone and not self._master.list_errors()
         self._reset_at = _SETTLING
 
@@ -452,7 +463,7 @@ class Session:
                 self.loop.cycle(CycleInput(phase, self._demand, load, self._choose_control_word(phase, i)))
                 if self.loop.queued % 50 == 0:
                     self._progress(shown, self.loop.k / max(self._plan.stop, self.loop.k))
-                if phase != CLEANUP and self._must_end():
+                if self._note_ended_processes() if phase == CLEANUP else self._must_end():
                     return False
         return True
 
@@ -533,6 +544,7 @@ class Session:
                                  node, error.code, round(error.timestamp * 1e9))
 
     def _handle_silence(self, node: int) -> None:
+        self._note_ended_processes()
         limit = "" if node not in self._master.heard_ns else (
             f": last heartbeat {1e-9 * (self._clock.now() - self._master.heard_ns[node]):.2f} s ago")
         if not self._is_answering(node):
@@ -553,14 +565,24 @@ class Session:
         now = self._clock.now()
         if now >= self._next_look:
             self._next_look = now + 20_000_000
-            for node, status in self._processes.find_ended().items():
-                how = describe_exit(status)
-                if self.gone.get(node) != how:
-                    self.gone[node] = how
-                    self._handle_trouble("process", f"node {node} {NAMES[node]}: {how}", node)
+            self._note_ended_processes()
             if self._playing and not self.job.realtime and not self._is_embedded:
                 self._look_for_silent_nodes(now)
         return bool(self.gone)
+
+    def _note_ended_processes(self) -> bool:
+        """Note which nodes that the rig started have ended; True if that was not known yet.
+
+        A process that is killed sends nothing more from then on, but takes some ms to end. Other nodes may report the
+        missing frames before.
+        """
+        is_news = False
+        for node, status in self._processes.find_ended().items():
+            how = describe_exit(status)
+            if self.gone.get(node) != how:
+                is_news, self.gone[node] = True, how
+                self._handle_trouble("process", f"node {node} {NAMES[node]}: {how}", node)
+        return is_news
 
     def _look_for_silent_nodes(self, now: int) -> None:
         """Lockstep between processes: a node that neither beats nor answers is gone, until it is heard again.

@@ -2,14 +2,15 @@
 
     python tests/robustness/attribution_trials.py --trials 100 --out trials
     python tests/robustness/attribution_trials.py --trials 100 --mixed --out trials
-    python tests/robustness/attribution_trials.py --trials 100 --mixed --pace lockstep --out trials
+    python tests/robustness/attribution_trials.py --trials 100 --mixed --stay --controller c --pace lockstep
 
 Each trial is one `rig run` on the UDP bus with plant and controller as processes of their own. At a random cycle one of
 the three processes is stopped (SIGSTOP) for 2, 10 or 50 ms, or one of the nodes is killed (SIGKILL). A stall of the rig
 or of the plant must never be held against the controller; a killed node must be named, and its run must end within 2 s.
 The table has a line per case: the verdicts, whom the first cause names, and how many trials were attributed wrongly.
 With `--mixed` the three processes are stopped by turns in one pace, each time for one of the three times at random,
-and the table has a line per process. A trial that came too late, after the run, is repeated.
+and the table has a line per process. A trial that came too late, after the run, is repeated. With `--stay` plant and
+controller are started once and stay for all trials.
 """
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +33,7 @@ from typing import Any, NamedTuple
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.link import Link
+from rig.studies.robustness.nodes import start_nodes
 
 SEQUENCE = """
 title = "A process of the bench stalls"
@@ -128,17 +130,19 @@ def disturb(victim: int, stall: float) -> None:
         os.kill(victim, signal.SIGCONT)
 
 
-def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str) -> Trial:
-    """One run with one stall or kill at a random cycle."""
+def run_trial(case: Case, number: int, sequence: Path, folder: Path, group: str,
+              standing: dict[str, int] | None = None) -> Trial:
+    """One run with one stall or kill at a random cycle. `standing`: processes of the nodes, if they stay."""
     chance = random.Random(f"{case} {number}")
     out = folder / f"{PROCESSES.index(case.process)}-{case.stall:g}-{case.pace}-{number}"
     command = [sys.executable, "-m", "rig.cli.main", "run", str(sequence), "--bus", f"udp_multicast:{group}", "--pace",
-               case.pace, "--json", "--plant", "builtin", "--out", str(out)]
+               case.pace, "--json", "--plant", "external" if standing else "builtin", "--out", str(out)]
+    command += ["--controller", "external"] if standing else []
     link = Link(open_can(f"udp_multicast:{group}"), time.monotonic_ns)
     link.leave_out((codec.SYNC, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE))  # this program may be slow
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     is_reached = wait_for_cycle(link, 1, run)
-    victim = run.pid if case.process == "rig" else find_children(run.pid).get(case.process, 0)
+    victim = run.pid if case.process == "rig" else (standing or find_children(run.pid)).get(case.process, 0)
     is_reached &= victim != 0 and wait_for_cycle(link, chance.randrange(250, 1500), run)
     link.close()
     begin, begin_time = time.monotonic(), time.time()
@@ -165,7 +169,8 @@ def format_case(case: object, trials: list[Trial]) -> str:
             f"{longest:.2f} s, exit {last:.2f} s")
 
 
-def run_mixed(trials: int, pace: str, folder: Path, group: str) -> Iterator[Trial]:
+def run_mixed(trials: int, pace: str, folder: Path, group: str,
+              standing: dict[str, int] | None = None) -> Iterator[Trial]:
     """Stop the three processes by turns, for times at random, and print a line per process at the end."""
     sequence = folder / "stall.toml"
     sequence.write_text(SEQUENCE)
@@ -174,12 +179,15 @@ def run_mixed(trials: int, pace: str, folder: Path, group: str) -> Iterator[Tria
         stall = random.Random(f"{process} {number}").choice((0.002, 0.010, 0.050))
         case = Case(pace, process, stall)
         for attempt in range(3):
-            trial = run_trial(case, number + attempt * trials, sequence, folder, group)
+            trial = run_trial(case, number + attempt * trials, sequence, folder, group, standing)
             if trial.seconds > 0:
                 break
         done[process].append(trial)
         if trial.is_wrong:
             print(f"    {case}: {trial.verdict} after {trial.seconds:.2f} s: {trial.text}", flush=True)
+        if sum(map(len, done.values())) % 30 == 0:
+            for name, so_far in done.items():
+                print(format_case(f"so far: {pace}, {name}", so_far), flush=True)
         yield trial
     for process, group_of_trials in done.items():
         print(format_case(f"{pace}, {process} stopped for 2, 10 or 50 ms", group_of_trials), flush=True)
@@ -204,6 +212,8 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=3, help="trials per case (default 3)")
     parser.add_argument("--mixed", action="store_true", help="stop the processes by turns for times at random")
     parser.add_argument("--pace", choices=("realtime", "lockstep"), default="realtime", help="of --mixed")
+    parser.add_argument("--stay", action="store_true", help="--mixed: start the nodes once for all trials")
+    parser.add_argument("--controller", choices=("builtin", "c"), default="builtin", help="of --stay")
     parser.add_argument("--case", default="", help="only the cases whose description has these words")
     parser.add_argument("--group", default="239.74.163.200", help="multicast group of the bus")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: a temporary one)")
@@ -212,9 +222,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = args.out or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        runs = (run_mixed(args.trials, args.pace, folder, args.group) if args.mixed
-                else run_cases(cases, args.trials, folder, args.group))
-        wrong = [trial.is_wrong for trial in runs]
+        with start_nodes(f"udp_multicast:{args.group}", args.controller) if args.stay else nullcontext() as standing:
+            runs = (run_mixed(args.trials, args.pace, folder, args.group, standing) if args.mixed
+                    else run_cases(cases, args.trials, folder, args.group))
+            wrong = [trial.is_wrong for trial in runs]
     print(f"{sum(wrong)} of {len(wrong)} trials attributed wrongly")
     return int(any(wrong))
 

@@ -3,11 +3,14 @@
 Each trial is a run of its own: rig, plant and controller are processes on a multicast group of their own. At a random
 moment one of them is killed or stopped, the folder of the log is removed, or the disk is full. Required of each trial:
 the run ends in time, with a documented exit status and without a traceback; the current is zero in time; the log can be
-read or recovered; no process, semaphore or temporary file is left.
+read or recovered; no process, semaphore or temporary file is left. A run whose node was killed between its cycles must
+be ABORTED and name the end of that process. A stop of less than 1 s must not end the run; a node that was stopped for
+longer than 3 s must be named.
 """
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import shutil
@@ -37,6 +40,7 @@ from rig.recorder.recover import recover_log
 
 PROCESSES = ("rig", "controller", "plant")
 ACTIONS = ("kill", "stop", "remove folder", "fill disk", "full tmpfs")
+CYCLES = 3200  # of a run of SEQUENCE, without the probes
 SEQUENCE = """
 title = "Disturbed"
 setup = [{ kind = "hold", time = 0.1 }]
@@ -51,21 +55,31 @@ class Trial(NamedTuple):
 
     action: str
     victim: str
+    is_effective: bool  # the process or folder was there, and cycles were still to come
     moment: float  # of the disturbance, s after the first SYNC; NaN: before it
+    syncs: int  # sent before the disturbance
     pause: float  # s for which a process was stopped
     status: int  # of the rig's process; -9: killed, -1: it hung
     end: float  # s from the disturbance to the end of the last process
     zero: int  # SYNCs from the last frame of the victim to zero current; -1: the run ended before
     cycles: int  # in the log, as read or recovered
+    verdict: str  # of the run; "": it wrote none
+    cause: str  # first cause that the run names
     message: str  # last line on standard error
     problems: tuple[str, ...]
 
 
 class _Watcher:
-    """Listens to the bus of a run and notes what is needed to judge it."""
+    """Listens to the bus of a run and notes what is needed to judge it.
+
+    Before the disturbance it hears SYNC alone: with all frames it would lag behind a run in lockstep.
+    """
 
     def __init__(self, bus: str, clock: WallClock) -> None:
         self._link = Link(open_can(bus), clock.now)
+        self._link.leave_out((codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE))
+        self._is_idle = False  # no frame was waiting
+        self._frames = {"plant": 0, "controller": 0}  # cyclic frames heard
         self._stop = threading.Event()
         self.first_sync = 0  # ns
         self.syncs = 0
@@ -76,8 +90,22 @@ class _Watcher:
 
     def _listen(self) -> None:
         while not self._stop.is_set():
-            for frame in self._link.poll(0.05):
+            frames = self._link.poll(0.05)
+            self._is_idle = not frames
+            for frame in frames:
                 self._note(frame)
+
+    def hear_nodes(self, node: str, seconds: float = 0.5) -> None:
+        """Listen to the nodes as well, and wait for a frame of one of them."""
+        self._heard = dict.fromkeys(self._heard, self.syncs)
+        before = self._frames[node]
+        self._link.leave_out((codec.COMMAND,))
+        wait_until(lambda: self._frames[node] > before, seconds, step=0.001)
+
+    def finish(self, seconds: float = 60.0) -> None:
+        """Take in what is still waiting."""
+        self._is_idle = False
+        wait_until(lambda: self._is_idle, seconds)
 
     def _note(self, frame: Frame) -> None:
         if frame.cob_id == codec.SYNC:
@@ -95,6 +123,7 @@ class _Watcher:
 
     def _hear(self, node: str) -> None:
         self._heard[node], self.zeroed[node] = self.syncs, -1
+        self._frames[node] += 1
 
     def _note_zero(self, silent: str) -> None:
         if self.zeroed[silent] < 0:
@@ -121,11 +150,12 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         seed: decides the moment, the length of a pause and the size of the disk.
         pace: of the run.
         controller: firmware of the run, "builtin" or "c".
-        limit: s in which the run must have ended after the disturbance.
+        limit: s in which the run must have ended after a kill; four times that where it may go on.
     """
     rng = np.random.default_rng([seed, ACTIONS.index(action), PROCESSES.index(victim)])
-    is_early, delay = rng.random() < 0.15, float(rng.uniform(0.0, 4.0))  # some before the first SYNC
-    pause = float(rng.uniform(0.02, 3.0)) if action == "stop" else 0.0
+    is_early, delay = rng.random() < 0.15, float(rng.uniform(0.0, 2.0))  # some before the first SYNC
+    cycle = int(rng.integers(1, CYCLES))
+    pause = float(rng.uniform(0.02, 4.0)) if action == "stop" else 0.0
     group = "239." + ".".join(str(number) for number in rng.integers(1, 255, 3))
     problems: list[str] = []
     with contextlib.ExitStack() as undo:
@@ -140,13 +170,18 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         undo.callback(watcher.close)
         most = int(rng.integers(4_000, 600_000)) if action == "fill disk" else None
         rig = _start_rig(place, group, pace, controller, most)
-        if not is_early:
-            wait_until(lambda: bool(watcher.first_sync) or rig.poll() is not None, 120.0)
-        threading.Event().wait(delay)
+        if is_early:
+            wait_until(lambda: rig.poll() is not None or victim in dict(find_processes(group)).values(), 120.0)
+            threading.Event().wait(delay)
+        else:
+            wait_until(lambda: watcher.syncs >= cycle or rig.poll() is not None, 120.0, step=0.002)
+        if action == "kill" and victim != "rig" and watcher.syncs:
+            watcher.hear_nodes(victim)
         moment = (clock.now() - watcher.first_sync) * 1e-9 if watcher.first_sync else float("nan")
+        syncs = watcher.syncs
         is_done = _disturb(action, victim, rig, group, folder, pause)
-        disturbed = clock.now()
-        patience = limit if is_done else 4.0 * limit  # a process that was not there yet: the run goes on as usual
+        disturbed, resumed = clock.now(), watcher.syncs
+        patience = limit if is_done and action == "kill" else 4.0 * limit  # else the run may go on as usual
         if not wait_until(lambda: rig.poll() is not None, patience):
             problems.append(f"the rig has not ended {patience:g} s later")
         status = -1 if rig.poll() is None else rig.returncode
@@ -159,11 +194,23 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         rig.wait()
         message = _judge_output(place / "err", status, problems, is_killed=(action, victim) == ("kill", "rig"))
         cycles = _judge_log(action, folder, watcher, problems)
+        watcher.finish()
+        if action == "stop":
+            is_in_time = status != 0 or watcher.syncs > resumed
+        else:
+            is_in_time = _has_come_in_time(action, victim, cycles, watcher)
+        is_effective = is_done and is_in_time
         zero = _judge_current(victim, watcher, problems) if action == "kill" and victim != "rig" else -1
+        verdict, cause = _read_verdict(folder / "verdict.json")
+        if is_effective and syncs and not (action == "kill" and victim == "rig"):
+            _judge_verdict(action, victim, pause, status, f"{verdict} {cause} {message}", problems)
+        if not wait_until(lambda: not _find_heirs(temporary), 10.0):
+            problems.append(f"left: {', '.join(_find_heirs(temporary))}")
         problems += [f"temporary file {path.name}" for path in sorted(temporary.iterdir())[:3]]
     if has_semaphores(group):
         problems.append("semaphores are left")
-    return Trial(action, victim, moment, pause, status, end, zero, cycles, message, tuple(problems))
+    return Trial(action, victim, is_effective, moment, syncs, pause, status, end, zero, cycles, verdict, cause, message,
+                 tuple(problems))
 
 
 def _start_rig(place: Path, group: str, pace: str, controller: str, most: int | None) -> subprocess.Popen[bytes]:
@@ -211,6 +258,38 @@ def _judge_output(file: Path, status: int, problems: list[str], *, is_killed: bo
     return lines[-1] if lines else ""
 
 
+def _has_come_in_time(action: str, victim: str, cycles: int, watcher: _Watcher) -> bool:
+    """Whether cycles were still to come at the disturbance. This process may be late, so the bus and the log say it."""
+    if action == "kill" and victim != "rig" and watcher.syncs:
+        return watcher.count_since(victim) > 0
+    return cycles < CYCLES
+
+
+def _read_verdict(file: Path) -> tuple[str, str]:
+    """Verdict and first cause of a run; empty where it wrote none."""
+    try:
+        answer = json.loads(file.read_text())
+    except (OSError, ValueError):
+        return "", ""
+    return str(answer["verdict"]), str((answer.get("cause") or {}).get("text", ""))
+
+
+def _judge_verdict(action: str, victim: str, pause: float, status: int, said: str, problems: list[str]) -> None:
+    """What a run that was disturbed between its cycles must say; `said`: its verdict, first cause and error.
+
+    A process that is stopped while it holds the turn to send stops the whole bus, which ends the run with status 2.
+    """
+    node = {"controller": "node 2 controller", "plant": "node 3 plant"}.get(victim, "the rig")
+    if action == "kill" and not (status == 1 and said.startswith(f"ABORTED {node}") and "SIGKILL" in said):
+        problems.append(f"the end of the process is not named: status {status}: {said}")
+    if action != "stop" or "the turn to send" in said:
+        return
+    if pause < 1.0 and status != 0:
+        problems.append(f"a stop of {pause:.2f} s ended the run: status {status}: {said}")
+    if pause > 3.0 and victim != "rig" and not said.startswith(f"ABORTED {node}"):
+        problems.append(f"{node} was stopped for {pause:.2f} s, and the run says: status {status}: {said}")
+
+
 def _judge_log(action: str, folder: Path, watcher: _Watcher, problems: list[str]) -> int:
     """Cycles in the log, as it is or recovered; -1 if there is none. A log that cannot be read is a problem."""
     log = folder / "trace.mcap"
@@ -247,14 +326,25 @@ def _mount_small_disk(folder: Path, kilobytes: int) -> Iterator[None]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def wait_until(done: Callable[[], bool], seconds: float) -> bool:
-    """Wait until `done()`; False if that takes longer than `seconds`."""
+def wait_until(done: Callable[[], bool], seconds: float, step: float = 0.02) -> bool:
+    """Wait until `done()`, asked every `step` s; False if that takes longer than `seconds`."""
     clock = WallClock()
     while not done():
         if clock.now() > seconds * 1e9:
             return False
-        threading.Event().wait(0.02)
+        threading.Event().wait(step)
     return True
+
+
+def _find_heirs(temporary: Path) -> list[str]:
+    """Processes that a run started whose folder for temporary files is `temporary`."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                if f"TMPDIR={temporary}".encode() in (entry / "environ").read_bytes().split(b"\0"):
+                    found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:60])
+    return found
 
 
 def find_processes(group: str) -> list[tuple[int, str]]:

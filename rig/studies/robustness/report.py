@@ -44,10 +44,11 @@ def _tabulate_trials(figures: Mapping[str, Any]) -> list[Item]:
     for row in figures["disturbed"]:
         is_sound = row["sound"] == row["trials"]
         statuses = ", ".join(f"{count} x {status}" for status, count in sorted(row["statuses"].items()))
-        rows.append([f"{row['action']} {row['victim']}", str(row["trials"]),
+        rows.append([f"{row['action']} {row['victim']}", str(row["trials"]), str(row["effective"]),
                      Cell(str(row["sound"]), "good" if is_sound else "bad"), statuses, f"{row['end_p50']:.1f}",
                      f"{row['end_max']:.1f}", str(row["zero_max"]).replace("None", ""), str(row["logs"])])
-    columns = [Column("disturbance"), Column("runs", align="right"), Column("sound", align="right"),
+    columns = [Column("disturbance"), Column("runs", align="right"), Column("effective", align="right"),
+               Column("sound", align="right"),
                Column("exit status"), Column("end p50", "s", "right"), Column("end max", "s", "right"),
                Column("zero current max", "SYNCs", "right"), Column("logs read", align="right")]
     caption = ("End: from the disturbance to the end of the last process. Zero current: SYNCs from "

@@ -27,7 +27,8 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
 
     Args:
         frames: invented frames for each node; a tenth as many datagrams, a thousandth as many changed logs.
-        trials: disturbed runs of each kind.
+        trials: disturbed runs of each kind in which the disturbance came before the last cycle; at most twice as
+            many are made.
         minutes: of long work; 0 for none.
         seed: of frames and moments.
         controller: firmware of the disturbed runs and of the long work, "builtin" or "c".
@@ -52,10 +53,10 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     rows = []
     kinds = list(_list_kinds())
     for i, (action, victim) in enumerate(kinds):
-        done = []
-        for trial in range(trials):
-            progress(f"{action} {victim}", (i + trial / trials) / len(kinds))
-            done.append(disturb_run(action, victim, seed + trial, controller=controller))
+        done: list[Trial] = []
+        while trials and (effective := sum(one.is_effective for one in done)) < trials and len(done) < 2 * trials:
+            progress(f"{action} {victim}", (i + effective / trials) / len(kinds))
+            done.append(disturb_run(action, victim, seed + len(done), controller=controller))
         problems += [f"{action} {victim}, seed {seed + n}: {problem}" for n, one in enumerate(done)
                      for problem in one.problems]
         if done:
@@ -98,6 +99,7 @@ def _summarise_trials(trials: list[Trial]) -> dict[str, Any]:
     for trial in trials:
         statuses[str(trial.status)] = statuses.get(str(trial.status), 0) + 1
     return {"action": trials[0].action, "victim": trials[0].victim, "trials": len(trials),
+            "effective": sum(trial.is_effective for trial in trials),
             "sound": sum(not trial.problems for trial in trials), "statuses": statuses,
             "end_p50": float(np.median(ends)), "end_max": max(ends), "zero_max": max(zeros, default=None),
             "logs": sum(trial.cycles >= 0 for trial in trials)}

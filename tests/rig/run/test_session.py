@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -189,6 +189,73 @@ def play_with(intruder: Intruder, tmp_path: Path) -> Session:
         session.bring_up()
         session.run_phases()
     return session
+
+
+class KilledPlant(Emulator):
+    """A plant whose process is killed after 0.3 s: it neither hears nor sends anything from then on."""
+
+    def __init__(self, send: Send) -> None:
+        super().__init__(send)
+        self.begun_ns = -1
+
+    def receive(self, frame: Frame) -> None:
+        if self.begun_ns < 0 and frame.cob_id == 0x080:
+            self.begun_ns = frame.t_ns
+        if not self.is_dead(frame.t_ns):
+            super().receive(frame)
+
+    def tick(self, t_ns: int) -> None:
+        if not self.is_dead(t_ns):
+            super().tick(t_ns)
+
+    def is_dead(self, t_ns: int) -> bool:
+        return 0 <= self.begun_ns <= t_ns - 300_000_000
+
+
+class SlowEnd(NodeProcesses):
+    """The end of the plant's process can be seen from the `looks`-th look on, or after it was waited for."""
+
+    def __init__(self, looks: int) -> None:
+        super().__init__()
+        self.looks = looks
+
+    def find_ended(self) -> dict[int, int]:
+        self.looks -= 1
+        return {} if self.looks > 0 else {3: -9}
+
+    def wait(self, nodes: Iterable[int], seconds: float = 1.0) -> None:
+        assert list(nodes) == [3]
+        self.looks = 0
+
+
+@pytest.mark.parametrize(("after", "cleanup"), [(30, 29 + 100), (10**6, 50)])
+def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tmp_path: Path, after: int,
+                                                                             cleanup: int) -> None:
+    """The controller misses its frames before, and ends main. The end of the process is seen in clean-up or after it.
+
+    The rest of clean-up is then 0.1 s without current. Of 30 looks one is made without a cycle.
+    """
+    no_probe = job("protocol = { probe = false }\n" + SHORT)
+    wire = EmbeddedWire(VirtualClock(), [KilledPlant, Firmware])
+    with runner.open_recorder(no_probe, tmp_path) as recorder:
+        processes = SlowEnd(10**9)
+        session = Session(no_probe, Participants(wire, processes), recorder, ignore_progress, lambda: False)
+        session.bring_up()
+        choose, chosen = session._choose_cleanup, []
+
+        def begin_cleanup() -> object:
+            chosen.append(choose())
+            if len(chosen) == 1:
+                processes.looks = after
+            return chosen[-1]
+
+        session._choose_cleanup = begin_cleanup  # type: ignore[method-assign, assignment]
+        session.run_phases()
+    assert session.aborted.startswith("node 2 controller 0x8250")
+    assert session.gone[3] == "its process was ended by SIGKILL"
+    assert [trouble.text for trouble in session.troubles if trouble.kind == "process"] == [
+        "node 3 plant: its process was ended by SIGKILL"]
+    assert phases(tmp_path)[2] == cleanup and set(control_words(tmp_path)[-cleanup:]) == {0}
 
 
 @pytest.mark.parametrize(("frames", "why"), [
