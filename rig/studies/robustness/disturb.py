@@ -203,7 +203,7 @@ def disturb_run(action: str, victim: str, seed: int, pace: str = "lockstep", con
         zero = _judge_current(victim, watcher, problems) if action == "kill" and victim != "rig" else -1
         verdict, cause = _read_verdict(folder / "verdict.json")
         if is_effective and syncs and not (action == "kill" and victim == "rig"):
-            _judge_verdict(action, victim, pause, status, f"{verdict} {cause} {message}", problems)
+            problems += judge_verdict(action, victim, pause, status, f"{verdict} {cause} {message}")
         if not wait_until(lambda: not _find_heirs(temporary), 10.0):
             problems.append(f"left: {', '.join(_find_heirs(temporary))}")
         problems += [f"temporary file {path.name}" for path in sorted(temporary.iterdir())[:3]]
@@ -274,20 +274,28 @@ def _read_verdict(file: Path) -> tuple[str, str]:
     return str(answer["verdict"]), str((answer.get("cause") or {}).get("text", ""))
 
 
-def _judge_verdict(action: str, victim: str, pause: float, status: int, said: str, problems: list[str]) -> None:
-    """What a run that was disturbed between its cycles must say; `said`: its verdict, first cause and error.
+def judge_verdict(action: str, victim: str, pause: float, status: int, said: str) -> list[str]:
+    """What is wrong with the verdict of a run in lockstep that was disturbed between its cycles.
 
     A process that is stopped while it holds the turn to send stops the whole bus, which ends the run with status 2.
+
+    Args:
+        action, victim: what was done to which process.
+        pause: s for which it was stopped.
+        status: of the rig's process.
+        said: verdict, first cause and error of the run.
     """
     node = {"controller": "node 2 controller", "plant": "node 3 plant"}.get(victim, "the rig")
-    if action == "kill" and not (status == 1 and said.startswith(f"ABORTED {node}") and "SIGKILL" in said):
-        problems.append(f"the end of the process is not named: status {status}: {said}")
+    is_named = status == 1 and said.startswith(f"ABORTED {node}")
+    if action == "kill" and not (is_named and "SIGKILL" in said):
+        return [f"the end of the process is not named: status {status}: {said}"]
     if action != "stop" or "the turn to send" in said:
-        return
+        return []
     if pause < 1.0 and status != 0:
-        problems.append(f"a stop of {pause:.2f} s ended the run: status {status}: {said}")
-    if pause > 3.0 and victim != "rig" and not said.startswith(f"ABORTED {node}"):
-        problems.append(f"{node} was stopped for {pause:.2f} s, and the run says: status {status}: {said}")
+        return [f"a stop of {pause:.2f} s ended the run: status {status}: {said}"]
+    if pause > 3.0 and victim != "rig" and not is_named:
+        return [f"{node} was stopped for {pause:.2f} s, and the run says: status {status}: {said}"]
+    return []
 
 
 def _judge_log(action: str, folder: Path, watcher: _Watcher, problems: list[str]) -> int:

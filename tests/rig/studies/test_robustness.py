@@ -11,7 +11,7 @@ from rig.network.frame import Frame, Send
 from rig.nodes.firmware import Firmware
 from rig.studies.robustness import fuzz
 from rig.studies.robustness.datagrams import fuzz_datagrams
-from rig.studies.robustness.disturb import PROCESSES, disturb_run, find_processes, has_semaphores
+from rig.studies.robustness.disturb import PROCESSES, disturb_run, find_processes, has_semaphores, judge_verdict
 from rig.studies.robustness.frames import invent_frames
 from rig.studies.robustness.fuzz import fuzz_node, fuzz_rig
 from rig.studies.robustness.logs import fuzz_logs
@@ -79,6 +79,26 @@ def test_a_killed_process(victim: str) -> None:
         if trials[-1].cycles > 0:
             break
     assert trials[-1].cycles > 0, trials
+
+
+GONE = "ABORTED node 3 plant stopped answering: no feedback frame since cycle 9; "
+
+
+@pytest.mark.parametrize(("action", "victim", "pause", "status", "said", "is_sound"), [
+    ("kill", "plant", 0.0, 1, f"{GONE}its process was ended by SIGKILL", True),
+    ("kill", "plant", 0.0, 1, f"{GONE}no heartbeat any more: last heartbeat 0.30 s ago", False),
+    ("kill", "controller", 0.0, 1, f"{GONE}its process was ended by SIGKILL", False),  # the wrong node
+    ("kill", "plant", 0.0, 0, "PASS", False),
+    ("stop", "plant", 0.9, 0, "PASS", True),
+    ("stop", "plant", 0.9, 1, f"{GONE}no heartbeat for 2.1 s either", False),
+    ("stop", "plant", 3.1, 1, f"{GONE}no heartbeat for 2.1 s either", True),
+    ("stop", "plant", 3.1, 0, "PASS", False),
+    ("stop", "rig", 3.1, 0, "PASS", True),
+    ("stop", "rig", 0.9, 2, "rig run: the turn to send was held for more than 1 s by process 7", True),
+])
+def test_what_the_verdict_of_a_disturbed_run_must_be(action: str, victim: str, pause: float, status: int, said: str,
+                                                     is_sound: bool) -> None:
+    assert (judge_verdict(action, victim, pause, status, said) == []) == is_sound
 
 
 @pytest.mark.parametrize("action", ["remove folder", "fill disk"])
