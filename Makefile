@@ -1,6 +1,6 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
 #   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
-#   make newcomer every line of README and tutorial, bad inputs, Ctrl-C; ARGS=inputs a part (shown, inputs, interruptions)
+#   make newcomer every line of README, tutorial and how-to pages, bad inputs, Ctrl-C; ARGS=inputs a part (shown, pages, ..)
 #   make docs     the pages as a searchable site in site/, which needs no network
 #   make bench    the project's benchmarks     make clean                what was made here, but for runs/
 PYTHON ?= python3

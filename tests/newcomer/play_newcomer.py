@@ -1,7 +1,7 @@
-"""Play a newcomer: every line of README and tutorial in a fresh clone, bad inputs, Ctrl-C in every long command.
+"""Play a newcomer: the lines of README and tutorial in a fresh clone, of other pages, bad inputs, Ctrl-C.
 
-`make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, inputs or interruptions.
-Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
+`make newcomer` runs all of it and prints a table; `make newcomer ARGS=inputs` a part: shown, pages, inputs or
+interruptions. Exit status 1 if something is wrong. The quick parts are tests as well (test_newcomer.py).
 """
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import how_to_pages
 from bad_inputs import BAD_INPUTS, find_faults, write_bad_files
 from interruption import LONG_COMMANDS, MOMENTS, interrupt_command
 from places import ROOT
@@ -67,6 +68,15 @@ def play_shown(folder: Path) -> Iterator[Row]:
             yield f"{page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
 
 
+def play_pages(folder: Path) -> Iterator[Row]:
+    """The lines of the other pages, each section in a folder with the files that it needs."""
+    for part in how_to_pages.PARTS:
+        for played in how_to_pages.play_part(part, folder, make_environment()):
+            status = "-" if played.status is None else str(played.status)
+            result = "; ".join(played.faults) or ("ok" if played.status is not None else "not run")
+            yield f"{part.page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
+
+
 def play_inputs(folder: Path) -> Iterator[Row]:
     """The bad inputs, each as a process of its own."""
     write_bad_files(folder)
@@ -111,7 +121,7 @@ def write_recordings(folder: Path, minutes: float = 13.0) -> None:
 
 
 PARTS: dict[str, Callable[[Path], Iterator[Row]]] = {
-    "shown": play_shown, "inputs": play_inputs, "interruptions": play_interruptions}
+    "shown": play_shown, "pages": play_pages, "inputs": play_inputs, "interruptions": play_interruptions}
 
 if __name__ == "__main__":
     sys.exit(main())

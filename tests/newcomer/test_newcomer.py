@@ -5,6 +5,16 @@ from pathlib import Path
 
 import pytest
 from bad_inputs import BAD_INPUTS, BadInput, find_faults, write_bad_files
+from how_to_pages import (
+    NOT_PLAYED,
+    NOT_PLAYED_PAGES,
+    NOT_PLAYED_SECTIONS,
+    PARTS,
+    Part,
+    find_section,
+    list_command_lines,
+    play_part,
+)
 from interruption import LONG_COMMANDS, find_damage, interrupt_command, judge_end, judge_time
 from places import ROOT
 from play_newcomer import make_environment
@@ -97,3 +107,33 @@ def test_what_an_interrupted_command_leaves_is_judged(tmp_path: Path) -> None:
     assert judge_end(130, "rig fdi: interrupted\n") == [] and len(judge_end(1, "Traceback\nx\n")) == 3
     assert judge_time(0.5, 0.4) == [] and judge_time(0.5, 2.5) and judge_time(1e6, 0.1)
     assert {words.split()[0] for words in LONG_COMMANDS.values()} <= {*HELP_OF_COMMAND}
+
+
+def test_every_command_line_of_a_page_is_played_or_has_a_reason() -> None:
+    """And a reason belongs to a line that stands on a page."""
+    played = {page: "".join(find_section(page, part.section) for part in PARTS if part.page == page)
+              for page in {part.page for part in PARTS}}
+    pages = [f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")) if path.name != "tutorial.md"]
+    shown = {page: list_command_lines((ROOT / page).read_text()) for page in pages}
+    skipped = {page: [line for where, title in NOT_PLAYED_SECTIONS if where == page
+                      for line in list_command_lines(find_section(page, title))] for page in pages}
+    missing = [f"{page}: {line}" for page, lines in shown.items() if page not in NOT_PLAYED_PAGES for line in lines
+               if line not in [*list_command_lines(played.get(page, "")), *skipped[page]]]
+    assert missing == []
+    assert {*NOT_PLAYED_PAGES} <= {page for page, lines in shown.items() if lines} - {*played}
+    assert {*NOT_PLAYED} <= {line for page in played for line in shown[page]}
+
+
+def test_a_part_of_a_page_is_played_with_its_files(tmp_path: Path) -> None:
+    part = Part("docs/effects.md", "", "echo 1 > there.txt")
+    played = list(play_part(part, tmp_path, make_environment() | {"PATH": "/bin:/usr/bin"}))  # without rig
+    words = [done.line.split()[1] for done in played if done.status == 127 and done.faults]
+    assert words == ["effects", "effects", "simulate", "run", "effects"]
+    assert {"there.txt", "my_effects.py"} <= {path.name for path in (tmp_path / "docs_effects_md").iterdir()}
+
+
+def test_the_page_of_rig_diff_is_played(tmp_path: Path) -> None:
+    """One page as it stands; `make newcomer` plays all."""
+    played = list(play_part(Part("docs/diff.md"), tmp_path, make_environment()))
+    assert [(done.line.split()[1], done.status, done.faults) for done in played] == [
+        ("run", 0, ()), ("run", 1, ()), ("diff", 1, ())]
