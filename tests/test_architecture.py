@@ -51,7 +51,7 @@ FOLDER_MAY_IMPORT = {
     "rig.recorder": {"rig.network"},
     "rig.run": BENCH - {"rig.run", "rig.view", "rig.live", "rig.doctor"},
     "rig.view": {"rig.sequences"},
-    "rig.live": {"rig.network", "rig.sequences", "rig.recorder", "rig.interrupts"},
+    "rig.live": {"rig.network", "rig.sequences", "rig.recorder", "rig.view", "rig.interrupts"},
     "rig.doctor": {"rig.network", "rig.run"},
     "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
     "rig.studies": {*BENCH, "rig.interrupts", "rig.junit"},

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.live import Live
 
-from rig.live.feed import LiveReader
+from rig.live.feed import LiveReader, Message
 from rig.live.live_run import LivePlan, LiveRun
 from rig.live.screen import describe_line, draw_screen
 
@@ -31,9 +31,12 @@ def show_run(reader: LiveReader, plan: LivePlan) -> None:
         return
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
         reader.say_ready()
-        for run, silence in _follow_run(reader, LiveRun(plan), _FRAME):
+        last, heard = -1, time.monotonic()
+        for run, _ in follow_run(reader, LiveRun(plan), _FRAME):
+            if run.cycles != last:
+                last, heard = run.cycles, time.monotonic()
             width, height = console.size
-            live.update(draw_screen(run, width, height, silence), refresh=True)
+            live.update(draw_screen(run, width, height, time.monotonic() - heard), refresh=True)
 
 
 def find_obstacle(console: Console) -> str:
@@ -52,28 +55,27 @@ def print_lines(reader: LiveReader, run: LiveRun, reason: str) -> None:
     print(f"live: {reason}: a line every 2 s instead of the screen", file=sys.stderr, flush=True)
     reader.say_ready()
     next_line = time.monotonic() + 2.0
-    for known, _ in _follow_run(reader, run, _FRAME):
+    for known, _ in follow_run(reader, run, _FRAME):
         if time.monotonic() >= next_line:
             next_line += 2.0
             print(f"live: {describe_line(known)}", file=sys.stderr, flush=True)
     print(f"live: {describe_line(run)}", file=sys.stderr, flush=True)
 
 
-def _follow_run(reader: LiveReader, run: LiveRun, every: float) -> Iterator[tuple[LiveRun, float]]:
-    """The run again and again with the seconds since its last cycle, until it is over or the rig has gone."""
-    last, heard = -1, time.monotonic()
+def follow_run(reader: LiveReader, run: LiveRun, every: float) -> Iterator[tuple[LiveRun, list[Message]]]:
+    """The run again and again, `every` so many s, with what is new, until it is over or the rig has gone."""
     is_there = True
     while is_there:
         began = time.monotonic()
         is_there = not (reader.is_over or _has_ended(sys.stdin.fileno()))
         run.add_rows(reader.read_rows())
-        for message in reader.read_messages():
+        messages = reader.read_messages()
+        for message in messages:
             run.add_message(message)
         run.judge_checks()
-        if run.cycles != last:
-            last, heard = run.cycles, time.monotonic()
-        yield run, time.monotonic() - heard
-        time.sleep(max(every - (time.monotonic() - began), 0.02))
+        yield run, messages
+        if is_there:
+            time.sleep(max(every - (time.monotonic() - began), 0.02))
 
 
 def _has_ended(number: int) -> bool:

@@ -12,10 +12,12 @@ from collections.abc import Iterator
 from rig.interrupts import ignore_interrupts
 from rig.live.feed import LiveFeed, make_shared_file
 from rig.live.live_run import LivePlan
+from rig.live.viewer_place import ViewerPlace
 
 
 @contextlib.contextmanager
-def show_live(plan: LivePlan, last_cpu_is_taken: bool, patience: float = 20.0) -> Iterator[LiveFeed]:
+def show_live(plan: LivePlan, last_cpu_is_taken: bool, place: ViewerPlace | None = None,
+              patience: float = 30.0) -> Iterator[LiveFeed]:
     """Start the showing process, wait until it is ready, and give the feed to fill; end the process afterwards.
 
     The process has normal priority. It ignores Ctrl-C, which ends the run and through it the process; what it leaves of
@@ -23,13 +25,17 @@ def show_live(plan: LivePlan, last_cpu_is_taken: bool, patience: float = 20.0) -
 
     Args:
         plan: of the run.
+        place: of the viewer; None: the screen in the terminal.
         last_cpu_is_taken: the loop runs on the last CPU; the process gets the others, where there are any.
         patience: s to wait for the process; without it the run begins anyway.
     """
     with make_shared_file() as file:
         feed = LiveFeed(file.fileno())
         with ignore_interrupts():
-            process = subprocess.Popen([sys.executable, "-m", "rig.live.dashboard", str(file.fileno())],
+            program = ["rig.live.dashboard", str(file.fileno())]
+            if place is not None:
+                program = ["rig.live.viewer_feeder", str(file.fileno()), str(place.port), str(place.file or "")]
+            process = subprocess.Popen([sys.executable, "-m", *program],
                                        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
         try:
             _send_plan(process, plan, last_cpu_is_taken)
@@ -39,30 +45,30 @@ def show_live(plan: LivePlan, last_cpu_is_taken: bool, patience: float = 20.0) -
             yield feed
         finally:
             feed.end()
-            _end_process(process)
+            _end_process(process, is_on_screen=place is None)
 
 
 def _send_plan(process: subprocess.Popen[bytes], plan: LivePlan, last_cpu_is_taken: bool) -> None:
     assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.write(pickle.dumps(plan))
-        process.stdin.flush()
     cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if last_cpu_is_taken and len(cpus) > 1:
         with contextlib.suppress(OSError):  # it has ended
             os.sched_setaffinity(process.pid, cpus[:-1])
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(pickle.dumps(plan))
+        process.stdin.flush()
 
 
-def _end_process(process: subprocess.Popen[bytes]) -> None:
+def _end_process(process: subprocess.Popen[bytes], *, is_on_screen: bool) -> None:
     """Let the process end by itself, kill it if it does not, and restore the screen if it could not."""
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
         process.stdin.close()
     try:
-        process.wait(3.0)
+        process.wait(3.0 if is_on_screen else 20.0)  # a file is to be whole
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    if process.returncode != 0 and sys.stderr.isatty():
+    if is_on_screen and process.returncode != 0 and sys.stderr.isatty():
         sys.stderr.write("\033[?1049l\033[?25h")  # leave the second screen, show the cursor
         sys.stderr.flush()

@@ -131,6 +131,15 @@ class LiveRun:
         return self._count
 
     @property
+    def zero_ns(self) -> float:
+        """Log time at which main began; NaN before it."""
+        return self._zero_ns if self._main_from >= 0 else nan
+
+    def read_rows_from(self, first: int) -> NDArray[np.float64]:
+        """The rows from this one on, (rows, columns)."""
+        return self._table[first:self._count]
+
+    @property
     def is_over(self) -> bool:
         """Whether the last cycle has been played."""
         return any(event.kind == "phase" and event.text == "end" for event in self.events)

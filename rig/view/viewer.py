@@ -97,7 +97,7 @@ def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
     """Save the picture; -> the views' states."""
     from rerun.experimental import ViewerClient
 
-    port = _find_free_port()
+    port = find_free_port()
     image.unlink(missing_ok=True)
     with tempfile.TemporaryFile("w+") as output:
         viewer = subprocess.Popen([*_build_command(rrd, str(port)), "--headless", "--window-size", "1920x1080"],
@@ -140,7 +140,8 @@ def _build_command(rrd: Path, port: str) -> list[str]:
     return [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", port, "--hide-welcome-screen", str(rrd)]
 
 
-def _find_free_port() -> int:
+def find_free_port() -> int:
+    """A port of 127.0.0.1 that nothing uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

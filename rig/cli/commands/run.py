@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
     from fdi.trace.trace import Trace
+    from rig.live.viewer_place import ViewerPlace
     from rig.recorder import Record
     from rig.run.job import Job
     from rig.run.job_choice import JobChoice
     from rig.run.outcome import Outcome
     from rig.run.runner import Observe
+
+TERMINAL = "terminal"  # --live without a word
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
     add("--jobs", type=options.parse_count, default=None, metavar="N",
         help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN bus)")
-    add("--live", action="store_true",
+    add("--live", nargs="?", const=TERMINAL, metavar="rerun[:PORT|:FILE.rrd]",
         help="show the run while it runs: nodes, command and position, checks, timing; without a terminal a line "
-             "every 2 s")
+             "every 2 s. rerun: in the viewer's window, in an open viewer at a port of 127.0.0.1, or into a file")
     add("--from", dest="source", type=Path, metavar="trace.mcap", help="repeat the run recorded in this log")
 
 
@@ -63,18 +66,21 @@ def run_command(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
+    from rig.live.viewer_place import find_viewer_place
     from rig.network.clock import WallClock
     from rig.run.job import replace_settings
     from rig.run.job_choice import build_job
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
 
+    args.live, args.sequence = split_live(args.live, args.sequence)
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
         raise InputError("--max-overruns", "", f"a fraction from 0 to 1, not {args.max_overruns:g}")
     if not args.source and is_suite(args.sequence):
         if args.live:
             raise InputError("--live", "", "one sequence; runs of a suite run side by side")
         return start_suite(args)
+    place = find_viewer_place(args.live) if args.live and args.live != TERMINAL else None
     job = read_job(args.source, args) if args.source else build_job(build_choice(args), is_trusted=args.trust)
     bus, why = choose_bus_of_run(args, job.bus if args.source else args.bus, job.controller)
     job = replace_settings(job, bus=bus)
@@ -82,15 +88,15 @@ def run_command(args: argparse.Namespace) -> int:
     junit = choose_junit(args)
     clock = WallClock()
     with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
-        with (announce_run(job, why, is_silent=args.json or args.quiet or args.live) as progress,
-              choose_observer(job, is_live=args.live) as observe):
+        with (announce_run(job, why, is_silent=args.json or args.quiet or args.live == TERMINAL) as progress,
+              choose_observer(job, place, is_live=args.live is not None) as observe):
             prepare = pages.wait_until_loaded if job.realtime else do_nothing
             diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
             outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observe)
             progress("report", 0.0)
             pages.start_page(folder / "trace.mcap", folder / "report.html")
             report = build_run_report(Trace.read(folder / "trace.mcap", all=True))  # meanwhile
-        if args.live and not (args.json or args.quiet):
+        if args.live == TERMINAL and not (args.json or args.quiet):
             print_settings(job, why)
         with contextlib.suppress(BrokenPipeError):  # whether somebody reads the output does not change the verdict
             show_answer(add_outcome(report, outcome), args)  # the page may take longer than the operator wants to wait
@@ -101,6 +107,13 @@ def run_command(args: argparse.Namespace) -> int:
 
         write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
     return outcome.status
+
+
+def split_live(live: str | None, sequences: list[str]) -> tuple[str | None, list[str]]:
+    """The value of --live and the sequences; the word after --live is a sequence unless it begins with "rerun"."""
+    if live is None or live == TERMINAL or live.partition(":")[0] == "rerun":
+        return live, sequences
+    return TERMINAL, [live, *sequences]
 
 
 def is_suite(names: list[str]) -> bool:
@@ -165,8 +178,8 @@ def do_nothing() -> None:
 
 
 @contextlib.contextmanager
-def choose_observer(job: Job, *, is_live: bool) -> Iterator[Observe]:
-    """What looks at the records of a run: the screen of --live, and the lines on standard error about dead nodes."""
+def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observe]:
+    """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
     if not is_live:
         yield announce_dead_node
         return
@@ -176,10 +189,12 @@ def choose_observer(job: Job, *, is_live: bool) -> Iterator[Observe]:
     from rig.recorder import Event
 
     deaths: list[Event] = []
-    with show_live(make_live_plan(job.sequence, job.pace), last_cpu_is_taken=job.realtime) as feed:
+    with show_live(make_live_plan(job.sequence, job.pace), last_cpu_is_taken=job.realtime, place=place) as feed:
         def observe(t_ns: int, record: Record) -> None:
             feed.observe(t_ns, record)
-            if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
+            if place is not None:
+                announce_dead_node(t_ns, record)
+            elif isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
                 deaths.append(record)
 
         yield observe

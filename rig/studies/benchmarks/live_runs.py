@@ -6,6 +6,7 @@ noise of the comparison.
 """
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import signal
@@ -14,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 import termios
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fcntl import ioctl
+from importlib.util import find_spec
 from math import isfinite, log, nan
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,14 +29,17 @@ from fdi.estimation.geometric_mean import estimate_geometric_mean
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.errors import InputError, RigError
+from rig.live.viewer_feeder import make_viewer_command
+from rig.live.viewer_place import is_listening
+from rig.network.clock import WallClock
 from rig.network.raw_bus import can_open
 from rig.run.hard_loop import compile_cycle
 from rig.run.priority import list_cpus
 from rig.studies.benchmarks.realtime import choose_priority, compute_percentiles
+from rig.view.viewer import find_free_port
 
 Seconds = NDArray[np.float64]
-WITHOUT, AGAIN, LIVE = "without", "without, again", "--live"
-OPTIONS: Mapping[str, tuple[str, ...]] = {WITHOUT: (), AGAIN: (), LIVE: ("--live",)}
+WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"
 QUANTITIES = ("lateness", "response", "feedback_response")
 SHARES = ("p50", "p99")
 _SEQUENCE = """title = "Live"
@@ -77,18 +82,58 @@ def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress 
     if not can_open(bus):
         raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
     compile_cycle(realtime=True)
-    found: dict[str, list[dict[str, Seconds]]] = {name: [] for name in OPTIONS}
+    missing = {} if find_spec("rerun") else {VIEWER: "not measured: pip install 'eha-rig[view]'"}
+    contenders = [name for name in (WITHOUT, AGAIN, LIVE, VIEWER) if name not in missing]
+    found: dict[str, list[dict[str, Seconds]]] = {name: [] for name in contenders}
     for block in range(blocks):
-        turn = block % len(OPTIONS)  # nobody is always the first
-        names = [*OPTIONS][turn:] + [*OPTIONS][:turn]
-        for number, name in enumerate(names):
-            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(names)) / blocks)
-            found[name].append(play_run(bus, seconds / blocks, OPTIONS[name]))
+        turn = block % len(contenders)  # nobody is always the first
+        for number, name in enumerate(contenders[turn:] + contenders[:turn]):
+            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(contenders)) / blocks)
+            found[name].append(play_contender(name, bus, seconds / blocks))
     return summarise_live_runs(found) | {
         "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
-        "missing": {},
+        "missing": missing,
         "ended_early": {name: sum(len(run["lateness"]) < 900.0 * seconds / blocks for run in runs)
                         for name, runs in found.items()}}
+
+
+def play_contender(name: str, bus: str, seconds: float) -> dict[str, Seconds]:
+    """Times of the cycles of a run of one kind, see `play_run`."""
+    if name != VIEWER:
+        return play_run(bus, seconds, ("--live",) if name == LIVE else ())
+    with open_hidden_viewer() as port:
+        return play_run(bus, seconds, ("--live", f"rerun:{port}"))
+
+
+@contextlib.contextmanager
+def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
+    """A viewer that draws without a display, by the CPUs that the loop leaves free; give its port on 127.0.0.1.
+
+    Raises:
+        RigError: it does not start, for example without a Vulkan driver.
+    """
+    port = find_free_port()
+    cpus = list_cpus()
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cpus[:-1] or cpus)  # the viewer inherits it
+    try:
+        viewer = subprocess.Popen([*make_viewer_command(port), "--headless", "--window-size", "1280x800"],
+                                  stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                                  start_new_session=True)
+    finally:
+        os.sched_setaffinity(0, before)
+    clock = WallClock()
+    try:
+        while not is_listening(port):
+            if viewer.poll() is not None or clock.now() > patience * 1e9:
+                raise RigError("the viewer does not start without a display; it needs a Vulkan driver (Debian: "
+                               "mesa-vulkan-drivers libvulkan1)")
+            clock.sleep_until(clock.now() + 100_000_000)
+        yield port
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
+        viewer.wait()
 
 
 def play_run(bus: str, seconds: float, options: Sequence[str]) -> dict[str, Seconds]:

@@ -1,0 +1,116 @@
+"""`rig run --live rerun`: what arrives in a recording, a viewer that is closed, and places that cannot be used."""
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_command import rig
+
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from rig.live.viewer_place import find_viewer_place, is_listening
+from rig.view.viewer import find_free_port
+
+needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="pip install 'eha-rig[view]'")
+SHORT = """title = "Short"
+setup = [{ kind = "hold", time = 0.2 }]
+main = [{ name = "rest", kind = "hold", time = 0.3 }, { name = "out", kind = "step", to = 1e-3, time = 0.5 }]
+checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" },
+          { name = "too small", kind = "never_exceeds", signal = "xj", high = 0.1, unit = "mm" }]
+"""
+LONG = 'title = "Long"\nmain = [{ name = "rest", kind = "hold", time = 600 }]\n'
+
+
+def read_rows(path: Path) -> dict[str, list[tuple[float, object]]]:
+    """What a recording holds: entity -> time, s, and value of each of its rows."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[tuple[float, object]]] = {}
+    for chunk in RrdReader(path).stream():
+        table = chunk.to_record_batch()
+        for column in {"StateChange:state", "TextLog:text", "Scalars:scalars"} & {*table.schema.names}:
+            times = (table.column("run").cast("int64").to_numpy() / 1e9).tolist()
+            values = [value[0] for value in table.column(column).to_pylist()]
+            found.setdefault(chunk.entity_path, []).extend(zip(times, values, strict=True))
+    return {entity: sorted(rows, key=lambda row: row[0]) for entity, rows in found.items()}
+
+
+@needs_rerun
+def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(SHORT)
+    said = rig("run", tmp_path / "short.toml", "--live", f"rerun:{tmp_path}/live.rrd", "--out", tmp_path / "run")
+    assert said.status == 1 and said.err == "" and "too small" in said.out
+    rows, trace = read_rows(tmp_path / "live.rrd"), Trace.read(tmp_path / "run", all=True)
+    t, ram = zip(*rows["/position/ram"], strict=True)
+    np.testing.assert_allclose(t, trace.t, atol=1e-6)
+    np.testing.assert_allclose(np.array(ram, float), trace.xj * 1e3, atol=1e-9)
+    np.testing.assert_allclose([value for _, value in rows["/spool/spool"]], trace.xs * 1e6, atol=1e-9)
+    assert [state for _, state in rows["/states/1_phase"]] == ["set-up", "main"]
+    assert rows["/states/1_phase"][1][0] == pytest.approx(0.0, abs=1e-6)
+    assert rows["/states/4.01_position"][-1][1].startswith("PASS")  # type: ignore[attr-defined]
+    assert rows["/states/4.02_too_small"][-1][1].startswith("FAIL")  # type: ignore[attr-defined]
+    assert "operational" in {state for _, state in rows["/states/3_node_2_NMT"]}
+    assert len(rows["/log/checks"]) == len(trace.checks) and len(rows["/log/events"]) == len(trace.events)
+    assert not any(math.isnan(t) for t, _ in rows["/log/events"])
+
+
+@needs_rerun
+def test_the_run_goes_on_when_the_viewer_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "long.toml").write_text(LONG)
+    port = find_free_port()
+    server = subprocess.Popen([sys.executable, "-m", "rerun", "--serve-grpc", "--bind", "127.0.0.1", "--port",
+                               str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        wait_until(lambda: is_listening(port))
+        command = [sys.executable, "-m", "rig.cli.main", "run", str(tmp_path / "long.toml"), "--live", f"rerun:{port}",
+                   "--quiet", "--out", str(tmp_path / "run")]
+        run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        log = tmp_path / "run" / "trace.mcap"
+        wait_until(lambda: log.exists() and log.stat().st_size > 100_000)  # well into main
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+    assert run.stderr is not None
+    assert run.stderr.readline() == "rig run: the viewer was closed; the run goes on\n"
+    size = log.stat().st_size
+    wait_until(lambda: log.stat().st_size > size + 100_000)
+    run.send_signal(signal.SIGINT)
+    assert run.wait() == 130 and (tmp_path / "run" / "verdict.json").exists()
+
+
+def wait_until(is_true: object) -> None:
+    """Wait for something that comes sooner or later."""
+    assert callable(is_true)
+    end = time.monotonic() + 120.0
+    while not is_true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_without_the_viewer_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    said = rig("run", "--live", "rerun", "--out", tmp_path / "run")
+    assert said.status == 2 and said.err.count("\n") == 1 and "pip install 'eha-rig[view]'" in said.err
+    assert not (tmp_path / "run").exists()
+
+
+@needs_rerun
+@pytest.mark.parametrize("word", ["rerun", "rerun:x", "rerun:0", "rerun:/absent/live.rrd", "rerun:{port}"])
+def test_places_that_cannot_be_used(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="--live"):
+        find_viewer_place(word.format(port=find_free_port()))
+
+
+def test_a_word_after_live_may_be_a_sequence() -> None:
+    said = rig("run", "--live", "absent.toml")
+    assert said.status == 2 and "absent.toml" in said.err
