@@ -57,6 +57,7 @@ _OWN_GROUP = "on the default group, where other programs may be; tests run it on
 _VCAN = "needs vcan0; tests run it in a guest that has one"
 NOT_PLAYED = {
     "rig view runs/preflight": _WINDOW,
+    "rig run --live rerun": _WINDOW,
     "rig conformance plant --bus udp_multicast": _OWN_GROUP,
     "rig conformance c --bus udp_multicast": _OWN_GROUP,
     "rig run --controller c --bus socketcan:vcan0 --pace realtime": _VCAN,
