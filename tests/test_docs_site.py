@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from build_site import NAVIGATION, build_site, compare_navigation
+from build_site import NAVIGATION, build_site, compare_navigation, run_sphinx
 from check_site import find_faults
 from json_page import list_keys
 from notebook_page import NotebookError, RunCell, check_format, run_cell, run_notebook
@@ -80,10 +80,15 @@ def test_keys_below_lists_and_variants_are_found() -> None:
                                        ("c", "null or object", ""), ("c.d", "`1`, null", "")]
 
 
-def test_the_site_is_whole_and_needs_no_network(cells: list[RunCell], tmp_path: Path) -> None:
+def require_sphinx() -> None:
+    """Skip a test where the extra is missing."""
     missing = [name for name in ("sphinx", "myst_parser", "pydata_sphinx_theme") if not importlib.util.find_spec(name)]
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)} (pip install 'eha-rig[docs]')")
+
+
+def test_the_site_is_whole_and_needs_no_network(cells: list[RunCell], tmp_path: Path) -> None:
+    require_sphinx()
     site = tmp_path / "site"
     assert build_site(site, {NOTEBOOK: cells}) == []
     pages = {path.relative_to(site).with_suffix(".md").as_posix() for path in site.rglob("*.html")}
@@ -92,6 +97,14 @@ def test_the_site_is_whole_and_needs_no_network(cells: list[RunCell], tmp_path: 
     assert '"stribeck"' in index and "Search.setIndex(" in index
     shown = (site / "docs" / f"{NOTEBOOK.stem}.html").read_text()
     assert shown.count('.svg"') == 2 and "truth 50 uA" in shown
+
+
+def test_a_broken_link_fails_the_build(tmp_path: Path) -> None:
+    require_sphinx()
+    (tmp_path / "other.md").write_text("---\norphan: true\n---\n# Other\n\n## Here\n")
+    for target, status in (("other.md#here", 0), ("other.md#gone", 1), ("gone.md", 1)):
+        (tmp_path / "index.md").write_text(f"# First\n\n[a link]({target})\n")
+        assert run_sphinx(tmp_path, tmp_path / target.replace("#", "-")) == status
 
 
 def test_what_is_wrong_with_a_site_is_found(tmp_path: Path) -> None:
