@@ -5,10 +5,15 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
 pytest_plugins = ["plugin_bus_summary", "pytester"]
+
+# An example that took longer than hypothesis expects tells of the machine and not of the code.
+settings.register_profile("shared machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("shared machine")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell script starts what it puts in the background with Ctrl-C ignored, and children inherit that. The tests of

@@ -64,7 +64,7 @@ def stations(kind: str, number: int = 3) -> Iterator[list[Station]]:
         yield list(links)
 
 
-def gather(station: Station, number: int, timeout: float = 5.0) -> list[Frame]:
+def gather(station: Station, number: int, timeout: float = 60.0) -> list[Frame]:
     """Poll until `number` frames came, or the time is over."""
     frames: list[Frame] = []
     end = time.monotonic() + timeout

@@ -27,5 +27,5 @@ def run_program(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
         yield program
     finally:
         program.terminate()
-        _, errors = program.communicate(timeout=20)
+        _, errors = program.communicate(timeout=120)
     assert (program.returncode, errors) == (0, "")

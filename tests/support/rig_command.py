@@ -63,14 +63,14 @@ def started(*words: object, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-m", "rig.cli.main", *map(str, words)], **streams)
 
 
-def finished(process: subprocess.Popen[str], timeout: float = 60.0) -> Said:
+def finished(process: subprocess.Popen[str], timeout: float = 300.0) -> Said:
     """Wait for it."""
     out, err = process.communicate(timeout=timeout)
     typed = process.args[3:] if isinstance(process.args, list) else ()  # after python -m rig.cli.main
     return Said(process.returncode, out or "", err or "", typed)
 
 
-def grown(path: Path, size: int, timeout: float = 30.0) -> None:
+def grown(path: Path, size: int, timeout: float = 300.0) -> None:
     """Wait until a file has that many bytes: a run that is well under way."""
     end = time.monotonic() + timeout
     while time.monotonic() < end:
@@ -94,7 +94,7 @@ def nodes_on(where: str) -> list[int]:
     return found
 
 
-def gone(where: str, timeout: float = 5.0) -> bool:
+def gone(where: str, timeout: float = 60.0) -> bool:
     """Whether no node is left on that bus, within `timeout` s."""
     end = time.monotonic() + timeout
     while nodes_on(where) and time.monotonic() < end:

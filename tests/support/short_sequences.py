@@ -4,8 +4,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from fdi.progress import ignore_progress
 from plant import load_model
+from rig.network import master
 from rig.run.job import Job
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
@@ -26,6 +29,8 @@ checks = [
 ]
 """
 
+SLOW_START = "\n[timing]\noperational = 20\n"  # s
+
 
 def never() -> bool:
     """Nobody stops the run."""
@@ -33,15 +38,20 @@ def never() -> bool:
 
 
 def job(text: str = SHORT, seed: int = 0, set_: dict[str, float] | None = None, **settings: object) -> Job:
-    """A job of a sequence's text."""
+    """A job of a sequence's text. On a bus between programs the nodes have 20 s to start: the machine may be busy."""
+    if "bus" in settings and "[timing]" not in text:
+        text += SLOW_START
     sequence = parse_sequence(text, "short.toml", lambda name: b"")
     model = load_model(sequence.model.name).replace(dict(sequence.model.overrides)).replace(set_ or {})
     return Job(sequence=sequence, model=model, seed=seed, **settings)  # type: ignore[arg-type]
 
 
 def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
-    """Run a job; its results lie in `folder`."""
-    return run_job(one, folder, ignore_progress, stop)
+    """Run a job; its results lie in `folder`. On a bus between programs a boot-up may take 20 s."""
+    with pytest.MonkeyPatch.context() as patch:
+        if one.bus != "embedded":
+            patch.setattr(master, "BOOT_TIMEOUT", 20.0)
+        return run_job(one, folder, ignore_progress, stop)
 
 
 def stop_after(cycles: int) -> Callable[[], bool]:

@@ -7,11 +7,9 @@ import can
 import pytest
 from c_device import CFrame, load_library, skip_without_compiler
 from can.interfaces.udp_multicast.utils import pack_message, unpack_message
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-settings.register_profile("unhurried", deadline=None)  # the first call may compile, and the machine may be busy
-settings.load_profile("unhurried")
 frames = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))
 
 

@@ -15,6 +15,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 COMMAND = [sys.executable, "-m", "rig.cli.main", "run"]
+WATCHED = """
+title = "Watched"
+main = [
+  { name = "step", kind = "step", to = 1e-3, time = 0.2 },
+  { name = "sine", kind = "sine", amplitude = 1e-3, frequency = 1.0, time = 600 },
+]
+checks = [
+  { name = "overshoot", kind = "overshoot", window = "step", high = 100.0 },
+  { name = "position", kind = "never_exceeds", signal = "xj", high = 20, unit = "mm" },
+]
+"""
 LONG = 'title = "Long"\nmain = [{ name = "rest", kind = "hold", time = 600 }]\n'
 
 
@@ -48,14 +59,34 @@ def test_screen_of_a_run(tmp_path: Path) -> None:
     assert status == 0 and "PASS  Every check passed." in frames[-1]
     assert text.index("\x1b[?1049h") < text.index("\x1b[?1049l") < text.index("Every check passed")
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again
-    shown = [frame for frame in frames[1:] if "Position [mm]" in frame]
-    plots = {"".join(letter for letter in frame if 0x2800 < ord(letter) < 0x2900) for frame in shown}
-    assert len(plots) >= 3  # it moves
-    assert any("node 2 controller operational" in frame and "node 3 plant      operational" in frame for frame in shown)
-    assert any("measures " in frame for frame in shown)
-    assert any(re.search(r"PASS {2,}[a-z]", frame) for frame in shown)  # which check: as frames are drawn in time
-    assert any(re.search(r"response p50 \d+ p99 \d+ max \d+ us", frame) for frame in shown)
+    assert any("Position [mm]" in frame for frame in frames[1:])
     assert "lockstep" in frames[-1]
+
+
+def test_screen_follows_the_run(tmp_path: Path) -> None:
+    """A run that lasts until all of it was seen, however slowly the screen is drawn."""
+    sequence = tmp_path / "watched.toml"
+    sequence.write_text(WATCHED)
+    seen: dict[str, set[str]] = {"plot": set(), "nodes": set(), "measures": set(), "passed": set(), "response": set()}
+    stopped: list[int] = []
+
+    def look(text: str, number: int) -> None:
+        for frame in split_frames(text)[1:]:
+            if "Position [mm]" not in frame:
+                continue
+            seen["plot"].add("".join(letter for letter in frame if 0x2800 < ord(letter) < 0x2900))
+            seen["nodes"] |= set(re.findall(r"node 2 controller operational|node 3 plant      operational", frame))
+            seen["measures"] |= set(re.findall(r"measures +([a-z]+)", frame))
+            seen["passed"] |= set(re.findall(r"PASS {2,}([a-z]+)", frame))
+            seen["response"] |= set(re.findall(r"response p50 \d+ p99 \d+ max \d+ us", frame))
+        is_complete = len(seen["plot"]) >= 3 and len(seen["nodes"]) == 2 and all(seen.values())
+        if is_complete and not stopped:
+            stopped.append(number)
+            os.kill(number, signal.SIGINT)
+
+    _, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
+    assert stopped and status == 130, {name: sorted(each)[:2] for name, each in seen.items()}
+    assert "overshoot" in seen["passed"] and "position" in seen["measures"] and "position" not in seen["passed"]
 
 
 def test_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
@@ -85,9 +116,9 @@ def test_lines_without_a_terminal(tmp_path: Path) -> None:
 
 
 def test_dead_node_is_announced_before_the_run_ends(tmp_path: Path) -> None:
-    """The plant's process is killed; the line comes while the rig is still at work on its clean-up."""
+    """The plant's process is killed; the line comes while the rig is still at work on its clean-up of 4000 cycles."""
     sequence = tmp_path / "long.toml"
-    sequence.write_text(LONG)
+    sequence.write_text(LONG + 'cleanup = [{ kind = "hold", time = 4 }]\n')
     group = f"udp_multicast:239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
     rig = subprocess.Popen([*COMMAND, str(sequence), "--bus", group, "--out", str(tmp_path / "run")],
                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

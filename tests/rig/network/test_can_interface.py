@@ -13,7 +13,7 @@ import pytest
 from bus_stations import spec
 from places import ROOT
 from rig_command import rig
-from short_sequences import SHORT
+from short_sequences import SHORT, SLOW_START
 
 from rig.network.bus import open_can
 from rig.network.can_interface import UdpBus
@@ -39,16 +39,19 @@ def test_it_is_registered_where_python_can_looks() -> None:
 
 def test_another_process_and_the_bus_of_the_rig_hear_each_other_and_not_themselves() -> None:
     group = find_group()
-    program = OPEN.format(group=group) + "m = bus.recv(20); m.arbitration_id += 1; bus.send(m); print(bus.recv(0.3))"
+    program = OPEN.format(group=group) + (
+        "m = bus.recv(120); m.arbitration_id += 1; bus.send(m); "
+        "heard = [hex(each.arbitration_id) for each in iter(lambda: bus.recv(0.3), None)]; "
+        "print([each for each in heard if each != '0x181'])")  # a second request came before the answer was out
     with open_can(f"udp_multicast:{group}") as bus:
         other = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
         answer, began = None, time.time()
-        while answer is None and time.time() < began + 20:  # until the other one has joined
+        while answer is None and time.time() < began + 120:  # until the other one has joined
             bus.send(frame(0x181))
             answer = bus.recv(0.1)
-        printed = other.communicate(timeout=20)[0]
+        printed = other.communicate(timeout=120)[0]
     assert answer is not None and (answer.arbitration_id, bytes(answer.data)) == (0x182, b"\1\2\3")
-    assert printed.strip() == "None"
+    assert printed.strip() == "[]"
 
 
 def test_a_message_has_the_time_of_its_reception_and_passes_the_filters() -> None:
@@ -58,7 +61,7 @@ def test_a_message_has_the_time_of_its_reception_and_passes_the_filters() -> Non
         before = time.time()
         for cob_id in (0x80, 0x182, 0x183):
             other.send(frame(cob_id))
-        heard = bus.recv(2.0)
+        heard = bus.recv(60.0)
         assert heard is not None and heard.arbitration_id == 0x182 and before <= heard.timestamp <= time.time()
         assert group in str(heard.channel) and bus.recv(0.1) is None
 
@@ -73,7 +76,7 @@ def test_what_it_cannot_do_is_refused(options: dict[str, object], words: str) ->
 
 def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Path) -> None:
     group = find_group()
-    (tmp_path / "short.toml").write_text(SHORT)
+    (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
     program = ROOT / "docs" / "foreign_controller.py"
     imports = [line for line in program.read_text().splitlines() if line.startswith(("import", "from"))]
     assert not any(package in line for line in imports for package in ("rig", "plant", "fdi", "dbc"))

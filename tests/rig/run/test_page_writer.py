@@ -58,8 +58,11 @@ def test_a_run_may_wait_until_the_second_process_has_loaded(preflight: Path, tmp
     with PageWriter(in_background=True) as pages:
         pages.wait_until_loaded()
         assert pages._process is not None
-        spent = [read_cpu_time(pages._process.pid) for _ in range(2) if time.sleep(0.3) is None]
-        assert spent[0] == spent[1]
+        spent: list[tuple[str, str]] = []
+        while len(spent) < 4 or (spent[-4] != spent[-1] and len(spent) < 100):  # it may be kept from coming to rest
+            time.sleep(0.2)
+            spent.append(read_cpu_time(pages._process.pid))
+        assert spent[-4] == spent[-1]
         pages.start_page(preflight / "trace.mcap", tmp_path / "page.html")
         pages.finish_page()
         assert pages._process.returncode == 0 and is_page(tmp_path / "page.html")
