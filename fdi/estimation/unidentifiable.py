@@ -62,23 +62,37 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
     if problem.model.plant != "eha":
         return [], np.empty((len(x), 0))
     low, high = scaled_bounds(free)
-    names, found, trials = {f.name for f in free}, [], []
-    for said in list_powers(problem):
-        if next(iter(said)) not in names:
-            continue
-        for way in (TRIED, -TRIED):
-            trial = scale_together(free, x, said, way)
-            if ((trial >= low - 1e-9) & (trial <= high + 1e-9)).all() and (trial != x).any():
-                found.append(said)
-                trials.append(trial)
-                break
-    if not found:
+    names = {f.name for f in free}
+    every = [said for said in list_powers(problem) if next(iter(said)) in names]
+    if not every:
         return [], np.empty((len(x), 0))
-    white = problem.compute_white_residuals(free, np.vstack([x, *trials]))
-    flat = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)) < FLAT_DIRECTION_MISFIT * white.shape[2] / 13500.0
-    held = [said for said, level in zip(found, flat, strict=True) if level]
+    trials = np.array([[scale_together(free, x, said, TRIED * share) for said in every] for share in TRIED_SHARES])
+    is_tried = ((trials >= low - 1e-9) & (trials <= high + 1e-9)).all(axis=2) & (trials != x).any(axis=2)
+    samples = sum(len(trace) for trace in (problem.trace, *problem.also))
+    allowed = FLAT_DIRECTION_MISFIT * samples / 13500.0
+    held = [every[k] for k in np.flatnonzero(confirm_flat(problem, free, x, trials, is_tried, allowed))]
     ways = [(scale_together(free, x, said, 1e-6) - x) / 1e-6 for said in held]
     return held, np.array(ways).T if ways else np.empty((len(x), 0))
+
+
+def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: NDArray[np.bool_],
+                 allowed: float = FLAT_DIRECTION_MISFIT) -> NDArray[np.bool_]:
+    """Which directions a trial replay finds flat at `x` (p,), (k,).
+
+    Args:
+        problem: the run.
+        free: the unknowns.
+        x: their scaled values (p,).
+        trials: scaled unknowns (4, k, p) at each of `TRIED_SHARES` along each direction.
+        is_tried: (4, k), False where a bound stops a trial.
+        allowed: change of the misfit, of a trial of full length; a shorter one may change its square's share.
+    """
+    shares, confirmed = np.array(TRIED_SHARES), np.zeros(is_tried.shape, bool)
+    if is_tried.any():
+        white = problem.compute_white_residuals(free, np.vstack([x, trials[is_tried]]))
+        moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
+        confirmed[is_tried] = moved < allowed * shares[np.nonzero(is_tried)[0]] ** 2
+    return np.asarray(confirmed.any(axis=0), np.bool_)
 
 
 def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
@@ -144,10 +158,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     steps = np.array([[cut_at_bounds(free, x, TRIED * share * way) for way in ways] for share in shares])
     whole = TRIED * np.abs(shares)[:, None] * np.abs(ways).max(axis=1)
     is_full = np.abs(steps).max(axis=2) >= 0.9 * whole
-    white = problem.compute_white_residuals(free, np.vstack([x, x + steps.reshape(-1, len(free))]))
-    moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2)).reshape(is_full.shape)
-    is_flat = is_full & (moved < FLAT_DIRECTION_MISFIT * shares[:, None] ** 2)
-    flat_ways = ways[is_flat.any(axis=0)]
+    flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full)]
     found: Floats = flat_ways[_find_independent(flat_ways)].T
     return found
 

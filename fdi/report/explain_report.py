@@ -218,7 +218,7 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
     rows = [_baseline_row(a, signals, has_holdout)]
     rows += [_candidate_row(a, c, signals, has_holdout) for c in a.explanations]
     caption = ("Signals: repeatable part of the error over its noise floor (1: noise alone). Held-out run: error of "
-               "the worst signal over its noise floor (on the page: error of each signal). Evidence: gain in log "
+               "the worst signal over its noise floor (on the page: that of each signal). Evidence: gain in log "
                "likelihood minus a penalty for parameters and candidates. p: probability of such a gain where nothing "
                "is missing.")
     return Table(columns, rows, caption, terminal_rows=most + 1)
@@ -243,10 +243,11 @@ def _candidate_row(a: Answer, c: Candidate, signals: Sequence[str], has_holdout:
 
 
 def _format_holdout(a: Answer, holdout: Mapping[str, float], signals: Sequence[str]) -> list[str]:
-    """The worst signal of the held-out run over its noise floor, then each signal's error there."""
+    """Errors of the held-out run over their noise floors: of the worst signal, then of each signal."""
     floor = a.explanation.floor
-    worst = max((x / floor[s] for s, x in holdout.items() if s in floor), default=math.nan)
-    return [format_ratio(worst), *(_format(holdout, s) for s in signals)]
+    ratios = {s: x / floor[s] for s, x in holdout.items() if s in floor}
+    return [format_ratio(ratio) for ratio in (max(ratios.values(), default=math.nan),
+                                              *(ratios.get(s, math.nan) for s in signals))]
 
 
 def list_parameters(parameters: Any) -> Table:

@@ -89,6 +89,7 @@ class Law:
     reason: str  # why it holds, or why not
     hypothesis: Hypothesis
     holdout: Mapping[str, float]
+    floor: Mapping[str, float]  # noise floor of each signal under the law, SI
     equals: tuple[str, ...] = ()  # terms that would do as well as the first one
 
 
@@ -126,7 +127,7 @@ class LawSearch:
     base: Hypothesis  # without the law
     catalogue: Hypothesis | None  # the catalogue's best
     holdout: Mapping[str, Mapping[str, float]]  # errors of "base" and "catalogue" on the held-out run
-    floor: Mapping[str, float]
+    floor: Mapping[str, float]  # under the law where it holds, else under the model without it
     curve: LawCurve | None = None
 
 
@@ -166,8 +167,9 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, hol
     errors = {}
     if holdout is not None:
         errors = {name: _measure(search, h, holdout) for name, h in (("base", base), ("catalogue", catalogue)) if h}
-    curve = None if law is None else draw_curve(law, balances, states, search, base)
-    return LawSearch(missing, hidden, law, base, catalogue, errors, floor, curve)
+    curve = None if law is None else draw_curve(law, search, base.effects)
+    said = law.floor if law is not None and law.holds else floor
+    return LawSearch(missing, hidden, law, base, catalogue, errors, said, curve)
 
 
 def _describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:
@@ -231,6 +233,8 @@ class _Worker:
 
     def choose_terms(self, progress: Progress) -> tuple[Trial | None, tuple[str, ...]]:
         """Terms added one by one as long as left-out pieces of the run want them, and what would do as well."""
+        if self.base.is_at_floor:
+            return None, ()  # what a healthy unit's tolerances have not quite reached is not a law
         start = continue_fit(self.problem(()), linearise(self.problem(()), self.base.fit.free, self.base.fit.x), 2)
         now = Trial((), start)
         now = replace(now, unseen=self.measure_unseen(now))
@@ -370,7 +374,7 @@ class _Worker:
                   for term in t.terms for f, unit in zip(term.fields, term.units, strict=True)}
         left = _measure(last, h, holdout) if holdout is not None else {}
         holds, reason = self.decide(h, left, catalogue, holdout, floor)
-        return Law(t.terms, values, holds, reason, h, left, equals)
+        return Law(t.terms, values, holds, reason, h, left, last.estimate_floor(h), equals)
 
     def decide(self, h: Hypothesis, left: Mapping[str, float], catalogue: Hypothesis | None, holdout: Trace | None,
                floor: Mapping[str, float]) -> tuple[bool, str]:
@@ -410,11 +414,28 @@ def _read_value(fit: Fit, name: str, unit: str) -> LawValue:
     return LawValue(value, value - half, value + half, unit)
 
 
-def draw_curve(law: Law, balances: Sequence[Balance], states: States, search: Search, base: Hypothesis) -> LawCurve:
-    """Bin means of what is missing under the model without the law, and of the law, over the first term's state."""
+def remove_law(law: Law, effects: tuple[str, ...]) -> Hypothesis:
+    """The model with the tolerances that were fitted together with a law, and without the law.
+
+    Tolerances fitted without it have moved to make up for a part of what is missing.
+    """
+    fit = law.hypothesis.fit
+    own = {name_parameter(term, f) for term in law.terms for f in term.fields}
+    kept = np.array([f.name not in own for f in fit.free])
+    free = tuple(f for f, keep in zip(fit.free, kept, strict=True) if keep)
+    return Hypothesis(effects, replace(fit, free=free, x=fit.x[kept]), {})
+
+
+def draw_curve(law: Law, search: Search, effects: tuple[str, ...]) -> LawCurve:
+    """Bin means of what is missing without the law, and of the law, over the first term's state.
+
+    `effects` are those that the law stands beside.
+    """
+    bare = remove_law(law, effects)
+    balances, states = compute_balances(search, bare, floor=law.floor)
     term = law.terms[0]
     balance = next(b for b in balances if b.place == term.place)
-    rows = select_rows(balance, states, {**search.problem.model.values, **base.fit.values})
+    rows = select_rows(balance, states, {**search.problem.model.values, **bare.fit.values})
     along = {"damping": "speed", "dry": "direction", "conductance": "pressure", "area": "speed"}.get(term.part, "")
     own = find_states(term)
     state = own[0] if own else (along or "time")

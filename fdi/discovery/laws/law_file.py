@@ -1,6 +1,7 @@
 """The effect file of a law that holds, and the way from an explanation to the law."""
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fdi.discovery.explain import Explanation
@@ -24,14 +25,14 @@ def find_law_beside(e: Explanation, holdout: Trace | None, progress: Progress = 
     beside = find_law(e.search, e.ledger[-1], best, holdout, e.floor, progress)
     if beside.law is None or not beside.law.holds:
         return found
-    if found.law is None or not found.law.holds or _measure_left(beside) < _measure_left(found):
+    if found.law is None or not found.law.holds or _measure_left(beside, e.floor) < _measure_left(found, e.floor):
         return beside
     return found
 
 
-def _measure_left(found: LawSearch) -> float:
+def _measure_left(found: LawSearch, floor: Mapping[str, float]) -> float:
     assert found.law is not None
-    return measure_excess(found.law.holdout or found.law.hypothesis.errors, found.floor)
+    return measure_excess(found.law.holdout or found.law.hypothesis.errors, floor)
 
 
 def name_effects(law: Law) -> dict[str, str]:
