@@ -122,10 +122,22 @@ def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: Timing
     judged, invalid = select_judged(records, late, disturbances)
     ordered = sorted(troubles, key=lambda trouble: trouble.t_ns)
     causes = [find_cause(trouble, records, disturbances, gone) for trouble in ordered]
-    cause = min(causes, key=lambda found: found.cycle, default=None)
+    cause = find_first_cause(causes, disturbances)
     consequences = tuple(trouble for trouble in ordered if cause is None or trouble.text != cause.text)
     return Attribution(judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
                        sum(found.is_lateness for found in causes), count_overruns(records, late))
+
+
+def find_first_cause(causes: Iterable[Cause], disturbances: Iterable[Disturbance]) -> Cause | None:
+    """The earliest cause; a node that stopped for good while the bench was late comes before that lateness.
+
+    Lateness makes frames come late, but it ends no process.
+    """
+    ordered = sorted(causes, key=lambda cause: cause.cycle)
+    if not ordered or not ordered[0].is_lateness:
+        return ordered[0] if ordered else None
+    reach = max((late.reach for late in disturbances if late.first == ordered[0].cycle), default=ordered[0].cycle)
+    return next((cause for cause in ordered if cause.is_gone and cause.cycle <= reach), ordered[0])
 
 
 class LateCycles(NamedTuple):
@@ -316,7 +328,7 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
         return itself
     silent, origin = _find_silent_node(trouble, records, cycle)
     for node in (silent, trouble.node):
-        if node in gone:
+        if node in gone and _find_stop(node, records) <= cycle + 1:  # later it still answered
             return _describe_stop(node, records, min(origin, _find_stop(node, records)), cycle, gone[node])
     window = records.injected.any[max(origin - 1, 0):cycle + 1]
     if window.any() and trouble.kind != "guard":

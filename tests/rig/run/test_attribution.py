@@ -182,6 +182,18 @@ def test_a_dead_controller_is_named_although_a_sync_was_late_just_before() -> No
     assert source_and_kind(script.attribute({CONTROLLER: "no heartbeat any more"})) == (CONTROLLER, "stopped")
 
 
+def test_a_controller_killed_while_the_plant_was_late_is_named() -> None:
+    """Lateness ends no process. Long before the kill it is the first cause."""
+    for late, expected in ((597, (CONTROLLER, "stopped")), (300, (PLANT, "late"))):
+        script = Script()
+        script.feedback[late:late + 2] = 4e-3
+        script.report(late + 1, CONTROLLER, 0x8250)
+        script.lose_drive(600)
+        script.report(604.0, PLANT, 0x8250)
+        found = script.attribute({CONTROLLER: "its process was ended by SIGKILL"})
+        assert source_and_kind(found) == expected and len(found.consequences) == 2
+
+
 def test_a_dead_plant_is_named_and_not_the_controller_that_misses_it() -> None:
     """Seen five of five times as "node 2 controller"."""
     script = Script()
