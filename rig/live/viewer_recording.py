@@ -28,7 +28,7 @@ class LiveView:
         """Send the names and colours of all lines and lanes.
 
         Args:
-            rr: the module `rerun`.
+            rr: the module rerun.
             stream: its recording, with `build_live_blueprint` as blueprint.
             plan: of the run.
         """

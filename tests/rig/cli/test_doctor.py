@@ -53,7 +53,7 @@ def test_can_finding_is_true(findings: list[doctor.Finding]) -> None:
 def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None:
     text = next(finding.found for finding in findings if finding.name == "packages")
     assert f"numpy {np.__version__}" in text
-    extras = {"view", "dev", "fleet", "learn", "bench", "measure", "plots", "shell"}
+    extras = {"view", "dev", "fleet", "learn", "bench", "measure", "plots", "shell", "docs"}
     assert set(doctor.read_requirements()) == {""} | extras
     assert doctor.read_versions(["no-such-distribution"]) == {"no-such-distribution": ""}
 
