@@ -132,11 +132,11 @@ def test_every_result_prints_shows_plots_and_converts(lines: dict[str, Any]) -> 
     for result in [*results, fdi.diagnose(lines["trace"])]:
         assert isinstance(result, Result)
         assert str(result).startswith(f"{result.verdict}  {result.sentence}\n")
-        assert result.verdict in result.to_html() and "</html>" in result.to_html()
-        assert result._repr_html_().startswith("<iframe srcdoc=") and "<script" not in result._repr_html_()
-        assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == result.to_dict()
-        drawn = result.plot()
-        assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in result.to_html()
+        page, cell, answer, drawn = result.to_html(), result._repr_html_(), result.to_dict(), result.plot()
+        assert result.verdict in page and "</html>" in page
+        assert cell.startswith("<iframe srcdoc=") and "<script" not in cell
+        assert json.loads(json.dumps(answer, allow_nan=False)) == answer
+        assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in page
         with pytest.raises(InputError, match=f"one of {re.escape(result.figures[0])}"):
             result.plot("nothing of this name")
     for result in results:
