@@ -20,9 +20,14 @@ from fdi.comparison.residuals import (
     find_condition,
     locate_error,
 )
-from fdi.estimation.noise import Floor, find_floors, sensor_floors, simulate_reading_noise
+from fdi.estimation.noise import (
+    Floor,
+    describe_doubtful_repeats,
+    find_floors,
+    sensor_floors,
+    simulate_reading_noise,
+)
 from fdi.estimation.preparation import Repeat, align_columns, find_repeat, match_period, prepare_trace
-from fdi.estimation.repeat_noise import describe_doubtful_repeats
 from fdi.estimation.replay import (
     Columns,
     Replay,

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from fdi.estimation.noise import describe_doubtful_repeats, find_floors, sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, align_repeat, find_repeat, hold_inputs, match_period, prepare_trace
-from fdi.estimation.repeat_noise import check_repeats
+from fdi.estimation.replay import compute_residuals, replay_current
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.errors import InputError
@@ -66,7 +67,7 @@ def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Sourc
     model = match_period(model, est, SAME_PERIOD)
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
     unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
-    doubt = check_repeats(est, others, model) if model.plant == "eha" else ""
+    doubt = _check_repeats(est, others, model) if model.plant == "eha" else ""
     return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
 
 
@@ -134,3 +135,14 @@ def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source
     if match_period(model, unseen, SAME_PERIOD)["controller.period"] != period:
         raise InputError(source, "t", f"rows {period:g} s apart, as in {fitted}")
     return unseen
+
+
+def _check_repeats(trace: Trace, repeats: Sequence[Trace], model: Model) -> str:
+    """What `describe_doubtful_repeats` says of prepared repeats on the rows of a prepared trace.
+
+    An error of the model is the same in all of them, so it does not matter here.
+    """
+    if not repeats:
+        return ""
+    first, *others = (compute_residuals(run, replay_current(run, model)) for run in (trace, *repeats))
+    return describe_doubtful_repeats(find_floors(first, others, trace.period), sensor_floors(trace, model))

@@ -21,9 +21,11 @@ from scipy.special import gammainc, gammaincinv, ndtri
 from fdi.thresholds import (
     CALM_BLOCK_RATIO,
     HUM_LINE_RATIO,
+    LOWER_BOUND_ERROR_RATIO,
     NOISE_COEFFICIENT_GAIN,
     NOISE_WINDOW_CONFIDENCE,
     NOISIER_THAN_MODEL,
+    REPEAT_FLOOR_RATIO,
 )
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace, rms
@@ -124,6 +126,19 @@ def simulate_reading_noise(model: Model, xj: Floats) -> float:
         u = Input(0.0, 0.0, 0.0, k * model["controller.period"], 0.0, model["controller.period"])
         out[k], memory = law(x, memory, s, u, p)
     return rms(out - true)
+
+
+def describe_doubtful_repeats(floor: Mapping[str, Floor], noise: Mapping[str, Floor]) -> str:
+    """What makes a noise floor from repeats larger than the sensors' own noise explains; empty if nothing does."""
+    def limit(name: str) -> float:  # the data's own noise is a lower bound: coloured noise has less of it
+        return REPEAT_FLOOR_RATIO * (LOWER_BOUND_ERROR_RATIO if noise[name].lower_bound else 1.0)
+
+    above = [f"{SIGNALS[name].symbol} by {f.value / noise[name].value:.2g}" for name, f in floor.items()
+             if f.source == "repeats" and f.value > limit(name) * noise[name].value]
+    if not above:
+        return ""
+    return (f"the repeats differ by more than the noise of the sensors: {', '.join(above)} times. Use repeats of the "
+            "same unit; if its sensors are so noisy, set sensors.*_noise of the model")
 
 
 def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[float, float, float]:
