@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from fdi.diagnosis.bands import Event
 from fdi.diagnosis.beside import Beside, Explanation
@@ -117,6 +117,28 @@ def format_size(fault: Fault, size: Estimate) -> str:
     '45.0 N (42.0 .. 48.2)'
     """
     return format_interval(size.value, size.low, size.high, fault.unit)
+
+
+class FoundFault(NamedTuple):
+    """A fault as a diagnosis judged it, in words."""
+
+    name: str
+    level: str
+    size: str  # symbol, value and 95 % interval
+
+
+def list_found_faults(answer: Mapping[str, Any]) -> list[FoundFault]:
+    """Both faults of an answer of `rig fdi --json`; none if it has no levels, because the trace cannot be judged."""
+    if not answer.get("level"):
+        return []
+    words = {level.word: name for level, name in LEVEL_NAMES.items() if level is not None}
+    found = []
+    for fault in FAULTS:
+        size = Estimate(**{key: math.nan if x is None else x for key, x in answer["refined"][fault.symbol].items()})
+        level = words.get(answer["level"][fault.name], LEVEL_NAMES[None])
+        found.append(FoundFault(FAULT_NAMES[fault.name], level,
+                                f"{SIZE_SYMBOLS[fault.name]} {format_size(fault, size)}"))
+    return found
 
 
 def format_limits_of_fault(fault: Fault) -> tuple[str, str]:

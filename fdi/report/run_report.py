@@ -115,7 +115,8 @@ def _show_diagnosis(trace: Trace) -> list[Item]:
     if not word:
         return []
     moods: dict[str, Mood] = {"ACCEPTABLE": "good", "CANNOT_TELL": "doubtful"}  # all others fail the run
-    return [Line(word, sentence, moods.get(word, "bad"))]
+    faults = trace.provenance.get("fdi.faults", "")
+    return [Line(word, sentence, moods.get(word, "bad")), *([Line("faults", faults)] if faults else [])]
 
 
 def _list_notes(trace: Trace) -> list[str]:

@@ -25,6 +25,7 @@ class JobChoice(NamedTuple):
     controller: str | None = None
     plant: str | None = None
     max_overruns: float | None = None
+    is_diagnosed: bool = False  # whether `rig fdi` judges the servovalve after the run
 
 
 def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: bool = False,

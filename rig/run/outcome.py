@@ -23,12 +23,12 @@ from rig.run.history import History
 from rig.run.job import Job
 from rig.run.limits import LimitReached
 from rig.run.loop import Loop
+from rig.run.servovalve import has_fault
 from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import HEARTBEAT
 
 STATUS_OF_VERDICT = {"PASS": 0, "NOT_JUDGED": 0, "FAIL": 1, "ABORTED": 1, "INVALID_TIMING": 3}
-FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that are no pass
 INTERRUPTED = 130
 
 
@@ -87,7 +87,7 @@ class Outcome:
     @property
     def _has_fault(self) -> bool:
         """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
-        return self.fdi.get("verdict") in FDI_FAILS
+        return has_fault(self.fdi)
 
     @property
     def timing_problem(self) -> str:

@@ -36,6 +36,7 @@ from rig.run.priority import (
     raise_priority,
     suspend_garbage_collection,
 )
+from rig.run.servovalve import describe_faults
 from rig.run.session import MAIN, Session
 from rig.run.soft_time import explain_soft_time
 from rig.sequences.checks import CheckResult, evaluate_checks
@@ -137,19 +138,20 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     checks = judge_run(job, session, attribution.judged)
     for check in checks:
         recorder.put(session.now(), _make_check_record(check))
-    found = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.interrupted else {}
+    diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.interrupted else {}
     outcome = Outcome(
         job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
         interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind, reason),
         counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
         attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
-        identities=session.identities, fdi=found,
+        identities=session.identities, fdi=diagnosis,
         limits=find_limits(history.column, job.model, job.scenario.plan.start))
     recorder.metadata("differences", {"text": find_differences(job).describe()})
     if outcome.limits:
         recorder.metadata("limits", {f"{number:02d}": limit.describe() for number, limit in enumerate(outcome.limits)})
     if outcome.fdi:
-        recorder.metadata("fdi", {key: str(outcome.fdi.get(key, "")) for key in ("verdict", "sentence")})
+        found = {key: str(outcome.fdi.get(key, "")) for key in ("verdict", "sentence")}
+        recorder.metadata("fdi", {**found, "faults": describe_faults(outcome.fdi)})
     if outcome.attribution.cause is not None:
         recorder.metadata("cause", outcome.describe_attribution())
     recorder.metadata("verdict", {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),

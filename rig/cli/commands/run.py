@@ -7,14 +7,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rig.cli import options
 
 if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
-    from fdi.trace.trace import Trace
     from rig.live.viewer_place import ViewerPlace
     from rig.recorder import Record
     from rig.run.job import Job
@@ -72,6 +71,7 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.run.job_choice import build_job
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
+    from rig.run.servovalve import diagnose_servovalve
 
     args.live, args.sequence = split_live(args.live, args.sequence)
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
@@ -129,11 +129,8 @@ def start_suite(args: argparse.Namespace) -> int:
     Raises:
         RigError: bad input; nothing has run then.
     """
-    from plant import InputError
     from rig.cli.suite import run_suite
 
-    if args.fdi:
-        raise InputError("--fdi", "", "one sequence; for several: rig fdi FOLDER of each case")
     base = build_choice(args)
     bus, _ = choose_bus_of_run(args, args.bus, args.controller)
 
@@ -281,20 +278,6 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
                    data=outcome.to_json())
 
 
-def diagnose_servovalve(trace: Trace, progress: Progress) -> dict[str, Any]:
-    """The answer of `rig fdi --json` on the main phase of a run, against the nominal unit."""
-    from fdi.diagnosis.diagnosis import diagnose
-    from fdi.report.diagnosis_report import collect_data
-    from fdi.report.json import to_plain
-    from plant import InputError
-
-    try:
-        diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"])
-    except InputError as error:  # for example a sequence that is too short
-        return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
-    return dict(to_plain(collect_data(diagnosis)))
-
-
 def build_choice(args: argparse.Namespace) -> JobChoice:
     """What the command line chooses for the run of its first sequence; the bus is chosen later.
 
@@ -305,7 +288,8 @@ def build_choice(args: argparse.Namespace) -> JobChoice:
 
     return JobChoice(sequence=[*args.sequence, "preflight"][0], model=args.model,
                      changes=options.parse_changes(args.set), seed=args.seed or 0, effects=tuple(args.effects),
-                     pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns)
+                     pace=args.pace, controller=args.controller, plant=args.plant, max_overruns=args.max_overruns,
+                     is_diagnosed=args.fdi)
 
 
 def read_job(source: Path, args: argparse.Namespace) -> Job:

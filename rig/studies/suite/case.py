@@ -1,11 +1,12 @@
 """A case of a suite: what is run, and what came out."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rig.run.job_choice import JobChoice
+from rig.run.servovalve import describe_finding, has_fault
 from rig.sequences.checks import CheckResult
 
 NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged
@@ -38,6 +39,7 @@ class CaseResult(NamedTuple):
     seconds: float = 0.0  # wall-clock time
     checks: tuple[CheckResult, ...] = ()
     differences: str = "nothing"  # from the nominal test
+    fdi: Mapping[str, Any] = {}  # answer of `rig fdi`, if the case asked for it
 
     @property
     def failed(self) -> list[CheckResult]:
@@ -46,11 +48,23 @@ class CaseResult(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Why the case did not pass, in a few words: the first check that failed and the number of the others."""
+        """Why the case did not pass, in a few words: the first check that failed and the number of the others.
+
+        A fault of the servovalve is named beside them. So is a diagnosis that leaves the level of a fault open.
+        """
+        if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
+            return "rig fdi cannot tell"
         failed = self.failed
-        if self.verdict != "FAIL" or len(failed) < 2:
+        if self.verdict != "FAIL" or (len(failed) < 2 and not self.has_fault):
             return self.why
-        return f"{failed[0].name} and {len(failed) - 1} more"
+        more = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
+        checks = [f"{failed[0].name}{more}"] if failed else []
+        return "; ".join([*checks, describe_finding(self.fdi)] if self.has_fault else checks)
+
+    @property
+    def has_fault(self) -> bool:
+        """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+        return has_fault(self.fdi)
 
 
 def find_status(results: Sequence[CaseResult], *, is_interrupted: bool) -> int:

@@ -5,9 +5,10 @@ import contextlib
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from types import FrameType
 
-from fdi.progress import ignore_progress
+from fdi.progress import Progress, ignore_progress
 from fdi.report.run_report import write_run_page
 from plant.errors import RigError
 from rig.network.clock import WallClock
@@ -16,6 +17,7 @@ from rig.run.job_choice import build_job
 from rig.run.outcome import Outcome
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
+from rig.run.servovalve import diagnose_servovalve
 from rig.studies.resumable.worker_processes import run_in_processes
 from rig.studies.suite.case import Case, CaseResult
 
@@ -65,7 +67,9 @@ def play_case(case: Case) -> CaseResult:
     try:
         with catch_termination(case.choice.bus) as is_to_stop:
             job = build_job(case.choice, is_trusted=True, announce=_ignore)  # the code was announced when it was tried
-            outcome = run_job(job, case.folder, ignore_progress, is_to_stop)
+            diagnose = partial(diagnose_servovalve, progress=_make_progress(is_to_stop), workers=1)
+            outcome = run_job(job, case.folder, ignore_progress, is_to_stop,
+                              diagnose=diagnose if case.choice.is_diagnosed else None)
             write_run_page(case.folder / "trace.mcap", case.folder / "report.html")
     except RigError as error:
         return CaseResult(case, "ERROR", str(error), 1e-9 * clock.now())
@@ -77,10 +81,19 @@ def play_case(case: Case) -> CaseResult:
     return make_result(case, outcome, 1e-9 * clock.now())
 
 
+def _make_progress(is_to_stop: Callable[[], bool]) -> Progress:
+    """The progress of a diagnosis, which follows the run: it ends the process if the case is to stop."""
+    def end_if_asked(stage: str, share: float) -> None:
+        if is_to_stop():
+            raise SystemExit(128 + signal.SIGTERM)
+
+    return end_if_asked
+
+
 def make_result(case: Case, outcome: Outcome, seconds: float) -> CaseResult:
     """The result of a case from the outcome of its run, which took `seconds`."""
     return CaseResult(case, outcome.verdict, outcome.why, seconds, tuple(outcome.checks),
-                      find_differences(outcome.job).describe())
+                      find_differences(outcome.job).describe(), outcome.fdi)
 
 
 @contextlib.contextmanager

@@ -31,6 +31,7 @@ class CaseEntry:
     effects: tuple[str, ...] = ()
     requirement: str | tuple[str, ...] = ()
     timeout: Annotated[float, "s"] | None = None
+    fdi: bool = False
 
     def __post_init__(self) -> None:
         for key in ("sequence", "seed"):
@@ -136,7 +137,8 @@ def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
         words += [f"{name}={_show(value)}" for name, value in changes.items() if len(values[name]) > 1]
         words += [f"seed {seed}"] if len(seeds) > 1 else []
         choice = base._replace(sequence=_find_beside(folder, sequence), changes=changes, seed=seed, effects=effects,
-                               model=None if model is None else _find_beside(folder, model))
+                               model=None if model is None else _find_beside(folder, model),
+                               is_diagnosed=base.is_diagnosed or entry.fdi)
         yield Variant(", ".join(words), choice, entry.timeout, _as_tuple(entry.requirement))
 
 

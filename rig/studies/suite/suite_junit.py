@@ -8,6 +8,7 @@ from fdi.report.run_report import format_limits
 from rig import junit
 from rig.run.job_choice import JobChoice
 from rig.run.outcome import Outcome
+from rig.run.servovalve import describe_faults
 from rig.sequences.checks import CheckResult
 from rig.studies.suite.case import NO_VERDICT, Case, CaseResult, PlannedCheck
 from rig.studies.suite.run_suite import make_result
@@ -37,6 +38,7 @@ def _make_suite(title: str, result: CaseResult) -> junit.TestSuite:
     properties += [("requirement", f"{name}: {check.name}") for check in case.checks for name in check.requirement]
     tests = [_make_run_test(result, classname), *(_make_check_test(check, result, classname)
                                                    for check in result.checks)]
+    tests += [_make_diagnosis_test(result, classname)] if result.fdi else []
     return junit.TestSuite(case.name, tests, properties, result.seconds)
 
 
@@ -44,7 +46,7 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
     """The run as a whole: it came to its end and could be judged. Its checks are tests of their own."""
     test = junit.TestCase("run", classname, result.seconds, message=result.why,
                           output=_name_requirements(result.case.requirement))
-    if result.verdict == "ABORTED" or (result.verdict == "FAIL" and not result.failed):
+    if result.verdict == "ABORTED" or (result.verdict == "FAIL" and not result.failed and not result.has_fault):
         return test._replace(problem="failure", detail=result.verdict)
     if result.verdict in ("INVALID_TIMING", "ERROR"):
         return test._replace(problem="error", detail=result.verdict)
@@ -66,6 +68,16 @@ def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> 
     if result.verdict in ("INVALID_TIMING", *NO_VERDICT):
         return test._replace(problem="skipped", message=f"{result.verdict}: {measured}")
     return test._replace(problem="failure", message=measured, detail=f"{check.kind} {check.signal}".strip() + window)
+
+
+def _make_diagnosis_test(result: CaseResult, classname: str) -> junit.TestCase:
+    """The diagnosis of the servovalve: a failure with a fault, skipped where it leaves the level of one open."""
+    word, sentence = result.fdi["verdict"], result.fdi["sentence"]
+    faults = describe_faults(result.fdi).replace("; ", "\n")
+    test = junit.TestCase("rig fdi", classname, message=sentence, output=f"{word}: {sentence}\n{faults}".strip())
+    if word == "CANNOT_TELL" or (result.has_fault and result.verdict == "INVALID_TIMING"):
+        return test._replace(problem="skipped", message=f"{word}: {sentence}")
+    return test._replace(problem="failure", detail=faults or word) if result.has_fault else test
 
 
 def _name_requirements(names: Sequence[str]) -> str:

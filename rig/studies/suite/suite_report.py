@@ -45,6 +45,7 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         facts=facts, notes=_list_notes(requirements),
         sections=[Section("Cases", [_tabulate_cases(results, folder)]),
                   Section("Checks that failed", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
+                  Section("Servovalve", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
                   Section("Requirements", _tabulate_requirements(requirements), title_medium=Medium.BOTH)],
         files=files, conclusion="" if verdict == "PASS" else f"{verdict}: {_describe(results)}",
         data=collect_data(suite, results, requirements, seconds, processes))
@@ -112,6 +113,28 @@ def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Tabl
     return [Table(columns, rows, terminal_rows=30)]
 
 
+def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]:
+    """Level and size of both faults in each case that asked for a diagnosis."""
+    diagnosed = [result for result in results if result.fdi]
+    if not diagnosed:
+        return []
+    from fdi.report.diagnosis_report import LEVEL_MOODS, LEVEL_NAMES, VERDICT_MOODS, FoundFault, list_found_faults
+
+    moods = {name: LEVEL_MOODS[level] for level, name in LEVEL_NAMES.items()}
+    columns = [Column("case"), Column("rig fdi"), Column("fault", medium=Medium.PAGE), Column("level"),
+               Column("size (95 % interval)"), Column("finding", medium=Medium.PAGE)]
+    rows: list[list[Cell | str]] = []
+    for result in diagnosed:
+        word = result.fdi["verdict"]
+        mood = VERDICT_MOODS.get(word, "bad" if result.has_fault else "doubtful")
+        name, sentence = Cell(result.case.name, link=_link(result, folder)), result.fdi["sentence"]
+        for found in list_found_faults(result.fdi) or [FoundFault("", "", "")]:
+            rows.append([name, Cell(word, mood), found.name, Cell(found.level, moods.get(found.level, "")), found.size,
+                         sentence])
+            name, word, sentence = Cell(""), "", ""  # once for both faults
+    return [Table(columns, rows, "A fault beyond acceptable, or another deviation, fails the case.", terminal_rows=30)]
+
+
 def _format_value(check: CheckResult) -> str:
     return "not measurable" if math.isnan(check.value) else f"{check.value:.4g}"
 
@@ -150,7 +173,8 @@ def collect_data(suite: Suite, results: Sequence[CaseResult], requirements: Sequ
             "name": result.case.name, "verdict": result.verdict, "why": result.why, "seconds": round(result.seconds, 3),
             "folder": str(result.case.folder), "sequence": choice.sequence, "model": choice.model,
             "set": dict(choice.changes), "seed": choice.seed, "requirement": list(result.case.requirement),
-            "differences": result.differences, "checks": [to_plain(check._asdict()) for check in result.checks]})
+            "differences": result.differences, "checks": [to_plain(check._asdict()) for check in result.checks],
+            "fdi": dict(result.fdi)})
     return {"verdict": find_verdict(results), "title": suite.title, "cases": cases,
             "counts": dict(Counter(result.verdict for result in results)), "seconds": round(seconds, 3),
             "jobs": processes,

@@ -195,7 +195,6 @@ def test_options_that_do_not_go_together(tmp_path: Path) -> None:
     write_sequences(tmp_path)
     (tmp_path / "suite.toml").write_text(SUITE)
     for words, line in ((["suite.toml", "--seed", 1], "--seed: expected in the suite file"),
-                        (["suite.toml", "--fdi"], "--fdi: expected one sequence"),
                         (["short.toml", "short.toml", "--junit", "x.txt"], "expected FILE.xml"),
                         (["short.toml", "short.toml", "--pace", "realtime", "--jobs", 2], "--jobs: 2: expected 1 in")):
         paths = [tmp_path / word if str(word).endswith(".toml") else word for word in words]
