@@ -41,7 +41,7 @@ class Command(NamedTuple):
     load: Array | None  # N, None without such a column
 
 
-def name_sections(segments: Sequence[Segment]) -> list[str]:
+def list_section_names(segments: Sequence[Segment]) -> list[str]:
     """Names of the sections of a command: the segment's own, or kind_number with its number from 1."""
     return [segment.name or f"{segment.kind}_{number}" for number, segment in enumerate(segments, 1)]
 
@@ -54,7 +54,7 @@ def build_profile(segments: Sequence[Segment], start: float = 0.0) -> Profile:
     pieces: list[Array] = [np.empty(0)]
     sections: list[Section] = []
     last, begin = start, 0
-    for segment, name in zip(segments, name_sections(segments), strict=True):
+    for segment, name in zip(segments, list_section_names(segments), strict=True):
         cycles = round(segment.duration * RATE)
         demand = segment.demand(np.arange(cycles + 1) / RATE, last)
         pieces.append(demand[:-1])

@@ -201,7 +201,7 @@ def select_ramp_rows(s: Section, period: float, settling: float = 0.2) -> slice:
 # Which bands a trace is judged by
 # ---------------------------------------------------------------------------------------------------------------------
 
-def check_command(bands: Bands, found: Sequence[Section], period: float, where: object) -> None:
+def require_same_command(bands: Bands, found: Sequence[Section], period: float, where: object) -> None:
     """Refuse bands of another command.
 
     Raises:
@@ -223,7 +223,7 @@ def check_command(bands: Bands, found: Sequence[Section], period: float, where: 
 def matches_command(bands: Bands, com: Floats, period: float) -> bool:
     """Whether the bands are of this command, (n,) m."""
     try:
-        check_command(bands, find_sections(com, period), period, "")
+        require_same_command(bands, find_sections(com, period), period, "")
     except InputError:
         return False
     return True
@@ -359,7 +359,7 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
     if np.isnan(xj).all():
         raise InputError(where, "xj", "a measured position: bands judge nothing else")
     parts = parts or find_sections(com, period)
-    check_command(bands, parts, period, where)
+    require_same_command(bands, parts, period, where)
     if load is not None and is_loaded(load) and "load" not in bands.provenance:
         most = float(np.nanmax(np.abs(load)))
         raise InputError(where, "load", f"none, as these bands are of an unloaded ram, not {most:.3g} N")

@@ -17,7 +17,6 @@ from fdi.diagnosis.bands import (
     RampBand,
     StepBand,
     Width,
-    check_command,
     choose_bands,
     compute_half_range,
     compute_speed,
@@ -27,6 +26,7 @@ from fdi.diagnosis.bands import (
     is_loaded,
     judge_position,
     read_columns,
+    require_same_command,
     select_ramp_rows,
 )
 from fdi.diagnosis.bands_file import KNOT_CYCLES, save_bands
@@ -283,7 +283,7 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     if abs(period / base.period - 1) > 0.01:
         raise InputError(name, "t", f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
     parts = find_sections(com, period)
-    check_command(base, parts, period, name)
+    require_same_command(base, parts, period, name)
     own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
     n = base.sections[-1].stop
     at = np.clip(np.arange(n) + own - usual, 0, len(xj) - 1)

@@ -28,7 +28,7 @@ from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, span_all_rows
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
 from fdi.estimation.unidentifiable import find_flat_directions
-from fdi.estimation.unknowns import all_unknowns, effect_unknowns, silence_readings
+from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
@@ -101,12 +101,12 @@ def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]
     usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
     ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
     taken = {f.name for f in (clogging, *friction, *suspects, ratio)}
-    tolerances = (_take_logarithm(f) for f in all_unknowns(model) if f.name not in taken)
+    tolerances = (_take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
     return (clogging, *friction, *suspects, ratio, *tolerances)
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
-    own = next(u for u in effect_unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
+    own = next(u for u in list_effect_unknowns(CATALOGUE[s.effect], model) if u.name == s.parameter)
     if s.is_ratio:
         usual = get_positive(model, s.parameter)
         return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.likelihood import limit_dynamic_friction
-from fdi.estimation.unknowns import tolerance_sizes
+from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from plant.lanes import NARROW, Lanes
 from plant.model import Model
@@ -42,7 +42,7 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
     what that leaves out. Every other block of units moved before its test and came to rest wherever friction left it;
     the others start at rest at null, as a model does.
     """
-    tolerance = tolerance_sizes(model)
+    tolerance = list_tolerance_sizes(model)
     names = list(dict.fromkeys([*tolerance, CLOGGING.parameter, FRICTION.parameter, DYNAMIC]))
     lanes = Lanes(model, names, steps, workers=1)
     out = np.empty((count, len(com)))

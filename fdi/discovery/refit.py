@@ -17,10 +17,10 @@ from fdi.estimation.fit import Fit, continue_fit, linearise
 from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
 from fdi.estimation.unknowns import (
     UNREPLAYED,
-    active_effects,
-    all_unknowns,
     complete_model,
-    effect_unknowns,
+    list_active_effects,
+    list_all_unknowns,
+    list_effect_unknowns,
     silence_readings,
 )
 from fdi.progress import Progress, Stage, ignore_progress
@@ -166,9 +166,9 @@ def lean_model(model: Model, effects: Sequence[str]) -> Model:
 
 def _start_fit(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
-    own = [u for name in effects for u in effect_unknowns(CATALOGUE[name], search.model)]
+    own = [u for name in effects for u in list_effect_unknowns(CATALOGUE[name], search.model)]
     taken = {u.name for u in own}
-    free = (*(f for f in all_unknowns(search.model) if f.name not in taken), *own)
+    free = (*(f for f in list_all_unknowns(search.model) if f.name not in taken), *own)
     x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
     return continue_fit(search.problem, linearise(search.problem, free, x), FIRST)
 
@@ -179,7 +179,7 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
     Raises:
         InputError: one is in it already, excludes another, or nobody can fit it.
     """
-    present = list(active_effects(model))
+    present = list(list_active_effects(model))
     for name in effects:
         entry = CATALOGUE[name]
         if name not in [e.name for e in list_offered_effects(model.plant)]:

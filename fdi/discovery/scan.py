@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scaled_bounds, span_all_rows
 from fdi.estimation.unidentifiable import list_powers, scale_together
-from fdi.estimation.unknowns import effect_unknowns
+from fdi.estimation.unknowns import list_effect_unknowns
 from plant.effects import CATALOGUE
 from plant.threads import map_in_threads
 
@@ -71,7 +71,7 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
 
 
 def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
-    mine = {u.name: u for u in effect_unknowns(CATALOGUE[t.effect], problem.model)}
+    mine = {u.name: u for u in list_effect_unknowns(CATALOGUE[t.effect], problem.model)}
     kept = tuple(mine.get(f.name, f) for f in fit.free)  # a suspect of the reference model loses its tolerance
     own = tuple(u for name, u in mine.items() if name not in {f.name for f in fit.free})
     found = {f.name: f.centre + f.scale * float(v) for f, v in zip(fit.free, t.x, strict=True)}
@@ -82,7 +82,7 @@ def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
 
 def _list_starts_around(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
-    free = effect_unknowns(CATALOGUE[t.effect], problem.model)
+    free = list_effect_unknowns(CATALOGUE[t.effect], problem.model)
     units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
     starts = []
     for unit in units:

@@ -17,7 +17,7 @@ from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
 from fdi.estimation.judgement import Judgement, judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit
 from fdi.estimation.noise import Noise
-from fdi.estimation.unknowns import all_unknowns, complete_model, silence_readings
+from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
 from fdi.trace.signals import OUTPUTS, SIGNALS
@@ -96,7 +96,7 @@ class Search:
 
     def fit_base(self) -> Hypothesis:
         """The model without a further effect, its tolerances fitted."""
-        free = all_unknowns(self.model)
+        free = list_all_unknowns(self.model)
 
         def fit_tolerances(ease: bool) -> Fit:
             return fit_unknowns(self.problem, free, self.find_eased_start(free) if ease else None)
@@ -159,7 +159,7 @@ class Search:
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
-        usual = {f.name: f for f in all_unknowns(self.model)}
+        usual = {f.name: f for f in list_all_unknowns(self.model)}
 
         def fit_without(gone: str) -> Hypothesis:
             own = set(CATALOGUE[gone].fitted)

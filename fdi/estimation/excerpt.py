@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fdi.estimation.driven import is_driven_by_pressure, replay_in_turns
 from fdi.estimation.likelihood import limit_dynamic_friction
-from fdi.estimation.unknowns import tolerance_sizes
+from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.trace import PER_ROW, Trace
@@ -103,7 +103,7 @@ def make_excerpt(pieces: Iterable[tuple[int, int]]) -> Excerpt:
 def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float], changes: Sequence[Mapping[str, float]],
                          rows: int, count: int, progress: Progress) -> tuple[Floats, Floats, Floats]:
     """Information of the unknowns in each piece (q, d, d), the model's squared misfit (q,), share measured (q,)."""
-    tolerances = tolerance_sizes(model)
+    tolerances = list_tolerance_sizes(model)
     names = list(dict.fromkeys([*tolerances, *(name for change in changes for name in change)]))
     base = np.array([model[name] for name in names])
     moved = [{name: model[name] + size} for name, size in tolerances.items()] + list(changes)

@@ -24,7 +24,7 @@ from fdi.estimation.driven import replay_in_turns, replay_measured
 from fdi.estimation.excerpt import choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.noise import WINDOW
-from fdi.estimation.unknowns import WITHOUT_NOISE, tolerance_sizes
+from fdi.estimation.unknowns import WITHOUT_NOISE, list_tolerance_sizes
 from fdi.thresholds import (
     ANCHOR_RATE,
     FRICTION_UNCERTAINTY,
@@ -233,7 +233,7 @@ class Scatter(NamedTuple):
 
 def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
-    known = tolerance_sizes(model)
+    known = list_tolerance_sizes(model)
     base = np.array([model[name] for name in known])
     size = np.array(list(known.values()))
     scatter_steps = 20  # a cycle; coarse, because only the size of the residual matters here

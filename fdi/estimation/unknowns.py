@@ -17,27 +17,27 @@ UNREPLAYED = ("command", "reading")  # ports that a replay from the measured cur
 WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
 
 
-def relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
+def list_relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
     """Of the named parameters those that differ from one healthy unit to the next, with one tolerance as a fraction."""
     found = {name: model.kind.find_tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
     return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
 
 
-def tolerance_sizes(model: Model) -> dict[str, float]:
+def list_tolerance_sizes(model: Model) -> dict[str, float]:
     """The parameters that differ from one healthy unit to the next, with one tolerance in SI units."""
-    found = relative_tolerances(model, model.list_names())
+    found = list_relative_tolerances(model, model.list_names())
     sizes = {name: tolerance * abs(model[name]) for name, tolerance in found.items()}
     return {name: size for name, size in sizes.items() if size > 0.0}
 
 
-def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
-    """The same as unknowns of a fit, each with its tolerance as prior.
+def list_tolerance_unknowns(model: Model) -> tuple[Free, ...]:
+    """The parameters with a tolerance as unknowns of a fit, each with its tolerance as prior.
 
     The tolerance is a fraction of the nominal value, so that it does not depend on the model's own.
     """
     usual = model.nominal
     free = []
-    for name, tolerance in relative_tolerances(model, model.values).items():
+    for name, tolerance in list_relative_tolerances(model, model.values).items():
         value, q = model.values[name], find_quantity(name, plant=model.plant)
         scale = tolerance * (abs(usual.get(name, value)) or 1.0)
         low, high = value - HEALTHY_TOLERANCES * scale, value + HEALTHY_TOLERANCES * scale
@@ -45,8 +45,8 @@ def tolerance_unknowns(model: Model) -> tuple[Free, ...]:
     return tuple(free)
 
 
-def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tuple[Free, ...]:
-    """The parameters of an effect that is to be fitted: nothing is known of them but the possible range.
+def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tuple[Free, ...]:
+    """The parameters of an effect as unknowns of a fit, without prior: only their possible range is known.
 
     `turning`, Hz, is the first difference of a frequency: a small part of a turn over a test.
     """
@@ -60,26 +60,26 @@ def effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) -> tupl
     return tuple(free)
 
 
-def active_effects(model: Model) -> tuple[str, ...]:
+def list_active_effects(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
     return tuple(e.name for e in list_offered_effects(model.plant)
-                 if (_off_nominal(e, model) if e.base else e.name in model.effects and e.is_active(model.values)))
+                 if (_is_off_nominal(e, model) if e.base else e.name in model.effects and e.is_active(model.values)))
 
 
-def own_unknowns(model: Model) -> tuple[Free, ...]:
-    """The parameters of these effects, to be fitted from the values they have; nothing else is known of them."""
-    replayed = [CATALOGUE[name] for name in active_effects(model) if CATALOGUE[name].port not in UNREPLAYED]
-    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in effect_unknowns(e, model))
+def list_active_unknowns(model: Model) -> tuple[Free, ...]:
+    """The parameters of the active effects as unknowns of a fit, from their present values and without prior."""
+    replayed = [CATALOGUE[name] for name in list_active_effects(model) if CATALOGUE[name].port not in UNREPLAYED]
+    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in list_effect_unknowns(e, model))
 
 
-def all_unknowns(model: Model) -> tuple[Free, ...]:
+def list_all_unknowns(model: Model) -> tuple[Free, ...]:
     """All that is free in a model: tolerances, and the parameters of the effects that it has."""
-    own = own_unknowns(model)
+    own = list_active_unknowns(model)
     taken = {u.name for u in own}
-    return (*(f for f in tolerance_unknowns(model) if f.name not in taken), *own)
+    return (*(f for f in list_tolerance_unknowns(model) if f.name not in taken), *own)
 
 
-def _off_nominal(e: Effect, model: Model) -> bool:
+def _is_off_nominal(e: Effect, model: Model) -> bool:
     usual = model.nominal
     tolerance = model.kind.find_tolerance
     return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])

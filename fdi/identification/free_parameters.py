@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from fdi.estimation.likelihood import Free
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio
-from fdi.estimation.unknowns import tolerance_unknowns
+from fdi.estimation.unknowns import list_tolerance_unknowns
 from fdi.thresholds import IDENTIFIED_SYSTEMATIC_SD, STATIC_FRICTION_SYSTEMATIC_SD
 from plant.errors import InputError
 from plant.model import Model, find_quantity, find_shipped_model
@@ -126,7 +126,7 @@ def get_systematic_sd(name: str) -> float:
 def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
     """What the fit may change: the free parameters, and the tolerances of the others."""
     free = {r.name: _make_free(r) for r in ranges}
-    free |= {f.name: _take_logarithm(f) for f in tolerance_unknowns(model) if f.name not in free}
+    free |= {f.name: _take_logarithm(f) for f in list_tolerance_unknowns(model) if f.name not in free}
     if STATIC in free and DYNAMIC in free:
         usual = math.log(max(model[STATIC] / model[DYNAMIC], 1.0))
         is_free = STATIC in {r.name for r in ranges}

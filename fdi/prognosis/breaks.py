@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
 from fdi.prognosis.growth_laws import evaluate_shapes, list_shapes
-from fdi.prognosis.regression import NOISES, WANDERS, Scaled, compute_covariance, compute_log_prior
+from fdi.prognosis.regression import NOISES, WANDERS, Scaled, compute_covariance, compute_shape_log_priors
 from fdi.thresholds import BREAK_FEWEST_IN_LINE, BREAK_MOST, BREAK_PRIOR, LAST_OUTLIER_PRIOR, STEP_PRIOR_SD
 
 Floats = NDArray[np.float64]
@@ -90,7 +90,7 @@ def _compute_gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
         for j in range(len(WANDERS)):
             factor = np.linalg.cholesky(compute_covariance(data, i, j))
             white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
-            chance = compute_log_prior(i, j) - np.log(np.diag(factor)).sum() - 0.5 * white[:, 0] @ white[:, 0]
+            chance = compute_shape_log_priors(i, j) - np.log(np.diag(factor)).sum() - 0.5 * white[:, 0] @ white[:, 0]
             y, rises, columns = white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):]
             alone, both, size = _compute_evidence(y, rises, columns, usual)
             plain.append(chance + alone)

@@ -104,7 +104,7 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
     return out
 
 
-def compute_log_prior(noise: int, wander: int) -> Floats:
+def compute_shape_log_priors(noise: int, wander: int) -> Floats:
     """Log prior of each shape under a noise and a wander; a level that wanders is a trend, not `none`."""
     every, prior = list_shapes()
     constant = np.array([shape.law == "none" for shape in every])
@@ -140,7 +140,7 @@ def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     usual = np.array([shape.rise for shape in every])
     precision = (g * g).sum(axis=0) + usual ** -2
     rise, deviation = (g.T @ y) / precision, precision ** -0.5
-    evidence = (compute_log_prior(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
+    evidence = (compute_shape_log_priors(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
                 + compute_rise_evidence(rise, deviation, usual))
     own = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
     spread = own + _compute_end_prior(kind, strength) - s.T @ s

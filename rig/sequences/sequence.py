@@ -17,7 +17,7 @@ import numpy as np
 from plant import segments
 from plant.errors import InputError
 from plant.model import Model, find_quantity
-from plant.profile import Profile, build_profile, name_sections, parse_columns
+from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
 from rig.sequences.checks import Check, ResponseWithin, ShutOff
@@ -250,7 +250,7 @@ def _with_functions(sequence: Sequence, place: Place, read_file: ReadFile) -> Se
 
 def _check_phases(sequence: Sequence, place: Place) -> None:
     for phase in ("setup", "main", "cleanup", "load"):
-        called = name_sections(getattr(sequence, phase))
+        called = list_section_names(getattr(sequence, phase))
         for i, name in enumerate(called):
             if name in called[:i]:
                 raise place.at(phase, i, "name").refuse(f"a name used once, not a second {name!r}")

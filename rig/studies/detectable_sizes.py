@@ -74,7 +74,7 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
     number, effect, factor = job
     target = folder / f"{number:04d}"
     first_seed = 7200
-    healthy = draw_unit(first_seed + number, effect)
+    healthy = draw_healthy_case(first_seed + number, effect)
     claimed = claim_size(healthy, effect, target / "healthy")
     row: Row = {"case": number, "effect": effect, "factor": factor, "sources": sources,
                 "claimed": claimed if math.isfinite(claimed) else None, "verdict": "NOT_CLAIMED", "found": None}
@@ -87,7 +87,7 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
                   "found": effect in answer["effects"] and answer["verdict"] != "NOT_RESOLVABLE"}
 
 
-def draw_unit(seed: int, effect: str) -> cases.Case:
+def draw_healthy_case(seed: int, effect: str) -> cases.Case:
     """A healthy unit of a seed, with the known load that an effect needs."""
     load = hidden.CATALOGUE[effect].known_load
     return cases.draw_case(seed, kind="nothing", level="bench")._replace(signals="xj,p12,xs", load=load)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.simulated_units import draw_sensor_noise
-from fdi.estimation.unknowns import tolerance_sizes
+from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
@@ -75,7 +75,7 @@ def make_command(length: float, seed: int) -> Array:
 def record_unit(com: Array, seed: int) -> Trace:
     """A unit with tolerances, coloured noise and too much spool friction over a command (n,) m."""
     rng, model = np.random.default_rng([seed, 1]), Model().replace(HIDDEN)
-    sizes = {name: size for name, size in tolerance_sizes(model).items() if name not in HIDDEN}
+    sizes = {name: size for name, size in list_tolerance_sizes(model).items() if name not in HIDDEN}
     values = np.array([[model[name] + size * rng.standard_normal() for name, size in sizes.items()]])
     noise = [draw_sensor_noise(rng, model, len(com)) for _ in range(3)]
     noise = [x * model[f"sensors.{name}_noise"] / model["sensors.position_noise"]

@@ -13,11 +13,11 @@ from fdi.diagnosis import bands as judging
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
-    check_command,
     find_stays,
     judge_position,
     judge_trace,
     matches_command,
+    require_same_command,
 )
 from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands, parse_bands, save_bands
 from fdi.diagnosis.faults import Level
@@ -193,7 +193,7 @@ def test_any_command() -> None:
     for kind, ruling in ((UnitKind("", 0.4), CLOGGING), (UnitKind("", friction=60.0), FRICTION), (UnitKind(""), None)):
         x = simulate_units(load_model(), com, np.zeros_like(com), kind, 16, seed=99)
         assert {judge_position(com, row, 1e-3, made).ruling for row in x} == {ruling}
-    check_command(made, find_sections(com), 1e-3, "")
+    require_same_command(made, find_sections(com), 1e-3, "")
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:

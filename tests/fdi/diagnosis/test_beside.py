@@ -16,7 +16,7 @@ from fdi.diagnosis.joint_search import EFFECT_POWERS, list_other_effects, make_j
 from fdi.diagnosis.refine import list_unknowns, make_start
 from fdi.estimation.preparation import hold_inputs
 from fdi.estimation.unidentifiable import find_flat_directions
-from fdi.estimation.unknowns import effect_unknowns
+from fdi.estimation.unknowns import list_effect_unknowns
 from fdi.report.diagnosis_report import build_diagnosis_report
 from fdi.thresholds import GAIN_TIE
 from plant import load_model
@@ -62,7 +62,7 @@ def test_what_is_not_a_logarithm_goes_along_with_a_flat_direction() -> None:
     model = load_model()
     problem = make_joint_problem(model, hold_inputs(record_plant({"aero_stiffness.stiffness": 1e6}, COMMAND)),
                                  {"xj": 2e-6, "p12": 2e4, "xs": 1e-6})
-    free = (*list_unknowns(model), *effect_unknowns(CATALOGUE["aero_stiffness"], problem.model))
+    free = (*list_unknowns(model), *list_effect_unknowns(CATALOGUE["aero_stiffness"], problem.model))
     x = np.r_[make_start(list_unknowns(model), 0.2, 20.0), 1e6 / free[-1].scale]
     along = find_flat_directions(problem, free, x, (), EFFECT_POWERS)
     without = find_flat_directions(problem, free, x)

@@ -10,7 +10,7 @@ from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import white_noise
 from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.unknowns import all_unknowns, complete_model, silence_readings
+from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 
@@ -26,7 +26,7 @@ def sizes() -> tuple[dict[str, Detectable], dict[str, float]]:
     trace = hold_inputs(Trace.from_columns(simulate(model, com, seed=3)._asdict(), 1e-3, {}))
     noise = tuple(white_noise(x) for x in (2e-6, 2e4, 1e-6))
     problem = Problem(complete_model(model), trace, noise, bare=silence_readings(model), workers=2)
-    fit = fit_unknowns(problem, all_unknowns(model), rounds=3)
+    fit = fit_unknowns(problem, list_all_unknowns(model), rounds=3)
     linear = dict(find_smallest_visible(compute_sensitivity(problem, fit, EFFECTS)))
     assert [d.effect for d in find_hidden_effects(problem, fit, EFFECTS)] == ["sensor_offset"]
     return {d.effect: d for d in find_detectable_sizes(problem, fit, EFFECTS, linear)}, linear

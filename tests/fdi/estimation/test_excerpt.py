@@ -15,7 +15,7 @@ from fdi.estimation.fit import Fit, linearise
 from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import white_noise
-from fdi.estimation.unknowns import tolerance_unknowns
+from fdi.estimation.unknowns import list_tolerance_unknowns
 from fdi.trace.trace import Trace
 from plant import Model
 from plant.lanes import Lanes
@@ -49,7 +49,7 @@ def make_problem(trace: Trace) -> Problem:
 
 def fit_nothing(problem: Problem, trace: Trace) -> Fit:
     """The model as it is, as a fit."""
-    free = tolerance_unknowns(problem.model)[:1]
+    free = list_tolerance_unknowns(problem.model)[:1]
     return linearise(replace(problem, trace=trace, _lanes={}), free, np.zeros(1))
 
 

@@ -82,7 +82,7 @@ def test_the_evidence_is_that_of_the_model_integrated_by_brute_force() -> None:
                 return float(chance * multivariate_normal.pdf(data.y, rise * column, cov))
 
             exact = math.log(quad(likelihood, 0.0, 4.0, epsabs=0.0, limit=200, points=[0.2, 0.5, 1.0])[0])
-            prior = regression.compute_log_prior(part.noise, part.wander)[k]
+            prior = regression.compute_shape_log_priors(part.noise, part.wander)[k]
             ours = part.evidence[k] - prior - 2.0 * math.log(2.0 * math.pi)
             assert ours == pytest.approx(exact, abs=1e-6)
 

@@ -11,7 +11,7 @@ from effect_files import HEAD, restored_catalogue
 from rig_command import Said, rig
 from short_runs import HIDDEN, build_command, list_trace_arguments, write_measured_runs
 
-from fdi.estimation.unknowns import active_effects, all_unknowns, own_unknowns
+from fdi.estimation.unknowns import list_active_effects, list_active_unknowns, list_all_unknowns
 from fdi.report import numbers as spoken
 from plant import Model
 from plant.effects import CATALOGUE
@@ -145,13 +145,13 @@ def test_a_trace_without_current_is_refused(biased: dict[str, Path], tmp_path: P
 def test_effects_of_a_model_are_free_from_where_they_are() -> None:
     model = Model().replace({"null_bias.current": 1e-4, "spool.static_friction": 45.0, "spool.dynamic_friction": 30.0,
                              "jack.mass": 101.0, "command_rate_limit.rate": 0.1})
-    assert set(active_effects(model)) == {"spool_friction", "null_bias", "command_rate_limit"}
-    own = {f.name: f for f in own_unknowns(model)}
+    assert set(list_active_effects(model)) == {"spool_friction", "null_bias", "command_rate_limit"}
+    own = {f.name: f for f in list_active_unknowns(model)}
     assert set(own) == {"null_bias.current", "spool.static_friction", "spool.dynamic_friction"}
     assert own["null_bias.current"].centre == 1e-4 and np.isinf(own["null_bias.current"].prior)
-    names = [f.name for f in all_unknowns(model)]
+    names = [f.name for f in list_all_unknowns(model)]
     assert len(names) == len(set(names)) and {"jack.mass", "null_bias.current"} <= set(names)
-    assert not active_effects(Model()) and not own_unknowns(Model().with_effects(["null_bias"]))
+    assert not list_active_effects(Model()) and not list_active_unknowns(Model().with_effects(["null_bias"]))
 
 
 def test_numbers_in_words() -> None:
