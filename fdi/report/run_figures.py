@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, shade_sections, thin_line, to_svg
+from fdi.report.drawing import COMMAND, FAULT, GREEN, INK, RED, STYLE, shade_sections, thin_line, to_svg
 from fdi.trace.trace import Trace
 
 Floats = NDArray[np.float64]
-FAULT = "#ffd8a8"
 BRIDGED = 5  # cycles
 PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [um]", 1e6, "#d9730d"),
           ("close", "error, close up [um]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),

@@ -283,14 +283,17 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
-    """Each begins within main, and no two change one parameter at the same time."""
+    """Each begins within main and acts for a cycle or more, and no two change one parameter at the same time."""
     plan = sequence.plan(0)
     taken: dict[str, list[tuple[int, int]]] = {}
     for i, fault in enumerate(sequence.faults):
         if fault.start >= sequence.duration:
             raise place.at(i, "start").refuse(f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
+        first, last = plan.find_cycles(fault)
+        if first == last:
+            raise place.at(i, "start" if fault.end is None else "end").refuse(
+                f"a fault that acts in a cycle of {1 / RATE:g} s of main or more")
         if isinstance(fault, Parameter):
-            first, last = plan.find_cycles(fault)
             others = taken.setdefault(fault.parameter, [])
             if any(first < b and a < last for a, b in others):
                 raise place.at(i, "start").refuse(f"a time when no other fault changes {fault.parameter}")

@@ -9,11 +9,13 @@ import numpy as np
 from plant import Model, simulate
 from plant.run import Columns
 from plant.segments import RATE, Array
+from rig.nodes.scenario import require_servovalve
 from rig.run.job import Job
 from rig.run.limits import LimitReached, find_limits
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.guards import Guard
 from rig.sequences.sequence import Sequence as TestSequence
+from rig.studies.dry_run.planned_faults import PlannedFault, plan_faults
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events
 
@@ -59,6 +61,7 @@ class DryRun(NamedTuple):
     t: Array  # s of main
     speed: Array  # m/s, of the command; 0 where it jumps
     load: Array  # N
+    faults: list[PlannedFault]  # that the run will inject
     predicted: Columns  # of setup, main and cleanup, without the faults
     limits: tuple[LimitReached, ...]  # that the predicted run reaches
     checks: list[CheckResult]  # on the predicted run, those that need no events
@@ -77,7 +80,13 @@ class DryRun(NamedTuple):
 
 
 def make_dry_run(job: Job) -> DryRun:
-    """Hold the command and load of a job against the model's limits, and simulate it without bus and faults."""
+    """Hold the command and load of a job against the model's limits, and simulate it without bus and faults.
+
+    Raises:
+        InputError: a plant that the bench cannot drive, or a fault that contradicts the model's parameters.
+    """
+    require_servovalve(job.model)
+    faults = plan_faults(job)
     sequence, model = job.sequence, job.model
     setup, main = sequence.setup_profile(), sequence.main_profile()
     cleanup = sequence.cleanup_profile(main.end)
@@ -94,7 +103,8 @@ def make_dry_run(job: Job) -> DryRun:
         job=job, durations={"setup": first / RATE, "main": (last - first) / RATE,
                             "cleanup": (len(command) - last) / RATE},
         demands=measure_demands(command, load, t, sections, model), t=t,
-        speed=split_jumps(command, [row for row, _ in sections])[0], load=load, predicted=predicted,
+        speed=split_jumps(command, [row for row, _ in sections])[0], load=load, faults=faults,
+        predicted=predicted,
         limits=find_limits(lambda name: getattr(predicted, name), model, first),
         checks=evaluate_checks(chosen, columns, sequence.sections(), (), sequence.fault_starts()),
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from fdi.report.json import to_plain
-from fdi.report.report import Cell, Column, Figure, Line, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table
 from fdi.report.run_report import format_limits
+from plant.segments import RATE
 from rig.run.differences import find_differences
 from rig.studies.dry_run.dry_run import SHOWN_UNITS, Demand, DryRun
 
@@ -30,6 +31,7 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
         command="check", title=f"Dry run: {sequence.title}", verdict=verdict, mood=_as_mood(mood), sentence=sentence,
         facts=facts, notes=_list_notes(dry),
         sections=[Section("Command and load", [Line("duration", duration), _tabulate_demands(dry.demands)]),
+                  Section("Faults", _tabulate_faults(dry)),
                   Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
                   Section("Checks", _tabulate_checks(dry)),
                   Section("Picture", [_draw(dry)])],
@@ -44,6 +46,9 @@ def _list_notes(dry: DryRun) -> list[str]:
     notes = []
     if dry.job.sequence.faults:
         notes.append("the prediction is without the faults of the sequence")
+    length = dry.durations["main"]
+    notes += [f"fault {fault.label!r} ends with main at {length:g} s, not at {fault.end:g} s"
+              for fault in dry.job.sequence.faults if fault.end is not None and fault.end > length + 0.5 / RATE]
     if dry.not_predicted:
         notes.append(f"not predicted, because they judge events: {', '.join(dry.not_predicted)}")
     failing = [check.name for check in dry.checks if not check.passed and check.value == check.value]
@@ -65,6 +70,17 @@ def _tabulate_demands(demands: Sequence[Demand]) -> Table:
                      each.parameter if each.limit is not None else "", each.section, f"{each.t:.3f}"])
     return Table(columns, rows,
                  "A jump between two sections is a step and counts neither as speed nor as acceleration.")
+
+
+def _tabulate_faults(dry: DryRun) -> list[Table]:
+    if not dry.faults:
+        return []
+    columns = [Column("fault"), Column("kind", medium=Medium.PAGE), Column("target"), Column("from", "s", "right"),
+               Column("to", "s", "right"), Column("duration", "s", "right", Medium.PAGE), Column("size")]
+    rows: list[list[Cell | str]] = [
+        [each.name, each.kind, each.target, f"{each.t0:.3f}", f"{each.t1:.3f}", f"{each.duration:.3f}", each.size]
+        for each in dry.faults]
+    return [Table(columns, rows, "Times count from the start of main; all faults end with it.")]
 
 
 def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
@@ -98,6 +114,8 @@ def _tabulate_checks(dry: DryRun) -> list[Table]:
 
 
 def _draw(dry: DryRun) -> Figure:
+    faults = " Orange: the faults of the sequence." if dry.faults else ""
+
     def draw() -> str:
         from rig.studies.dry_run.dry_run_figure import draw_dry_run  # loads matplotlib
 
@@ -106,7 +124,7 @@ def _draw(dry: DryRun) -> Figure:
     return Figure("Position and speed of the command; position, following error and current of the predicted run of a "
                   "healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are "
                   "the windows of the checks, green for a check that passes on the predicted run and red for one that "
-                  "does not.", draw)
+                  "does not." + faults, draw)
 
 
 def collect_data(dry: DryRun) -> dict[str, Any]:
@@ -116,6 +134,7 @@ def collect_data(dry: DryRun) -> dict[str, Any]:
         "verdict": "BEYOND_LIMITS" if dry.problems else "WITHIN_LIMITS", "problems": dry.problems,
         "sequence": dry.job.sequence.title, "model": dry.job.model.name,
         "differences": find_differences(dry.job).describe(), "durations": dry.durations,
+        "faults": [{**each._asdict(), "duration": each.duration} for each in dry.faults],
         "demands": [{**each._asdict(), "violated": each.is_violated} for each in dry.demands],
         "predicted": {"current": float(np.abs(run.cor).max()), "error": float(np.abs(error).max()),
                       "limits": [each._asdict() for each in dry.limits],

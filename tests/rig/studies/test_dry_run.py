@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rig_command import rig
-from short_sequences import SHORT, job
+from short_sequences import SHORT, job, play
 
+from fdi.trace.trace import Trace
 from plant import Model, simulate
 from rig.studies.dry_run.dry_run import find_capabilities, make_dry_run, split_jumps
 from rig.studies.dry_run.dry_run_figure import draw_dry_run
+from rig.studies.dry_run.planned_faults import plan_faults
 
 FAR = """
 title = "Far"
@@ -82,6 +84,68 @@ def test_faults_are_not_predicted(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(f"{SHORT}\n{fault}\n")
     said = rig("check", tmp_path / "s.toml")
     assert said.status == 0 and "the prediction is without the faults of the sequence" in " ".join(said.out.split())
+
+
+FAULTS = """
+faults = [
+  { kind = "parameter", parameter = "filter.clogging", value = 0.9, start = 0.05, end = 0.25, ramp = 0.1 },
+  { name = "some", kind = "lost", frame = "drive", start = 0.1, count = 2, every = 5 },
+  { name = "biased", kind = "offset", signal = "xj", value = 1e-4, start = 0.3, end = 9.0 },
+  { name = "mute", kind = "heartbeat", node = "plant", start = 0.2, end = 0.25 },
+  { kind = "reset", start = 0.125 },
+]
+"""
+
+
+def test_the_faults_of_a_sequence_are_listed_and_drawn(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SHORT + FAULTS)
+    said = rig("check", tmp_path / "s.toml", "--json")
+    listed = {each["name"]: each for each in said.json["faults"]}
+    assert {name: (each["kind"], each["target"], each["t0"], each["t1"]) for name, each in listed.items()} == {
+        "parameter filter.clogging": ("parameter", "filter.clogging", 0.05, 0.25),
+        "some": ("lost", "frame drive", 0.1, 0.106), "biased": ("offset", "sensor xj", 0.3, 0.35),
+        "mute": ("heartbeat", "node plant", 0.2, 0.25), "reset node": ("reset", "node controller", 0.125, 0.126)}
+    assert listed["biased"]["duration"] == pytest.approx(0.05)
+    assert listed["parameter filter.clogging"]["size"] == "0 to 0.900 within 100 ms"
+    said = rig("check", tmp_path / "s.toml", "--out", tmp_path / "s.html")
+    text = " ".join(said.out.split())
+    assert "biased sensor xj 0.300 0.350 100 um" in text and "ends with main at 0.35 s, not at 9 s" in text
+    page = (tmp_path / "s.html").read_text()
+    assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in listed)
+
+
+def test_times_and_frames_of_the_list_are_those_of_the_run(tmp_path: Path) -> None:
+    """The events of a run tell when each fault began and ended."""
+    text = SHORT + FAULTS.replace("{ kind = \"reset\", start = 0.125 },", "")  # which would end the run
+    play(job(text), tmp_path)
+    planned = {each.name: (each.t0, each.t1) for each in plan_faults(job(text))}
+    events = [event for event in Trace.read(tmp_path, all=True).events if event.kind == "fault"]
+    found = {event.text: event.t for event in events}
+    assert len(planned) == 4
+    for name, (t0, t1) in planned.items():
+        assert found[f"{name} begins"] == pytest.approx(t0, abs=2e-3), found
+        assert found[f"{name} ends"] == pytest.approx(t1, abs=2e-3), found
+
+
+@pytest.mark.parametrize(("fault", "line"), [
+    ('kind = "lost", frame = "drive", start = 9.0', "s.toml:14: faults[0].start: expected a time within main's 0.35 s"),
+    ('kind = "lost", frame = "drive", start = 0.3499', "faults[0].start: expected a fault that acts in a cycle"),
+    ('kind = "lost", frame = "drive", start = 0.1, end = 0.1001', "faults[0].end: expected a fault that acts in a cyc"),
+    ('kind = "lost", frame = "drives", start = 0.1', "faults[0].frame: expected 'command', 'drive'"),
+    ('kind = "heartbeat", node = "controller", start = 0.1', "faults[0].node: expected 'plant' or 'rig'"),
+    ('kind = "offset", signal = "xk", value = 1.0, start = 0.1', "faults[0].signal: expected 'p12'"),
+    ('kind = "parameter", parameter = "filter.cloging", value = 0.5, start = 0.1', "faults[0].parameter: expected"),
+    ('kind = "parameter", parameter = "filter.clogging", value = 5.0, start = 0.1', "faults[0].value: expected"),
+    ('kind = "gone", start = 0.1', "faults[0].kind: expected a kind:")])
+def test_impossible_faults_are_one_line(fault: str, line: str, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SHORT + f"faults = [{{ {fault} }}]\n")
+    said = rig("check", tmp_path / "s.toml")
+    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1) and line in said.err, said
+
+
+def test_the_bench_drives_no_other_plant() -> None:
+    said = rig("check", "preflight", "--model", "servo")
+    assert said.status == 2 and said.err.count("\n") == 1 and "--model: servo: expected a model of eha" in said.err
 
 
 def test_the_no_load_speed_is_that_of_the_simulated_ram() -> None:
