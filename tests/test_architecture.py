@@ -50,7 +50,7 @@ FOLDER_MAY_IMPORT = {
     "rig.nodes": {"rig.network", "rig.device", "rig.sequences"},
     "rig.recorder": {"rig.network"},
     "rig.run": BENCH - {"rig.run", "rig.view", "rig.live", "rig.doctor"},
-    "rig.view": {"rig.sequences"},
+    "rig.view": {"rig.network", "rig.sequences"},
     "rig.live": {"rig.network", "rig.sequences", "rig.recorder", "rig.view", "rig.interrupts"},
     "rig.doctor": {"rig.network", "rig.run"},
     "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests

@@ -43,6 +43,7 @@ class LivePlan(NamedTuple):
     unknown_checks: tuple[str, ...]  # names of checks that only the run itself can judge
     sections: dict[str, slice]
     starts: dict[str, float]
+    has_load: bool
 
 
 def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
@@ -55,7 +56,7 @@ def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
         except (pickle.PicklingError, AttributeError, TypeError):
             unknown.append(check.name)
     return LivePlan(sequence.title, sequence.duration, pace, tuple(known), tuple(unknown), sequence.sections(),
-                    dict(sequence.fault_starts()))
+                    dict(sequence.fault_starts()), bool(sequence.load))
 
 
 class CheckState(NamedTuple):

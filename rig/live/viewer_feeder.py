@@ -32,7 +32,7 @@ def feed_viewer(reader: LiveReader, plan: LivePlan, port: int, file: str) -> Non
 
     viewer = None if port or file else open_empty_viewer(port := find_free_port())
     stream = rr.RecordingStream("eha-rig", recording_id=f"live-{os.getpid()}")
-    blueprint = build_live_blueprint(rr, plan)
+    blueprint = build_live_blueprint(plan)
     if file:
         stream.save(file, default_blueprint=blueprint)
     else:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,35 @@ from numpy.typing import NDArray
 from rig.live.feed import COLUMNS, Message
 from rig.live.live_run import CheckState, LivePlan, LiveRun
 from rig.network.node_objects import NAMES
-from rig.view.rerun_log import FAIL, LANES, MEASURED, NEUTRAL, PASS, PLOTS, SECTIONS, STATES, TEXTS, TIMELINE
+from rig.view.recording import (
+    FAIL,
+    MEASURED,
+    NEUTRAL,
+    PASS,
+    TIMELINE,
+    Lane,
+    make_lane_path,
+    make_plot_view,
+    send_lane_style,
+    send_line_style,
+)
+from rig.view.rerun_log import (
+    ACTIVE,
+    PLOTS,
+    SECTIONS,
+    STATES,
+    arrange_run,
+    name_fault_lane,
+    name_node_lane,
+    read_fault_event,
+)
 
 _SENT = {"position/command": ("com", 1e3), "position/ram": ("xj", 1e3), "current/current": ("cor", 1e3),
-         "pressure/pressure": ("p12", 1e-5), "spool/spool": ("xs", 1e6), "timing/lateness": ("lateness", 1e6),
+         "pressure/pressure": ("p12", 1e-5), "spool/spool": ("xs", 1e6), "load/load": ("load", 1.0),
+         "timing/lateness": ("lateness", 1e6),
          "timing/response": ("response", 1e6)}  # line of a plot -> column of the feed, scale from SI
 _ERROR = "error/error"
-_PHASE, _COMMAND = "1 phase", "2 command"
+_PHASE, _COMMAND = "run/phase", "run/command"
 _WORDS = {"waits": NEUTRAL, "measures": MEASURED, "after the run": NEUTRAL, "PASS": PASS, "FAIL": FAIL}
 
 
@@ -36,17 +57,18 @@ class LiveView:
         self._rows = 0
         self._waiting: list[Message] = []
         self._shown: dict[str, str] = {}  # lane -> state
-        self._checks = {name: f"4.{number:02} {name}" for number, name in enumerate(list_check_names(plan), 1)}
+        self._check_names = list_check_names(plan)
         for plot in PLOTS:
             for line in plot.lines:
                 path = f"{plot.origin}/{line.path}"
                 if path in _SENT or path == _ERROR:
-                    stream.log(path, rr.SeriesLines(colors=[line.colour], widths=[line.width], names=[line.name],
-                                                    aggregation_policy="MinMax"), static=True)
+                    send_line_style(rr, stream, path, line)
         self._declare_lane(_PHASE, {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL})
         self._declare_lane(_COMMAND, dict.fromkeys(plan.sections, SECTIONS["dynamic"]))
         for node in NAMES:
-            self._declare_lane(_name_node_lane(node), STATES)
+            self._declare_lane(name_node_lane(node), STATES)
+        for label in plan.starts:
+            self._declare_lane(name_fault_lane(label), {ACTIVE: FAIL})
 
     def update(self, run: LiveRun, messages: list[Message], *, is_last: bool = False) -> None:
         """Send the rows and messages that have come since the last call; before main only if it is the last one."""
@@ -70,6 +92,8 @@ class LiveView:
         values[_ERROR] = (rows[:, COLUMNS.index("com")] - rows[:, COLUMNS.index("xj")]) * 1e6
         if run.plan.pace == "lockstep":
             values.pop("timing/lateness")  # in lockstep nothing is ever late
+        if not run.plan.has_load:
+            values.pop("load/load")
         for path, column in values.items():
             self._rr.send_columns(path, times, self._rr.Scalars.columns(scalars=column), recording=self._stream)
         phases = rows[:, COLUMNS.index("phase")].astype(int)
@@ -83,7 +107,7 @@ class LiveView:
     def _send_message(self, message: Message, t: float) -> None:
         fields = message.fields
         if message.kind == "NmtState":
-            self._send_state(_name_node_lane(int(fields["node"])), str(fields["name"]), t)
+            self._send_state(name_node_lane(int(fields["node"])), str(fields["name"]), t)
         elif message.kind == "Check":
             word = "PASS" if fields["passed"] else "FAIL"
             state = CheckState(fields["name"], word, fields["value"], fields["unit"], True, fields["detail"])
@@ -92,59 +116,42 @@ class LiveView:
                             "INFO" if fields["passed"] else "ERROR", t)
         elif message.kind == "Event":
             self._send_text("log/events", f"{t:8.3f} s  {fields['kind']}: {fields['text']}", fields["level"], t)
+            fault = read_fault_event(fields["text"]) if fields["kind"] == "fault" else None
+            if fault:
+                self._send_state(name_fault_lane(fault[0]), fault[1], t)
 
     def _send_check(self, state: CheckState, t: float) -> None:
-        lane = self._checks.setdefault(state.name, f"4.{len(self._checks) + 1:02} {state.name}")
+        if state.name not in self._check_names:
+            return  # the protocol checks are judged after the run: they have no window
+        lane = f"check/{state.name}"
         word = f"{state.word}{_format_value(state)}" if state.word in ("PASS", "FAIL") else state.word
         if self._shown.get(lane, "waits") != word:
             self._declare_lane(lane, {**_WORDS, word: _WORDS[state.word]})
             self._send_state(lane, word, t)
 
     def _declare_lane(self, lane: str, colours: dict[str, int]) -> None:
-        if colours:
-            values = self._rr.StateConfiguration(values=list(colours), colors=np.array([*colours.values()], np.uint32))
-            self._stream.log(_make_path(lane), values, static=True)
+        send_lane_style(self._rr, self._stream, Lane(lane, [], colours))
 
     def _send_state(self, lane: str, state: str, t: float) -> None:
         if self._shown.get(lane) != state:
             self._shown[lane] = state
             self._stream.set_time(TIMELINE, duration=t)
-            self._stream.log(_make_path(lane), self._rr.StateChange(state=state))
+            self._stream.log(make_lane_path(lane), self._rr.StateChange(state=state))
 
     def _send_text(self, path: str, text: str, level: str, t: float) -> None:
         self._stream.set_time(TIMELINE, duration=t)
         self._stream.log(path, self._rr.TextLog(text, level=level))
 
 
-def build_live_blueprint(rr: Any, plan: LivePlan) -> Any:
+def build_live_blueprint(plan: LivePlan) -> Any:
     """The views of a run under way: they follow the newest rows."""
-    import rerun.blueprint as rrb
-
-    linked = rrb.TimeAxis(link="LinkToGlobal")
-    plots = [rrb.TimeSeriesView(origin=f"/{plot.origin}", name=plot.title, axis_x=linked,
-                                plot_legend=rrb.PlotLegend("RightTop")) for plot in PLOTS]
-    half = (len(plots) + 1) // 2
-    states = rrb.StateTimelineView(origin="/states", name=LANES, time_view=linked)
-    texts = rrb.TextLogView(contents=["/log/events", "/log/checks"], name=TEXTS)
-    share = min(max(0.039 * (5 + len(NAMES) + len(list_check_names(plan))), 0.5), 0.78)
-    return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*plots[:half]), rrb.Vertical(*plots[half:]),
-                       rrb.Vertical(states, texts, row_shares=[share, 1 - share])),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        rrb.BlueprintPanel(state="hidden"), rrb.SelectionPanel(state="hidden"))
+    plots = [make_plot_view(plot) for plot in PLOTS if plot.origin != "load" or plan.has_load]
+    return arrange_run(plots, 2 + len(NAMES) + len(plan.starts), len(list_check_names(plan)), "following")
 
 
 def list_check_names(plan: LivePlan) -> list[str]:
     """The checks of the sequence, those that only the run itself can judge last."""
     return [*(check.name for check in plan.checks), *plan.unknown_checks]
-
-
-def _name_node_lane(node: int) -> str:
-    return f"3 node {node} NMT"
-
-
-def _make_path(lane: str) -> str:
-    return f"states/{re.sub('[^A-Za-z0-9.]+', '_', lane)}"
 
 
 def _format_value(state: CheckState) -> str:

@@ -9,29 +9,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.trace import Trace
-from rig.view.rerun_log import (
-    LANES,
-    LIMIT,
-    PASS,
-    PLOTS,
-    SECTIONS,
-    STATES,
-    TEXTS,
-    VERDICTS,
-    ViewerError,
-    import_rerun,
-    list_lines,
-)
-
-LEVEL_COLOURS = (0x00DA7EFF, 0xAB0115FF)  # its colours of INFO and ERROR; WARN's stands in its own menu too
-LIMITS = "limits"
+from rig.view.recording import ShownView, ViewerError, import_rerun
 
 
 def open_viewer(rrd: Path) -> None:
@@ -45,46 +30,33 @@ def open_viewer(rrd: Path) -> None:
     subprocess.Popen(_build_command(rrd, "auto"), start_new_session=True)
 
 
-def take_screenshot(trace: Trace, rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
-    """Draw `rrd`, made of `trace`, without a display and save the picture; -> pixels of what each view is to show.
+def take_screenshot(shown: Sequence[ShownView], rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:
+    """Draw `rrd` without a display and save the picture; -> pixels of what each view is to show.
 
     Needs a Vulkan driver, lavapipe will do (Debian: mesa-vulkan-drivers libvulkan1). Raises ViewerError when the viewer
     does not come up within `patience` s, when a view reports a warning or an error, and when one shows no line, no
-    lane or no text. The lines of limits are counted, but one may well lie behind its signal.
+    lane or no text.
     """
     import_rerun()
     views = _draw_views(rrd, image, patience)
     wrong = [f"{view.name}: {report.summary}" for view in views for report in view.reports]
     if wrong:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
-    pixels = _count_view_pixels(trace, image)
-    fewest_text_pixels = 40  # pixels; one level in the list of events has some 60
-    fewest = {TEXTS: fewest_text_pixels, LIMITS: 0}
-    fewest_pixels = 500  # pixels; the marks in a legend have some 60 each
-    empty = [title for title, count in pixels.items() if count < fewest.get(title, fewest_pixels)]
+    pixels = _count_view_pixels(shown, image)
+    empty = [view.title for view in shown if pixels[view.title] < view.fewest]
     if empty:
         raise ViewerError(f"{image}: empty views: {', '.join(empty)}")
     return pixels
 
 
-def _count_view_pixels(trace: Trace, image: Path) -> dict[str, int]:
+def _count_view_pixels(shown: Sequence[ShownView], image: Path) -> dict[str, int]:
     """View -> how many pixels have the colour of one of its lines, lanes or words."""
     from matplotlib.image import imread
 
     shades = (imread(str(image))[..., :3] * 255).astype(int)
-    there = list_lines(trace)
-    out: dict[str, int] = {}
-    for plot in PLOTS:
-        colours = [line.colour for line in plot.lines if f"{plot.origin}/{line.path}" in there]
-        if colours:
-            out[plot.title] = sum(_count_pixels(shades, colour) for colour in colours)
     lane_weight = 0.784  # the viewer draws a lane's colour over black with this weight (rerun 0.41)
-    out[LANES] = sum(_count_pixels(shades, colour, lane_weight, 6) for colour in
-                     {PASS, *SECTIONS.values(), *STATES.values(), *VERDICTS.values()})
-    if trace.events or trace.checks:
-        out[TEXTS] = sum(_count_pixels(shades, colour) for colour in LEVEL_COLOURS)
-    out[LIMITS] = _count_pixels(shades, LIMIT)
-    return out
+    return {view.title: sum(_count_pixels(shades, colour, *((lane_weight, 6) if view.is_lanes else ()))
+                            for colour in view.colours) for view in shown}
 
 
 def _count_pixels(shades: NDArray[np.int64], colour: int, weight: float = 1.0, off: int = 24) -> int:

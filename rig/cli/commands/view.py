@@ -45,7 +45,7 @@ def run_command(args: argparse.Namespace) -> int:
         if args.screenshot:
             progress("the viewer draws the picture", 0.0)
             answer["screenshot"] = args.screenshot
-            answer["pixels"] = viewer.take_screenshot(trace, rrd, Path(args.screenshot))
+            answer["pixels"] = viewer.take_screenshot(rerun_log.list_shown_views(trace), rrd, Path(args.screenshot))
         elif save is None:
             progress("opening the viewer", 0.0)
             viewer.open_viewer(rrd)

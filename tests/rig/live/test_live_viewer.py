@@ -23,6 +23,8 @@ needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reas
 SHORT = """title = "Short"
 setup = [{ kind = "hold", time = 0.2 }]
 main = [{ name = "rest", kind = "hold", time = 0.3 }, { name = "out", kind = "step", to = 1e-3, time = 0.5 }]
+load = [{ kind = "ramp", to = 100.0, time = 0.5 }]
+faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.4, start = 0.2 }]
 checks = [{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" },
           { name = "too small", kind = "never_exceeds", signal = "xj", high = 0.1, unit = "mm" }]
 """
@@ -53,11 +55,15 @@ def test_what_arrives_is_what_the_log_holds(tmp_path: Path) -> None:
     np.testing.assert_allclose(t, trace.t, atol=1e-6)
     np.testing.assert_allclose(np.array(ram, float), trace.xj * 1e3, atol=1e-9)
     np.testing.assert_allclose([value for _, value in rows["/spool/spool"]], trace.xs * 1e6, atol=1e-9)
-    assert [state for _, state in rows["/states/1_phase"]] == ["set-up", "main"]
-    assert rows["/states/1_phase"][1][0] == pytest.approx(0.0, abs=1e-6)
-    assert rows["/states/4.01_position"][-1][1].startswith("PASS")  # type: ignore[attr-defined]
-    assert rows["/states/4.02_too_small"][-1][1].startswith("FAIL")  # type: ignore[attr-defined]
-    assert "operational" in {state for _, state in rows["/states/3_node_2_NMT"]}
+    assert [state for _, state in rows["/run/phase"]] == ["set-up", "main"]
+    assert rows["/run/phase"][1][0] == pytest.approx(0.0, abs=1e-6)
+    assert rows["/check/position"][-1][1].startswith("PASS")  # type: ignore[attr-defined]
+    assert rows["/check/too_small"][-1][1].startswith("FAIL")  # type: ignore[attr-defined]
+    assert [(round(t, 6), state) for t, state in rows["/fault/parameter_filter.clogging"]] == [(0.2, "active")]
+    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
+    assert trace.load.max() == 100.0
+    assert "operational" in {state for _, state in rows["/node/2_controller"]}
+    assert {entity for entity in rows if entity.startswith("/check/")} == {"/check/position", "/check/too_small"}
     assert len(rows["/log/checks"]) == len(trace.checks) and len(rows["/log/events"]) == len(trace.events)
     assert not any(math.isnan(t) for t, _ in rows["/log/events"])
 

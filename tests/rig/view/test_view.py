@@ -13,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_command import rig
 from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
 from rig.view import rerun_log, viewer
+from rig.view.recording import TIMELINE, ViewerError, make_lane_path
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
 
@@ -49,8 +51,8 @@ def _rows(trace: Trace, path: Path) -> dict[str, list[tuple[float, object]]]:
                 *table.schema.names}:
             values = [value[0] for value in table.column(column).to_pylist()]
             times = [math.nan] * len(values)
-            if rerun_log.TIMELINE in table.schema.names:
-                times = (table.column(rerun_log.TIMELINE).cast("int64").to_numpy() / 1e9).tolist()
+            if TIMELINE in table.schema.names:
+                times = (table.column(TIMELINE).cast("int64").to_numpy() / 1e9).tolist()
             found.setdefault(chunk.entity_path, []).extend(zip(times, values, strict=True))
     return {entity: sorted(rows, key=lambda row: row[0]) for entity, rows in found.items()}
 
@@ -81,19 +83,44 @@ def test_recording_holds_every_limit(rows: dict[str, list[tuple[float, object]]]
 
 
 def test_recording_holds_every_lane(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
-    lanes = {entity.removeprefix("/states/"): values for entity, values in rows.items() if "/states/" in entity}
-    assert lanes.pop("0_verdict") == [(-0.5, "PASS")]
-    assert lanes.pop("1_phase") == [(-0.5, "set-up"), (0.0, "main"), (13.5, "clean-up")]
-    assert [str(word).split()[0] for _, word in lanes.pop("2_command")] == [s.kind for s in trace.sections()]
-    for node in (2, 3):
-        states = lanes.pop(f"3_node_{node}_NMT")
+    lanes = {entity: values for entity, values in rows.items() if entity.split("/")[1] in ("run", "node", "check")}
+    assert lanes.pop("/run/verdict") == [(-0.5, "PASS")]
+    assert lanes.pop("/run/phase") == [(-0.5, "set-up"), (0.0, "main"), (13.5, "clean-up")]
+    assert [str(word).split()[0] for _, word in lanes.pop("/run/command")] == [s.kind for s in trace.sections()]
+    for node in ("2_controller", "3_plant"):
+        states = lanes.pop(f"/node/{node}")
         words = [word for _, word in states]  # the probes begin with a reset as well
         assert words[0] == "boot-up" and words[-1] == "operational" and states[-1][0] < 0
         assert words.count("boot-up") == words.count("operational") == 3
     assert len(lanes) == len(trace.sequence_checks) == 17
-    for (lane, ((t0, word), (t1, end))), check in zip(sorted(lanes.items()), trace.sequence_checks, strict=True):
-        assert lane[:5] == f"5.{trace.sequence_checks.index(check) + 1:02}_" and end == ""
-        assert (t0, t1) == pytest.approx((check.t0, check.t1)) and str(word).startswith(f"PASS {check.value:.4g}")
+    for check in trace.sequence_checks:
+        states = lanes[make_lane_path(f"/check/pass/{check.name}")]
+        (window,) = [k for k, (t, word) in enumerate(states) if t == pytest.approx(check.t0) and word]
+        assert states[window + 1][0] == pytest.approx(check.t1)
+        (text,) = {str(word) for _, word in states} - {"", "PASS"}  # beside a short window, in a long one
+        assert text.startswith(f"PASS {check.value:.4g}") and "≤" in text
+        assert (str(states[window][1]) == text) == (check.t1 - check.t0 > 0.5 * (trace.t[-1] - trace.t[0]))
+
+
+def test_recording_holds_faults_and_load(tmp_path: Path) -> None:
+    sequence = tmp_path / "faults.toml"
+    sequence.write_text("""title = "Faults"
+setup = [{ kind = "hold", time = 0.1 }]
+main = [{ kind = "hold", time = 0.5 }]
+load = [{ kind = "ramp", to = 500.0, time = 0.2 }]
+faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value = 1e-6, start = 0.1, end = 0.3 },
+          { kind = "parameter", parameter = "filter.clogging", value = 0.4, start = 0.2 }]
+""")
+    rig("run", sequence, "--out", tmp_path / "run")
+    trace = Trace.read(tmp_path / "run", all=True)
+    rows = _rows(trace, tmp_path / "x.rrd")
+    assert {entity: [(round(t, 6), word) for t, word in states] for entity, states in rows.items()
+            if entity.startswith("/fault/")} == {
+        "/fault/offset_of_XS_small": [(0.1, "active"), (0.3, "")],
+        "/fault/parameter_filter.clogging": [(0.2, "active")]}
+    np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
+    assert trace.load.max() == 500.0
+    assert "Load on the ram [N]" in {view.title for view in rerun_log.list_shown_views(trace)}
 
 
 def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
@@ -110,14 +137,14 @@ def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, lis
 
 def test_recording_of_an_aborted_run(aborted: Path, tmp_path: Path) -> None:
     rows = _rows(Trace.read(aborted, all=True), tmp_path / "x.rrd")
-    lanes = {entity.removeprefix("/states/"): values for entity, values in rows.items() if "/states/" in entity}
-    assert lanes["0_verdict"] == [(-0.3, "ABORTED: guard 'ram far out' was passed by xj")]
-    failed = {lane: [(round(t, 3), word) for t, word in values] for lane, values in lanes.items() if lane[0] == "4"}
+    assert rows["/run/verdict"] == [(-0.3, "ABORTED: guard 'ram far out' was passed by xj")]
+    failed = {entity.removeprefix("/check/FAIL/"): [(round(t, 3), word) for t, word in values]
+              for entity, values in rows.items() if entity.startswith("/check/FAIL/")}
     assert failed == {
-        "4.02_ramp_error": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 3.5 s"), (2.271, "")],
-        "4.03_gain_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
-        "4.04_lag_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
-        "4.05_spool": [(0, "FAIL not measured: 300 of 2271 samples of xs are missing"), (2.271, "")]}
+        "ramp_error": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 3.5 s"), (2.271, "")],
+        "gain_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
+        "lag_1_Hz": [(0, "FAIL not measured: the run ended at 2.271 s, the window at 5.5 s"), (2.271, "")],
+        "spool": [(0, "FAIL not measured: 300 of 2271 samples of xs are missing"), (2.271, "")]}
     assert np.isnan([float(str(value)) for _, value in rows["/spool/spool"]]).sum() == 300
     assert not any("nan" in str(text) for _, text in rows["/log/checks"])
 
@@ -129,10 +156,12 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
         pytest.skip(missing)
     assert not missing
     rerun_log.write_rrd(trace, tmp_path / "view.rrd")
-    pixels = viewer.take_screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
-    assert {*pixels} == {*(plot.title for plot in rerun_log.PLOTS), rerun_log.LANES, rerun_log.TEXTS, viewer.LIMITS}
+    pixels = viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "view.rrd", tmp_path / "view.png")
+    plots = {plot.title for plot in rerun_log.PLOTS if plot.origin != "load"}
+    assert {*pixels} == {*plots, rerun_log.LANES, rerun_log.TEXTS, rerun_log.LIMITS}
     assert (tmp_path / "view.png").stat().st_size > 50_000
-    assert pixels[rerun_log.LANES] > 20_000 and pixels[rerun_log.TEXTS] > 200 and pixels[viewer.LIMITS] > 1000
+    assert pixels[rerun_log.LANES] > 20_000 and pixels[rerun_log.TEXTS] > 200
+    assert pixels[rerun_log.LIMITS] > 600  # at least the two lines of the position
     with capsys.disabled():
         print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
 
@@ -145,8 +174,8 @@ def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monke
         pytest.skip(missing)
     monkeypatch.setattr(rerun_log, part, lambda *_: None)
     rerun_log.write_rrd(trace, tmp_path / "view.rrd")
-    with pytest.raises(rerun_log.ViewerError, match=f"empty views: {title}$"):
-        viewer.take_screenshot(trace, tmp_path / "view.rrd", tmp_path / "view.png")
+    with pytest.raises(ViewerError, match=f"empty views: {title}$"):
+        viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "view.rrd", tmp_path / "view.png")
 
 
 @pytest.fixture(scope="module")
@@ -159,13 +188,13 @@ def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
         pytest.skip("no rerun")
     (tmp_path / "x.rrd").write_bytes(b"")
     trace = Trace.read(folder)
-    with pytest.raises(rerun_log.ViewerError, match="does not draw"):
-        viewer.take_screenshot(trace, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+    with pytest.raises(ViewerError, match="does not draw"):
+        viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
 def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(rerun_log.ViewerError, match=r"pip install 'eha-rig\[view\]'"):
+    with pytest.raises(ViewerError, match=r"pip install 'eha-rig\[view\]'"):
         rerun_log.write_rrd(Trace.read(folder), folder / "none.rrd")
 
 
@@ -174,7 +203,7 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> 
         pytest.skip("no rerun, or no Linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(rerun_log.ViewerError, match="no display"):
+    with pytest.raises(ViewerError, match="no display"):
         viewer.open_viewer(Path("x.rrd"))
 
 
