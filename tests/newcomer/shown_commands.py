@@ -34,7 +34,10 @@ class Played(NamedTuple):
 
 
 def list_steps(page: str) -> list[Step]:
-    """The steps of a page in order: its indented blocks are lines to type, Python files, or answers."""
+    """The steps of a page in order: its indented blocks are lines to type, Python files, or answers.
+
+    A remark behind a line that begins with a verdict is an answer, too.
+    """
     steps: list[Step] = []
     for block in re.findall(r"(?:^    .*\n(?:\s*\n(?=    ))*)+", page, re.MULTILINE):
         code: list[str] = []  # of a file, from the line with its name to the next command
@@ -46,7 +49,10 @@ def list_steps(page: str) -> list[Step]:
                 steps.append(_make_file(code))
                 code = []
             if re.match(r"(rig|make|mkdir|cp|cd) ", line):
-                steps.append(Step("line", re.split(r"\s{2,}#", line)[0].strip()))
+                typed, *remarks = re.split(r"\s{2,}#", line, maxsplit=1)
+                steps.append(Step("line", typed.strip()))
+                for promised in filter(None, (VERDICT.match(remark.strip()) for remark in remarks)):
+                    steps.append(Step("answer", promised[1]))
             elif found := VERDICT.match(line):
                 steps.append(Step("answer", found[1]))
         if code:

@@ -69,17 +69,18 @@ def test_the_lines_of_a_page_are_played_in_order(tmp_path: Path) -> None:
     x = 1
 
     rig list models eha          # a remark
+    rig list models eha          # WITHIN_FLOOR is not what it prints
     rig report absent.mcap
     rig conformance 2 --bus socketcan:can0 --eds node2.eds
 
     WITHIN_FLOOR  That was printed nowhere.
 """
     steps = list_steps(page)
-    assert [step.kind for step in steps] == ["line", "file", "line", "line", "line", "answer"]
-    assert steps[1] == Step("file", "# my_effects.py\nx = 1\n", "my_effects.py") and NEEDS_HARDWARE in steps[4].text
+    assert [step.kind for step in steps] == ["line", "file", "line", "line", "answer", "line", "line", "answer"]
+    assert steps[1] == Step("file", "# my_effects.py\nx = 1\n", "my_effects.py") and NEEDS_HARDWARE in steps[6].text
     played = list(play_page(page, tmp_path, make_environment()))
-    assert [each.status for each in played] == [0, 0, 2, 2, None]
-    assert [len(each.faults) for each in played] == [0, 0, 1, 0, 1], played
+    assert [each.status for each in played] == [0, 0, 0, None, 2, 2, None]
+    assert [len(each.faults) for each in played] == [0, 0, 0, 1, 1, 0, 1], played
     assert (tmp_path / "here" / "my_effects.py").read_text() == "# my_effects.py\nx = 1\n"
 
 
