@@ -22,6 +22,7 @@ UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 
               "kN": 1e3, "A": 1.0, "mA": 1e-3, "s": 1.0, "ms": 1e-3}
 SHOWN_UNITS = {"com": "mm", "xj": "mm", "error": "um", "speed": "mm/s", "cor": "mA", "p12": "bar", "xs": "um",
                "load": "kN"}
+REACTIONS = ("response_within", "shut_off", "recovers")  # kinds of check that measure the time of a reaction
 BLUE, LIMIT = "#1f6feb", "#b7791f"
 
 
@@ -66,10 +67,11 @@ def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
         return ""
     first, stop = np.searchsorted(trace.t, [check.t0 - 0.5 * trace.period, check.t1 - 0.5 * trace.period])
     draw = DRAWERS.get(check.kind)
-    if draw is None or stop - first < 2 or check.signal not in (*SHOWN_UNITS, ""):
+    is_reaction = check.kind in REACTIONS
+    if draw is None or stop - first < 2 or (check.signal not in (*SHOWN_UNITS, "") and not is_reaction):
         return ""
     view = _View(trace, check, slice(int(first), int(stop)))
-    if check.signal and np.isnan(view.read(check.signal)).all():
+    if check.signal and not is_reaction and np.isnan(view.read(check.signal)).all():
         return ""
     if check.kind in ("overshoot", "rise_time", "settling_time") and not view.has_step:
         draw = _draw_response
@@ -214,13 +216,45 @@ def _draw_response(ax: Axes, view: _View) -> None:
     ax.set_ylabel("position [mm]")
 
 
-def _draw_signal(ax: Axes, view: _View) -> None:
-    """The signal itself, or the current where the check is about none; limits and value stand in the legend."""
-    name = view.check.signal or "cor"
+def _draw_reaction(ax: Axes, view: _View) -> None:
+    """The signal, or the current where the check is about none, around the instant from which the reaction counts.
+
+    Vertical lines: that instant, the latest time that the limits allow, and when the reaction came. Of a log without
+    the instant, which earlier versions wrote, the window is drawn.
+    """
+    check = view.check
+    name = check.signal if check.signal in SHOWN_UNITS else "cor"
     unit = SHOWN_UNITS[name]
-    ax.plot(*thin_line(view.t, view.read(name) / UNIT_SIZES[unit]), color=BLUE, lw=0.9, label=name)
-    ax.plot([], [], " ", label=f"{_name_value(view.check)}; limits in the table")
+    if not math.isnan(check.after):
+        view = view._replace(rows=_find_reaction_rows(view))
+    ax.plot(*thin_line(view.t, view.read(name) / UNIT_SIZES[unit]), color=BLUE, lw=1.2, label=name)
     ax.set_ylabel(f"{name} [{unit}]")
+    if math.isnan(check.after):
+        ax.plot([], [], " ", label=f"{_name_value(check)}; limits in the table")
+        return
+    ax.set_xlim(view.t[0], view.t[-1])
+    ax.axvline(check.after, color=COMMAND, lw=1.2, ls=":",
+               label="clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s")
+    for level, word in ((check.above, "above"), (check.below, "below")):
+        if not math.isnan(level):
+            ax.axhline(level / UNIT_SIZES[unit], color=COMMAND, lw=1.2, ls="--",
+                       label=f"{word} {level / UNIT_SIZES[unit]:g} {unit}")
+    _draw_times(ax, check, check.after)
+    if math.isnan(check.value):
+        ax.plot([], [], " ", label=_name_value(check))
+
+
+def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
+    """The rows around a reaction: from half its longest time before the instant to three times that after it.
+
+    Where it did not come, ten times the limit is shown. `least`: s after the instant.
+    """
+    check, trace = view.check, view.trace
+    times = [_to_seconds(check, x) for x in (check.value, check.high, check.low) if not math.isnan(x)]
+    longest = max([abs(t) for t in times], default=0.0)
+    after = max((10.0 if math.isnan(check.value) else 3.0) * longest, least)
+    first, stop = np.searchsorted(trace.t, [check.after - max(0.5 * longest, 0.5 * least), check.after + after])
+    return slice(int(first), int(stop)) if stop - first > 1 else view.rows
 
 
 def _draw_limits(ax: Axes, check: Check, sides: tuple[float, ...] = (1.0,), middle: float = 0.0) -> None:
@@ -265,5 +299,5 @@ DRAWERS: Mapping[str, Callable[[Axes, _View], None]] = {
     "overshoot": _draw_overshoot, "rise_time": _draw_rise_time, "settling_time": _draw_settling_time,
     "steady_error": _draw_error_level, "ramp_error": _draw_error_level, "max_error": _draw_error_level,
     "rms_error": _draw_error_level, "break_away": _draw_break_away, "never_exceeds": _draw_largest,
-    "amplitude_ratio": _draw_response, "phase_lag": _draw_response, "response_within": _draw_signal,
-    "shut_off": _draw_signal, "recovers": _draw_signal}
+    "amplitude_ratio": _draw_response, "phase_lag": _draw_response, "response_within": _draw_reaction,
+    "shut_off": _draw_reaction, "recovers": _draw_reaction}

@@ -48,7 +48,7 @@ def draw_signals(trace: Trace) -> str:
                 ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
                 if ax is axes[0]:
                     foot = ax.get_xaxis_transform()
-                    ax.text(t0, 0.03, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
+                    ax.text(t0, 0.07, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
         if trace.sequence_checks:
             _draw_checks(axes[-1], trace)

@@ -73,6 +73,9 @@ class Check(NamedTuple):
     t1: float  # s
     detail: str
     requirement: str = ""  # ids of the requirements that it verifies, with commas between them
+    after: float = math.nan  # s, from which the time of a reaction counts
+    above: float = math.nan  # level that a signal has to pass, SI
+    below: float = math.nan
 
     @property
     def is_protocol(self) -> bool:

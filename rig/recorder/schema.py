@@ -105,6 +105,10 @@ class Check:
     t0: float = _describe_field("start of the window, from the start of the main phase; NaN: not a window", "s",
                                 default=math.nan)
     t1: float = _describe_field("end of the window", "s", default=math.nan)
+    after: float = _describe_field("when the time of a reaction begins, from the start of the main phase; NaN: none",
+                                   "s", default=math.nan)
+    above: float = _describe_field("level that a signal has to pass, SI; NaN: none", default=math.nan)
+    below: float = _describe_field("level that a signal has to pass downwards, SI; NaN: none", default=math.nan)
     name: str = _describe_field("as in the sequence")
     kind: str = _describe_field("what was measured: overshoot, settling, never_exceeds, ...", default="")
     signal: str = _describe_field("what was looked at")

@@ -252,5 +252,5 @@ def _count_lost_frames(history: History) -> dict[str, int]:
 
 def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
-                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, detail=check.detail,
-                 requirement=", ".join(check.requirement))
+                 low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, after=check.after,
+                 above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement))

@@ -37,6 +37,17 @@ class CheckResult(NamedTuple):
     t1: float
     detail: str
     requirement: tuple[str, ...] = ()  # ids of the requirements that the check verifies
+    after: float = nan  # s of main, from which a time is measured; NaN: the check measures none
+    above: float = nan  # level that a signal has to pass, SI
+    below: float = nan
+
+
+class Reference(NamedTuple):
+    """What a check measures a reaction against: the instant from which time counts, s of main, and levels, SI."""
+
+    after: float = nan
+    above: float = nan
+    below: float = nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +101,10 @@ class Check(ABC):
         """How many SI units the unit of the limits is."""
         return find_scale(self.shown_unit, self.si_unit)
 
+    def find_reference(self, run: RunData) -> Reference:
+        """What a reaction is measured against; NaN for a check of something else, or if there was no such fault."""
+        return Reference()
+
     @abstractmethod
     def measure(self, run: RunData, span: slice) -> float:
         """Measure the number in rows `span`, SI; raises NotMeasurable with the reason."""
@@ -112,4 +127,4 @@ class Check(ABC):
         low, high = (nan if limit is None else limit for limit in (self.low, self.high))
         passed = not (value != value or value < low or value > high)  # NaN limits compare false
         return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail,
-                           self.requirements)
+                           self.requirements, *self.find_reference(run))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from cmath import phase
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import degrees
+from math import degrees, nan
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from plant.segments import RATE, Hertz, Second, require_frequency
 from rig.network.codec import Status
 from rig.sequences import measures
-from rig.sequences.check import LATEST_TIME, Check, CheckResult, InUnit, require_check
+from rig.sequences.check import LATEST_TIME, Check, CheckResult, InUnit, Reference, require_check
 from rig.sequences.measures import NotMeasurable
 from rig.sequences.run_data import NO_DRIVES, DriveFrames, EventLike, RunData, TraceLike
 
@@ -170,6 +170,14 @@ def _require_time(after: str | float) -> None:
                       f"0 to {LATEST_TIME:g} s of main, or a fault's name, not {after:g}")
 
 
+def _find_start(run: RunData, after: str | float) -> float:
+    """When a reaction is due to begin, s of main; NaN without the fault that it names."""
+    try:
+        return run.find_start(after)
+    except NotMeasurable:
+        return nan
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResponseWithin(Check):
     """Time from `after` (a fault's name or s of main) to an event, or to a signal passing a level for 3 samples, s."""
@@ -188,6 +196,10 @@ class ResponseWithin(Check):
         require_check(levelled == (self.signal is not None), "signal",
                       "a signal with a level above or below which it counts")
         _require_time(self.after)
+
+    def find_reference(self, run: RunData) -> Reference:
+        above, below = (nan if level is None else level for level in (self.above, self.below))
+        return Reference(_find_start(run, self.after), above, below)
 
     def measure(self, run: RunData, span: slice) -> float:
         after = run.find_start(self.after)
@@ -218,6 +230,9 @@ class ShutOff(Check):
         require_check(self.status is None or 0 <= self.status <= 0xF, "status",
                       f"the four lower bits of a status word, 0 to 15, not {self.status}")
 
+    def find_reference(self, run: RunData) -> Reference:
+        return Reference(_find_start(run, self.after))
+
     def measure(self, run: RunData, span: slice) -> float:
         after = run.find_start(self.after)
         drives = run.drives.select_between(after, span.stop / RATE)
@@ -239,6 +254,9 @@ class Recovers(Check):
     """Time from the start of clean-up until the status word says ACTIVE, and does so to the end, s."""
 
     kind, si = "recovers", "s"
+
+    def find_reference(self, run: RunData) -> Reference:
+        return Reference(len(run.trace.t) / RATE)
 
     def measure(self, run: RunData, span: slice) -> float:
         start = len(run.trace.t) / RATE

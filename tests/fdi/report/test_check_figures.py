@@ -86,6 +86,31 @@ def test_largest_size_and_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list_levels(ax) == [-8.0, 8.0]
 
 
+def list_times(ax: Any) -> list[float]:
+    """Places of the vertical lines."""
+    return sorted(float(line.get_xdata()[0]) for line in ax.lines if len(line.get_xdata()) == 2
+                  and line.get_xdata()[0] == line.get_xdata()[1])
+
+
+@pytest.mark.parametrize(("kind", "signal"), [("shut_off", ""), ("recovers", ""), ("response_within", "xj"),
+                                              ("response_within", "node 2 0x8250")])
+def test_a_reaction_stands_between_its_begin_and_its_limit(monkeypatch: pytest.MonkeyPatch, kind: str, signal: str
+                                                           ) -> None:
+    check = make_check(kind, 12.0, "ms", 5.0, (0.2, 1.5), signal)._replace(after=0.5, above=4e-3)
+    ax = draw(monkeypatch, check)
+    assert list_times(ax) == pytest.approx([0.5, 0.505, 0.512]) and list_levels(ax) == [4.0]
+    assert 0.45 < ax.get_xlim()[0] < 0.5 and 0.52 < ax.get_xlim()[1] < 0.6  # of a window of 1.3 s
+    assert ax.get_ylabel() == ("xj [mm]" if signal == "xj" else "cor [mA]")
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert {"most 5 ms", "measured 12 ms"} <= {*labels}
+
+
+def test_a_reaction_that_did_not_come_has_its_limit_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    ax = draw(monkeypatch, make_check("shut_off", NAN, "ms", 5.0, (0.2, 1.5), "")._replace(after=0.5))
+    assert list_times(ax) == pytest.approx([0.5, 0.505]) and ax.get_xlim()[1] == pytest.approx(0.55, abs=2e-3)
+    assert "not measurable" in [text.get_text() for text in ax.get_legend().get_texts()]
+
+
 @pytest.mark.parametrize("kind", sorted(check_figures.DRAWERS))
 def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> None:
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
