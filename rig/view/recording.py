@@ -1,6 +1,7 @@
 """What all recordings for the viewer share: lines and lanes, colours, and what a picture of each view must show."""
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -135,6 +136,33 @@ def make_plot_view(plot: Plot, axis_y: Any = None) -> Any:
 
     return rrb.TimeSeriesView(origin=f"/{plot.origin}", name=plot.title, axis_x=make_time_axis(), axis_y=axis_y,
                               plot_legend=rrb.PlotLegend("RightTop"))
+
+
+def make_value_axis(columns: Sequence[Floats]) -> Any:
+    """The value axis of a plot of these columns; None, the viewer's own choice, where it prints enough numbers."""
+    import rerun.blueprint as rrb
+
+    known = [column[~np.isnan(column)] for column in columns]
+    ends = [(float(column.min()), float(column.max())) for column in known if len(column)]
+    wider = widen_range(min(low for low, _ in ends), max(high for _, high in ends)) if ends else None
+    return rrb.ScalarAxis(range=wider) if wider else None
+
+
+def widen_range(low: float, high: float) -> tuple[float, float] | None:
+    """A wider range of an axis on which the viewer would print only one number; None if it prints more.
+
+    The viewer prints powers of ten and their multiples, and a range such as -8 to 8 is too wide for the multiples of 1.
+
+    >>> widen_range(-8.0, 8.0), widen_range(-6.0, 6.0), widen_range(0.0, 800.0), widen_range(0.0, 0.0)
+    ((-10.0, 10.0), None, None, None)
+    """
+    span = high - low
+    if not 0.0 < span < math.inf:
+        return None
+    step = 10.0 ** math.floor(math.log10(span))
+    below, above = math.floor(low / step), math.ceil(high / step)
+    is_sparse = 1.3 * step < span and math.floor(high / step) <= math.ceil(low / step)
+    return (below * step, above * step) if is_sparse else None
 
 
 def make_lanes_view(title: str, groups: Sequence[str]) -> Any:

@@ -29,6 +29,7 @@ from rig.view.recording import (
     import_rerun,
     make_lanes_view,
     make_plot_view,
+    make_value_axis,
     measure_lanes_view,
     open_recording,
     send_lane,
@@ -150,15 +151,14 @@ def _list_lanes(trace: Trace) -> list[Lane]:
     out.append(make_command_lane(trace))
     out += [Lane(name_node_lane(node), [(s.t, s.name) for s in trace.nmt if s.node == node], STATES)
             for node in sorted({state.node for state in trace.nmt})]
-    out += [Lane(name_fault_lane(label), states, {ACTIVE: FAIL}) for label, states in _list_fault_states(trace).items()]
+    out += [Lane(name_fault_lane(label), states, {ACTIVE: FAIL}) for label, states in list_fault_states(trace).items()]
     return out + [_make_check_lane(check, trace) for check in trace.sequence_checks]
 
 
-def make_command_lane(trace: Trace) -> Lane:
-    """The sections of the command."""
-    sections = [(float(trace.t[s.start]), s.kind, _describe_section(s)) for s in trace.sections()]
-    return Lane("run/command", [(t, text) for t, _, text in sections],
-                {text: SECTIONS[kind] for _, kind, text in sections})
+def make_command_lane(trace: Trace, path: str = "run/command", offset: float = 0.0) -> Lane:
+    """The sections of the command, at the times of the trace plus `offset`, s."""
+    sections = [(float(trace.t[s.start]) + offset, s.kind, _describe_section(s)) for s in trace.sections()]
+    return Lane(path, [(t, text) for t, _, text in sections], {text: SECTIONS[kind] for _, kind, text in sections})
 
 
 def name_node_lane(node: int) -> str:
@@ -185,7 +185,7 @@ def read_fault_event(text: str) -> tuple[str, str] | None:
     return (label, ACTIVE if word == "begins" else "") if word in ("begins", "ends") else None
 
 
-def _list_fault_states(trace: Trace) -> dict[str, list[tuple[float, str]]]:
+def list_fault_states(trace: Trace) -> dict[str, list[tuple[float, str]]]:
     """Label of each fault -> when it begins and ends, from the events of the run."""
     found: dict[str, list[tuple[float, str]]] = {}
     for event in trace.events:
@@ -262,32 +262,13 @@ def _choose_axis(trace: Trace, plot: Plot) -> Any:
     drawn = [values for path, (_, values) in list_lines(trace).items() if path.startswith(f"{plot.origin}/")]
     if plot.origin == "timing":
         return rrb.ScalarAxis(range=(0.0, 1.5 * max(float(np.nanpercentile(values, 99.5)) for values in drawn)))
-    wider = widen_range(min(float(np.nanmin(values)) for values in drawn),
-                        max(float(np.nanmax(values)) for values in drawn))
-    return rrb.ScalarAxis(range=wider) if wider else None
-
-
-def widen_range(low: float, high: float) -> tuple[float, float] | None:
-    """A wider range of an axis on which the viewer would print only one number; None if it prints more.
-
-    The viewer prints powers of ten and their multiples, and a range such as -8 to 8 is too wide for the multiples of 1.
-
-    >>> widen_range(-8.0, 8.0), widen_range(-6.0, 6.0), widen_range(0.0, 800.0), widen_range(0.0, 0.0)
-    ((-10.0, 10.0), None, None, None)
-    """
-    span = high - low
-    if not 0.0 < span < math.inf:
-        return None
-    step = 10.0 ** math.floor(math.log10(span))
-    below, above = math.floor(low / step), math.ceil(high / step)
-    is_sparse = 1.3 * step < span and math.floor(high / step) <= math.ceil(low / step)
-    return (below * step, above * step) if is_sparse else None
+    return make_value_axis(drawn)
 
 
 def _build_blueprint(trace: Trace) -> Any:
     there = {path.split("/")[0] for path in list_lines(trace)}
     plots = [make_plot_view(p, _choose_axis(trace, p)) for p in PLOTS if p.origin in there]
-    lanes = 3 + len({state.node for state in trace.nmt}) + len(_list_fault_states(trace))
+    lanes = 3 + len({state.node for state in trace.nmt}) + len(list_fault_states(trace))
     return arrange_run(plots, lanes, len(trace.sequence_checks))
 
 

@@ -57,6 +57,9 @@ _OWN_GROUP = "on the default group, where other programs may be; tests run it on
 _VCAN = "needs vcan0; tests run it in a guest that has one"
 NOT_PLAYED = {
     "rig view runs/preflight": _WINDOW,
+    "rig view run.csv --compare --repeat run2.csv": _WINDOW,
+    "rig view run.csv --compare --model better.toml": _WINDOW,
+    "rig view runs/preflight runs/preflight-2": _WINDOW,
     "rig run --live rerun": _WINDOW,
     "rig conformance plant --bus udp_multicast": _OWN_GROUP,
     "rig conformance c --bus udp_multicast": _OWN_GROUP,

@@ -5,7 +5,6 @@ EHA_RIG_REQUIRE_VIEWER=1 forbids skips.
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import subprocess
 import sys
@@ -13,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_rows import read_recording
 from rig_command import rig
 from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
 from rig.view import rerun_log, viewer
-from rig.view.recording import TIMELINE, ViewerError, make_lane_path
+from rig.view.recording import ViewerError, make_lane_path
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
 
@@ -41,20 +41,8 @@ def _rows(trace: Trace, path: Path) -> dict[str, list[tuple[float, object]]]:
     """What a recording of the trace holds: entity -> time, s (NaN: always), and value of each of its rows."""
     if importlib.util.find_spec("rerun") is None:
         pytest.skip("no rerun: pip install 'eha-rig[view]'")
-    from rerun.chunk import RrdReader
-
     rerun_log.write_rrd(trace, path)
-    found: dict[str, list[tuple[float, object]]] = {}
-    for chunk in RrdReader(path).stream():
-        table = chunk.to_record_batch()
-        for column in {"StateChange:state", "TextLog:text", "Scalars:scalars", "TextDocument:text"} & {
-                *table.schema.names}:
-            values = [value[0] for value in table.column(column).to_pylist()]
-            times = [math.nan] * len(values)
-            if TIMELINE in table.schema.names:
-                times = (table.column(TIMELINE).cast("int64").to_numpy() / 1e9).tolist()
-            found.setdefault(chunk.entity_path, []).extend(zip(times, values, strict=True))
-    return {entity: sorted(rows, key=lambda row: row[0]) for entity, rows in found.items()}
+    return read_recording(path)
 
 
 @pytest.fixture(scope="module")
