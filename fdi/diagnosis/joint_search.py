@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from fdi.diagnosis.refine import (
     Refinement,
     choose_start,
     estimate_offsets,
+    find_flat,
     is_noise_left,
     learn_left_noise,
     list_unknowns,
@@ -41,10 +43,9 @@ from fdi.estimation.final_rounds import descend_valley, guess_covariance, linear
 from fdi.estimation.fit import Fit
 from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Free
-from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
-from fdi.thresholds import FURTHER_EFFECT_SHARE, GAIN_CONVINCES, GAIN_TIE, GAIN_WORTH_A_FIT
+from fdi.thresholds import FITTED_RUN_WORST, FURTHER_EFFECT_SHARE, GAIN_CONVINCES, GAIN_TIE, GAIN_WORTH_A_FIT
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.model import Model, list_searched_effects
@@ -110,7 +111,7 @@ def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
 
 
 def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:
-    found = report_fit(fit, problem)
+    found = replace(report_fit(fit, problem), worst=FITTED_RUN_WORST)
     if whole is not None and whole is not problem.trace:
         judged = judge_on_all(problem, [fit], whole, FINE_STEPS)[0]
         found = replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
@@ -130,47 +131,76 @@ class JointSearch:
         self.problem, self.effects, self.model, self.progress = problem, list(effects), model, progress
 
     def find_explanations(self, alone: Fit, most_effects: int = 2) -> list[Named]:
-        """Fits with 0, 1 .. other effects that may be the answer, taken to the end with one noise."""
+        """Fits with 0, 1 .. other effects that may be the answer, taken to the end with one noise.
+
+        Fits are compared only when they have gone equally far: one that has just begun has the cost of the stops that
+        it still misses, and a rival that has been fitted to the end beats it although it is wrong.
+        """
         free = list_unknowns(self.model)
-        base = self.descend(replace(alone, free=free, covariance=guess_joint_covariance(free)), ((1.0, 2),))
-        found: list[Named] = [((), base)]
-        parents = list(found)
+        begun = self.descend(replace(alone, free=free, covariance=guess_joint_covariance(free)), ((1.0, 2),))
+        parents: list[Named] = [((), begun)]
+        found = self.deepen(parents)
         for count in range(1, most_effects + 1):
-            self.progress(f"looking for effect {count} beside the faults", 0.25 * count)
-            tried = [each for parent in parents for each in self.add_effects(parent, count)]
+            self.progress(f"looking for effect {count} beside the faults", 0.3 * count - 0.1)
+            is_enough = is_noise_left(self.problem, found[0][1])
+            tried = [each for parent in parents for each in self.add_effects(parent, count, is_enough)]
             if not tried:
                 break
-            best = min(tried, key=_get_cost)
+            parents = sorted(tried, key=_get_cost)[:4]
+            self.progress(f"fitting {', '.join(_describe(effects) for effects, _ in parents)} further", 0.3 * count)
+            deep = sorted(self.deepen(parents), key=_get_cost)
             before = min(found, key=_get_cost)
-            if count > 1 and not _takes_fair_share(before[1], best[1]):
+            if count > 1 and not _takes_fair_share(before[1], deep[0][1]):
                 break
-            found += tried
-            if is_noise_left(self.problem, best[1]):
+            found += deep
+            if is_noise_left(self.problem, deep[0][1]):
                 break
-            parents = sorted(tried, key=_get_cost)[:2]
+            parents = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 2),))), deep[:2])
         return self.finish(found)
 
-    def add_effects(self, parent: Named, count: int) -> list[Named]:
-        """The parent with one more effect each: the promising ones fitted."""
+    def deepen(self, found: Sequence[Named], rounds: int = 8) -> list[Named]:
+        """The fits taken further with finer steps; while the best leaves more than noise, they also begin elsewhere."""
+        fine = self._refine_steps()
+        deep = self.map_alone(lambda each: (each[0], fine.descend(each[1], ((1.0, rounds),))), found)
+        if is_noise_left(self.problem, min(deep, key=_get_cost)[1]):
+            return deep
+
+        def begin_again(each: Named) -> Named:
+            again = fine.restart(each[1], 1.0) if fine.is_near(each[1]) else each[1]
+            return each[0], min(each[1], again, key=lambda f: f.cost)
+
+        return self.map_alone(begin_again, deep)
+
+    def _refine_steps(self) -> JointSearch:
+        problem = replace(self.problem, steps=FINE_STEPS, _lanes={})
+        return JointSearch(problem, self.effects, self.model, self.progress)
+
+    def add_effects(self, parent: Named, count: int, is_enough: bool) -> list[Named]:
+        """The parent with one more effect each: the promising ones fitted; `is_enough`: the faults leave noise only."""
         present, fit = parent
         effects = [e for e in self.effects if e not in present and not _excludes(e, present)]
-        prospects = [scan_effects(self.problem, at, effects, self.problem.workers)
-                     for at in ([fit, self.start_afresh()] if count == 1 else [fit])]
-        worth = _interleave([[p for p in each if p.cost < fit.cost - GAIN_WORTH_A_FIT] for each in prospects],
-                            8 if count == 1 else 5)
+        prospects = [self.scan(fit, effects, fit.cost)]
+        if count == 1:
+            # The forecast from a start that nobody has fitted is poor beside a finished fit. Where that fit leaves more
+            # than noise, a fault may have made up for the effect in it, so both lists count, each by itself.
+            prospects.append(self.scan(self.start_afresh(), effects, fit.cost if is_enough else np.inf))
+        worth = _interleave(prospects, 8 if count == 1 else 5)
         if not worth:
             return []
         named = ", ".join(dict.fromkeys(p.effect for p in worth))
-        self.progress(f"fitting {named}", 0.25 * count + 0.1)
+        self.progress(f"fitting {named}", 0.3 * count - 0.05)
         begun = self.map_alone(self._begin_fit, worth)
         begun = sorted(begun, key=lambda f: f.cost)[:4]
-        self.progress(f"fitting {', '.join(dict.fromkeys(self._name_added(f, present) for f in begun))}",
-                      0.25 * count + 0.15)
         fits = self.map_alone(lambda f: self.descend(f, ((3.0, 3), (1.0, 6))), begun)
         best: dict[str, Named] = {}
         for each in sorted(fits, key=lambda f: f.cost):
             best.setdefault(self._name_added(each, present), ((*present, self._name_added(each, present)), each))
         return list(best.values())
+
+    def scan(self, fit: Fit, effects: Sequence[str], most: float) -> list[Prospect]:
+        """The effects that promise to gain on this fit and to come below the cost `most`, best first."""
+        least = min(fit.cost, most) - GAIN_WORTH_A_FIT
+        return [p for p in scan_effects(self.problem, fit, effects, self.problem.workers) if p.cost < least]
 
     def start_afresh(self) -> Fit:
         """A unit with the best pair of faults and no other deviation: an effect may lead fits into a wrong valley."""
@@ -180,22 +210,33 @@ class JointSearch:
         return linearise_across(self.problem, free, x, guess_joint_covariance(free), flat)
 
     def finish(self, found: Sequence[Named]) -> list[Named]:
-        """The likely ones with finer steps, under the noise that the best one leaves."""
+        """The likely ones to the end with finer steps, under the noise that the best one leaves."""
         ranked = sorted(found, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
-        near = 60.0 * GAIN_TIE  # coarse fits are not done
+        near = 60.0 * GAIN_TIE  # such fits are not done: beginning again has gained a few hundred
         close = [each for each in ranked if each[1].cost < ranked[0][1].cost + near][:4]
         self.progress(f"last fits, {', '.join(_describe(effects) for effects, _ in close)}", 0.75)
-        self.problem = replace(learn_left_noise(self.problem, ranked[0][1]), _lanes={})
-        self.problem = replace(self.problem, steps=FINE_STEPS, _lanes={})
-        fits = self.map_alone(lambda each: self.descend(each[1], ((1.0, 8),)), close)
-        done = list(zip([effects for effects, _ in close], fits, strict=True))
+        fine = self._refine_steps()
+        self.problem = learn_left_noise(fine.problem, ranked[0][1])
+        done = self.map_alone(lambda each: (each[0], self.descend(each[1], ((1.0, 8),))), close)
         best = min(done, key=_get_cost)
         if len(best[0]) > 1:
             self.progress(f"last fits without one of {_describe(best[0])}", 0.85)
             done += self.map_alone(lambda effect: self._leave_out(best, effect), best[0])
-        if not is_noise_left(self.problem, best[1]) and self._is_near(best[1]):
-            self.progress(f"another start, {_describe(best[0])}", 0.9)
-            again = self.map_alone(lambda part: self._restart(best[1], part), (1.0, 0.5))
+        alike: dict[frozenset[str], Named] = {}
+        for each in sorted(done, key=_get_cost):
+            alike.setdefault(frozenset(each[0]), each)
+        return self._begin_again(list(alike.values()))
+
+    def _begin_again(self, done: Sequence[Named], most: int = 2) -> list[Named]:
+        """The fits, the best of them also from other places; again as long as that changes which is best."""
+        done, tried = list(done), set[tuple[str, ...]]()
+        while len(tried) < most:
+            best = min(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
+            if best[0] in tried or not self.is_near(best[1]):
+                break
+            tried.add(best[0])
+            self.progress(f"another start, {_describe(best[0])}", 0.85 + 0.05 * len(tried))
+            again = self.map_alone(partial(self.restart, best[1]), (1.0, 0.5))
             done[done.index(best)] = (best[0], min([best[1], *again], key=lambda f: f.cost))
         return done
 
@@ -208,10 +249,11 @@ class JointSearch:
         begun = replace(fit, free=tuple(fit.free[k] for k in kept), x=fit.x[kept], cost=np.inf, jacobian=none)
         return tuple(e for e in effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8)))
 
-    def _is_near(self, fit: Fit, far: float = 7.0) -> bool:
+    def is_near(self, fit: Fit, far: float = 7.0) -> bool:
+        """Whether a fit leaves so little that beginning again elsewhere may help."""
         return max(measure_ratios(self.problem, fit)) < far
 
-    def _restart(self, fit: Fit, part: float) -> Fit:
+    def restart(self, fit: Fit, part: float) -> Fit:
         """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
         home = make_start(fit.free, 0.0, FRICTION.healthy, estimate_offsets(self.problem))
         kept = [f.name in FAULT_PARAMETERS or not np.isfinite(f.prior) for f in fit.free]
@@ -229,7 +271,7 @@ class JointSearch:
 
     def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
         """Directions that the data do not see, with what of the effects goes along."""
-        return find_flat_directions(replace(self.problem, workers=1, _lanes={}), free, x, (), EFFECT_POWERS)
+        return find_flat(replace(self.problem, workers=1, _lanes={}), free, x, EFFECT_POWERS)
 
     def map_alone(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; each fit keeps to one of them."""

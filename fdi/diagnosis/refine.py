@@ -27,13 +27,14 @@ from fdi.estimation.fit import Fit
 from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, span_all_rows
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
-from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.estimation.unidentifiable import FLAPPER, find_flat_directions
 from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (
     FAULT_BLAMED_SHARE,
     FSS_INTERVAL_FACTOR,
     INTERVAL_95_SD,
+    PRIORS_KNOW_MORE_MISFIT,
     RESIDUAL_HELD_OUT,
     RESIDUAL_HOPELESS,
     RESIDUAL_IS_NOISE,
@@ -153,6 +154,7 @@ class Refinement:
     simulations: int
     method: str = "least squares"
     everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
+    worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -165,7 +167,7 @@ class Refinement:
         usual = compute_typical_rms(self.fit.residuals)
         near = all(float(t) <= RESIDUAL_IS_NOISE * floor for t, floor in zip(usual, self.floor.values(), strict=True))
         near &= all(ratio <= RESIDUAL_HELD_OUT for ratio in self.everywhere.values())
-        return near and max(self.ratio.values()) <= RESIDUAL_WORST
+        return near and max(self.ratio.values()) <= self.worst
 
 
 @dataclass
@@ -249,7 +251,7 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     fine = replace(problem, steps=FINE_STEPS, _lanes={})
     last = first
     for rounds in (4, 8):
-        last = descend_valley(fine, last, rounds, find_flat_directions(problem, first.free, last.x), problem.stage)
+        last = descend_valley(fine, last, rounds, find_flat(problem, first.free, last.x), problem.stage)
         if is_noise_left(problem, last):
             return last
     signals = problem.trace.outputs
@@ -275,7 +277,7 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
 
     def fit_from(part: float) -> Fit:
         begun = _fit_in_stages(alone, free, found.x + part * (home - found.x))
-        flat = find_flat_directions(alone, free, begun.x)
+        flat = find_flat(alone, free, begun.x)
         return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat, problem.stage)
 
     return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
@@ -291,8 +293,14 @@ def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> 
 
 def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
     start = replace(found, covariance=guess_covariance(found.free))
-    flat = find_flat_directions(problem, found.free, found.x)
+    flat = find_flat(problem, found.free, found.x)
     return descend_valley(scale_noise(problem, factor), start, rounds, flat, problem.stage)
+
+
+def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats,
+              scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {})) -> Floats:
+    """Directions (p, k) at `x` (p,) that no signal shows; `scaled` is that of `find_flat_directions`."""
+    return find_flat_directions(problem, free, x, (FLAPPER,), scaled, PRIORS_KNOW_MORE_MISFIT)
 
 
 def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:

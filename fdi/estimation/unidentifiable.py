@@ -36,6 +36,10 @@ FLAT: tuple[Mapping[str, float], ...] = (
 FLAT_BY_RATIO = tuple({name: power for name, power in flat.items() if name != "jack.static_friction"}
                       for flat in FLAT)
 
+# In a run in which the flapper meets neither of its stops nothing shows how far it moves, only what its way does.
+FLAPPER: Mapping[str, float] = {"pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0, "flapper.stiffness": 1.0,
+                                "flapper.damping": 1.0, "flapper.inertia": 1.0}
+
 
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:
     """`FLAT` for the filter's law of this model."""
@@ -76,7 +80,7 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
 
 
 def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: NDArray[np.bool_],
-                 allowed: float = FLAT_DIRECTION_MISFIT) -> NDArray[np.bool_]:
+                 allowed: float | Floats = FLAT_DIRECTION_MISFIT) -> NDArray[np.bool_]:
     """Which directions a trial replay finds flat at `x` (p,), (k,).
 
     Args:
@@ -85,13 +89,15 @@ def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floa
         x: their scaled values (p,).
         trials: scaled unknowns (4, k, p) at each of `TRIED_SHARES` along each direction.
         is_tried: (4, k), False where a bound stops a trial.
-        allowed: change of the misfit, of a trial of full length; a shorter one may change its square's share.
+        allowed: change of the misfit, of a trial of full length, (k,) or one for all directions; a shorter one may
+            change its square's share.
     """
-    shares, confirmed = np.array(TRIED_SHARES), np.zeros(is_tried.shape, bool)
+    limits = np.array(TRIED_SHARES)[:, None] ** 2 * allowed * np.ones(is_tried.shape[1])
+    confirmed = np.zeros(is_tried.shape, bool)
     if is_tried.any():
         white = problem.compute_white_residuals(free, np.vstack([x, trials[is_tried]]))
         moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
-        confirmed[is_tried] = moved < allowed * shares[np.nonzero(is_tried)[0]] ** 2
+        confirmed[is_tried] = moved < limits[is_tried]
     return np.asarray(confirmed.any(axis=0), np.bool_)
 
 
@@ -136,12 +142,13 @@ def relax_fit(problem: Problem, found: Fit) -> Fit:
 
 def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
                          others: Sequence[Mapping[str, float]] = (),
-                         scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {})) -> Floats:
+                         scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {}),
+                         allowed: float = FLAT_DIRECTION_MISFIT) -> Floats:
     """Directions of `FLAT_BY_RATIO` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k).
 
     A direction holds if one of the trial replays along it, of four lengths, changes no more than its share of
-    `FLAT_DIRECTION_MISFIT`. `scaled` are parameters that are not logarithms, with their powers in each of
-    `FLAT_BY_RATIO`.
+    `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. `scaled` are parameters that are not logarithms,
+    with their powers in each of `FLAT_BY_RATIO`.
     """
     law = problem.model["filter.law"]
     load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
@@ -158,7 +165,8 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     steps = np.array([[cut_at_bounds(free, x, TRIED * share * way) for way in ways] for share in shares])
     whole = TRIED * np.abs(shares)[:, None] * np.abs(ways).max(axis=1)
     is_full = np.abs(steps).max(axis=2) >= 0.9 * whole
-    flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full)]
+    limits = np.array([allowed if flat in others else FLAT_DIRECTION_MISFIT for flat in every])
+    flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full, limits)]
     found: Floats = flat_ways[_find_independent(flat_ways)].T
     return found
 

@@ -35,3 +35,10 @@ def test_a_direction_whose_only_trials_jump_or_are_stopped_by_a_bound_is_not_con
     assert confirm(is_tried) == [False, False]
     is_tried[0] = True  # the full length forwards, where the jump is
     assert confirm(is_tried) == [False, False]
+
+
+def test_each_direction_may_have_its_own_limit() -> None:
+    problem, trials = cast(Any, SteppedResiduals()), np.array([TRIED * share * np.eye(2) for share in TRIED_SHARES])
+    limits = np.array([1.0, 2.1e6])
+    assert confirm_flat(problem, (), np.zeros(2), trials, np.ones((4, 2), bool), limits).tolist() == [True, True]
+    assert confirm_flat(problem, (), np.zeros(2), trials, np.ones((4, 2), bool), limits[::-1]).tolist() == [True, False]
