@@ -78,10 +78,11 @@ def explain_level(trend: Trend) -> str:
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     items: list[Item] = [Line("level", explain_level(trend))]
+    unit_name = "" if trend.fault.unit == "1" else f" {trend.fault.unit}"
     items += [Line("" if i else "size", text) for i, text in enumerate(describe_trend(trend, unit))]
     for level, remaining in trend.remaining.items():
-        items.append(Line(f"{LIMIT_NAMES[level]} ({remaining.limit:g})", _describe_arrival(remaining, trend, unit),
-                          medium=Medium.TERMINAL))
+        name = f"{LIMIT_NAMES[level]} ({remaining.limit:g}{unit_name})"
+        items.append(Line(name, _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL))
     if trend.remaining:
         items.append(_tabulate_remaining(trend, unit))
     plot = plot_trend(trend, lambda t: format_date(t, unit))

@@ -9,7 +9,7 @@ from rig.cli import discovery_options, options
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     add = parser.add_argument
-    add("words", nargs="+", metavar="EFFECT .. TRACE",
+    add("words", nargs="+", metavar="EFFECT|TRACE",
         help="effects to add, and the measured run to fit (default: the run that the model file was fitted to)")
     add("--trace", metavar="TRACE", help="same as the positional TRACE")
     discovery_options.add_run_options(parser)

@@ -16,10 +16,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig bench`."""
     parser.add_argument("what", nargs="?", default="plant",
                         choices=("plant", "realtime", "live", "explain", "robustness", "faults", "recordings"),
-                        help="plant: speed of the plant (default); realtime: lateness and response of the cycle beside "
-                             "cyclictest and C; live: both with and without rig run --live; "
+                        help="plant: speed of the plant (default); realtime: lateness and response of the cycle, "
+                             "compared with cyclictest and C; live: the same with and without rig run --live; "
                              "explain: how often rig explain is right; "
-                             "robustness: invented frames, killed processes, full disks, long work; "
+                             "robustness: fuzz frames, killed processes, full disks, long operation; "
                              "faults: every fault on the bus in every phase of a motion, a matrix; "
                              "recordings: CPU time and memory of compare, explain and fdi by length of the recording")
     parser.add_argument("--accuracy", action="store_true",
@@ -27,8 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("rig bench realtime, rig bench live").add_argument
     add("--bus", default="auto", metavar="INTERFACE:CHANNEL",
         help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)")
-    add("--seconds", type=float, default=60.0, metavar="S", help="time for each contender (default: 60)")
-    add("--blocks", type=int, default=6, metavar="N", help="blocks by turns that the time is divided into (default: 6)")
+    add("--seconds", type=float, default=60.0, metavar="S",
+        help="time of measurement for each row of the table (default: 60)")
+    add("--blocks", type=int, default=6, metavar="N",
+        help="alternating blocks into which this time is divided (default: 6)")
     add = parser.add_argument_group("rig bench explain", "a blind trial, hours long (docs/trial.md)").add_argument
     add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
     add("--seed", type=parse_whole_number, default=0, metavar="N",
@@ -38,17 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("rig bench recordings").add_argument
     add("--lengths", default="13.5,60,300,1800", metavar="S,S,..",
         help="lengths of the recordings, s (default: 13.5,60,300,1800)")
-    add = parser.add_argument_group("rig bench robustness", "hours with the figures of docs/robustness.md").add_argument
+    add = parser.add_argument_group("rig bench robustness", "hours with the numbers of docs/robustness.md").add_argument
     add("--frames", type=parse_whole_number, default=100_000, metavar="N",
-        help="invented frames for each node (default: 100000; 0: none)")
+        help="fuzz frames for each node (default: 100000; 0: none)")
     add("--trials", type=parse_whole_number, default=5, metavar="N",
-        help="runs with each kind of disturbance (default: 5; 0: none)")
-    add("--minutes", type=float, default=5.0, metavar="N", help="minutes of long work (default: 5; 0: none)")
+        help="effective disturbances of each kind, one in each run (default: 5; 0: none)")
+    add("--minutes", type=float, default=5.0, metavar="N", help="minutes of long operation (default: 5; 0: none)")
     add("--controller", choices=("builtin", "c"), default="builtin", help="firmware of these runs (default: builtin)")
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Without an argument: the speed of the plant, beside C and other libraries."""
+    """Without an argument: the speed of the plant, compared with C and other libraries."""
     if args.what == "explain":
         return _run_trial(args)
     if args.what == "robustness":
@@ -228,7 +230,7 @@ def _study_bus_faults(args: argparse.Namespace) -> int:
 
 
 def _study_robustness(args: argparse.Namespace) -> int:
-    """Invented frames, disturbed runs and long work; exit status 1 if anything hung, crashed, grew or was left."""
+    """Fuzz frames, disturbed runs and long operation; exit status 1 if anything hung, crashed, grew or was left."""
     from fdi.output import write_text
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress

@@ -34,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--again", action="store_true", help="judge failed cases once more")
     add = parser.add_argument_group("the matrix").add_argument
     add("--fault", action="append", default=[], metavar="EFFECT=SIZE,..",
-        help="cases: healthy, EFFECT=SIZE,SIZE.., or both at once EFFECT=SIZE/EFFECT=SIZE (repeatable)")
+        help="cases: healthy; EFFECT=SIZE,SIZE,..; or two faults in one plant, EFFECT=SIZE/EFFECT=SIZE "
+             "(repeatable)")
     add("--seeds", type=options.parse_whole_number, metavar="N", help="runs of each size (default 20)")
     add("--seed", type=options.parse_whole_number, metavar="N", help="seed of the first run (default 0)")
     add("--tolerance", metavar="X,..", help="standard deviation of the base parameters, relative (default 0.015)")

@@ -8,7 +8,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig diff`."""
     add = parser.add_argument
     add("trace", metavar="A", help="the reference: trace.mcap, the folder of a run, or a CSV")
-    add("others", metavar="B", nargs="+", help="a run to hold against it (repeatable)")
+    add("others", metavar="B", nargs="+", help="a run to compare with the reference (repeatable)")
     add("--report", action="store_true", help="write a page with pictures, diff.html beside the first B, or where "
                                               "--out FILE.html says")
 

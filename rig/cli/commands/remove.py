@@ -10,7 +10,7 @@ from rig.cli import discovery_options, options
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of this command alone."""
     add = parser.add_argument
-    add("words", nargs="+", metavar="EFFECT [TRACE]", help="the effect, and the measured run to fit the rest to")
+    add("words", nargs="+", metavar="EFFECT|TRACE", help="the effect, and the measured run to fit the rest to")
     add("--trace", metavar="TRACE", help="same as the positional TRACE")
     discovery_options.add_run_options(parser)
     options.add_model_options(parser)

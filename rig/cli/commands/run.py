@@ -34,8 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
              "file, run on all cores and end in one report (docs/suite.md)")
     options.add_model_options(parser)
     parser.set_defaults(seed=None)  # None: not given; --from takes the seed of the log
-    add("--bus", default="auto", metavar="auto|virtual|INTERFACE:CHANNEL",
-        help="virtual: the embedded bus in this process (default); or socketcan:can0, udp_multicast, ...")
+    add("--bus", default="auto", metavar="auto|embedded|INTERFACE:CHANNEL",
+        help="auto: that of EHA_RIG_BUS, else the embedded one (default); embedded: in this process; or "
+             "socketcan:can0, udp_multicast, ...")
     add("--pace", choices=PACES, default=None,
         help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time")
     add("--controller", choices=CONTROLLERS, default=None,

@@ -16,13 +16,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig simulate`."""
     options.add_model_options(parser)
     parser.add_argument("--command", dest="command_file", metavar="FILE",
-                        help="CSV with t,com and optionally load (default: the main phase of preflight); of rows up to "
-                             "1 ms apart a cycle takes the latest, rows further apart are joined by straight lines")
+                        help="CSV with t,com and optionally load (default: the main phase of preflight). Of rows at "
+                             "most 1 ms apart a cycle takes the latest; others are joined by straight lines")
     options.add_force_option(parser)
     parser.add_argument("--samples", action="store_true",
                         help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv "
-                             "of another command, into the folder --out (default: here); the model lacks two "
-                             "effects of their unit")
+                             "of another command, into the folder --out (default: here); the recorded unit has two "
+                             "effects that the nominal model lacks")
     parser.add_argument("--steps", type=options.parse_whole_number, default=None, metavar="N",
                         help="steps of the plant per cycle (default 100)")
 

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="time axis of the trend (default: the first of these that all traces have)")
     add("--dates", metavar="FILE.csv", help="table file,date[,hours][,flights] (default: dates.csv in the folder)")
     add("--again", action="store_true", help="diagnose every trace again, even if its sizes are stored")
-    add("--score", action="store_true", help="instead: score the prognosis method on simulated units")
+    add("--score", action="store_true", help="score the prognosis method on simulated units, without FOLDER")
     add("--units", type=options.parse_whole_number, default=20, metavar="N",
         help="with --score: simulated units of each growth law (default 20)")
 

@@ -1,1 +1,1 @@
-"""Robustness, counted: invented frames, killed and stopped processes, full disks, long work."""
+"""Robustness, counted: fuzz frames, killed and stopped processes, full disks, long operation."""

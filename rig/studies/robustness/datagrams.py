@@ -1,4 +1,4 @@
-"""Invented datagrams on the UDP bus, on which every program of the machine can send anything."""
+"""Fuzz datagrams on the UDP bus, on which every program of the machine can send anything."""
 from __future__ import annotations
 
 import socket
@@ -35,9 +35,9 @@ class DatagramCount(NamedTuple):
 
 def fuzz_datagrams(count: int, seed: int, group: str, controller: str = "builtin",
                    progress: Progress = ignore_progress) -> DatagramCount:
-    """Send invented datagrams to the nodes of a UDP bus; afterwards a run on these nodes passes.
+    """Send fuzz datagrams to the nodes of a UDP bus; afterwards a run on these nodes passes.
 
-    A third are random bytes, a third frames with changed bytes, a third invented frames in proper datagrams.
+    A third are random bytes, a third frames with changed bytes, a third fuzz frames in proper datagrams.
 
     Raises:
         RigError: the nodes do not start.

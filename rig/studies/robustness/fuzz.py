@@ -1,4 +1,4 @@
-"""Invented frames into each node of the bench: afterwards it answers as before, and its memory has not grown."""
+"""Fuzz frames into each node of the bench: afterwards it answers as before, and its memory has not grown."""
 from __future__ import annotations
 
 import resource
@@ -47,7 +47,7 @@ def read_memory() -> int:
 
 
 def fuzz_node(target: str, frames: int, seed: int, progress: Progress = ignore_progress) -> FuzzCount:
-    """Give a node alone on a bus invented frames.
+    """Give a node alone on a bus fuzz frames.
 
     Args:
         target: "plant" or "controller".
@@ -114,7 +114,7 @@ def _is_answering(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
 
 
 class _Stranger:
-    """A node that sends invented frames in every cycle: NMT commands, SYNCs and answers for others among them."""
+    """A node that sends fuzz frames in every cycle: NMT commands, SYNCs and answers for others among them."""
 
     def __init__(self, send: Send, frames: int, each: int, seed: int) -> None:
         self._send, self._each = send, each
@@ -134,7 +134,7 @@ class _Stranger:
 
 
 _SEQUENCE = """
-title = "invented frames"
+title = "fuzz frames"
 setup = [{{ kind = "hold", time = 0.05 }}]
 main = [{{ name = "sine", kind = "sine", amplitude = 1e-3, frequency = 1.0, time = {time} }}]
 cleanup = [{{ kind = "ramp", to = 0.0, time = 0.05 }}]
@@ -144,7 +144,7 @@ checks = [{{ name = "error", kind = "never_exceeds", signal = "xj", high = 5.0, 
 
 
 def fuzz_rig(frames: int, seed: int, progress: Progress = ignore_progress, each: int = 50) -> FuzzCount:
-    """Run a sequence on the embedded bus with a stranger that sends `each` invented frames in every cycle.
+    """Run a sequence on the embedded bus with a stranger that sends `each` fuzz frames in every cycle.
 
     The rig must end each run with a verdict, and a run without the stranger passes afterwards.
     """

@@ -14,7 +14,7 @@ def build_robustness_report(figures: Mapping[str, Any]) -> Report:
     return Report(
         command="bench", title="robustness", verdict="FAIL" if problems else "PASS", mood="bad" if problems else "good",
         sentence=sentence,
-        sections=[Section("Invented frames", _tabulate_frames(figures)),
+        sections=[Section("Fuzz frames", _tabulate_frames(figures)),
                   Section("Disturbed runs", _tabulate_trials(figures)), Section("Long work", _tabulate_soak(figures)),
                   Section("Problems", [Paragraph(problem, "bad") for problem in problems[:50]])],
         data=dict(figures))

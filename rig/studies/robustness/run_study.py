@@ -1,4 +1,4 @@
-"""The whole study: invented frames and datagrams, disturbed runs, long work."""
+"""The whole study: fuzz frames and datagrams, disturbed runs, long operation."""
 from __future__ import annotations
 
 import os
@@ -26,28 +26,28 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
     """Run the study; its figures, with all that went wrong as "problems".
 
     Args:
-        frames: invented frames for each node; a tenth as many datagrams, a thousandth as many changed logs.
+        frames: fuzz frames for each node; a tenth as many datagrams, a thousandth as many changed logs.
         trials: disturbed runs of each kind in which the disturbance came before the last cycle; at most twice as
             many are made.
-        minutes: of long work; 0 for none.
+        minutes: of long operation; 0 for none.
         seed: of frames and moments.
-        controller: firmware of the disturbed runs and of the long work, "builtin" or "c".
+        controller: firmware of the disturbed runs and of the long operation, "builtin" or "c".
         progress: called with the stage and the share done.
     """
     problems: list[str] = []
     counts = [fuzz_node("plant", frames, seed, progress), fuzz_node("controller", frames, seed, progress),
               fuzz_rig(frames, seed, progress)] if frames else []
-    most_growth = 16 << 20  # bytes of memory that invented frames may cost
+    most_growth = 16 << 20  # bytes of memory that fuzz frames may cost
     for count in counts:
-        problems += [f"invented frames, {count.target}: {failure}" for failure in count.failures]
+        problems += [f"fuzz frames, {count.target}: {failure}" for failure in count.failures]
         if not count.works:
-            problems.append(f"invented frames, {count.target}: does not work afterwards")
+            problems.append(f"fuzz frames, {count.target}: does not work afterwards")
         if count.growth > most_growth:
-            problems.append(f"invented frames, {count.target}: {count.growth >> 20} MiB more memory")
+            problems.append(f"fuzz frames, {count.target}: {count.growth >> 20} MiB more memory")
     datagrams = fuzz_datagrams(frames // 10, seed, _draw_group(seed, 1), controller, progress) if frames else None
     if datagrams and datagrams.verdict != "PASS":
-        problems.append(f"invented datagrams: a run afterwards is {datagrams.verdict or 'impossible'}")
-    problems += [f"invented datagrams: {problem}" for problem in (datagrams.problems if datagrams else ())]
+        problems.append(f"fuzz datagrams: a run afterwards is {datagrams.verdict or 'impossible'}")
+    problems += [f"fuzz datagrams: {problem}" for problem in (datagrams.problems if datagrams else ())]
     logs = _study_logs(frames // 1000, seed, progress) if frames >= 1000 else None
     problems += [f"changed logs: {failure}" for failure in (logs.failures if logs else ())]
     rows = []
@@ -63,7 +63,7 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
             rows.append(_summarise_trials(done))
     soak = soak_bench(minutes, _draw_group(seed, 2), controller=controller, progress=progress) if minutes else None
     if soak:
-        problems += [f"long work: {problem}" for problem in (*soak.problems, *soak.find_growth())]
+        problems += [f"long operation: {problem}" for problem in (*soak.problems, *soak.find_growth())]
     return {"frames": [count._asdict() for count in counts], "datagrams": datagrams._asdict() if datagrams else None,
             "logs": logs._asdict() if logs else None, "disturbed": rows,
             "soak": _describe_soak(soak._asdict()) if soak else None, "problems": problems}

@@ -30,18 +30,18 @@ def test_a_seed_gives_the_same_frames_again() -> None:
 
 
 @pytest.mark.parametrize("target", ["plant", "controller"])
-def test_invented_frames_into_a_node(target: str) -> None:
+def test_fuzz_frames_into_a_node(target: str) -> None:
     count = fuzz_node(target, 20_000, 5)
     assert count.failures == () and count.works and count.answers > 500 and count.growth < 16 << 20
 
 
-def test_invented_frames_into_the_c_firmware(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzz_frames_into_the_c_firmware(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "Firmware", CFirmware)
     count = fuzz_node("controller", 20_000, 6)
     assert count.failures == () and count.works and count.answers > 500
 
 
-def test_invented_frames_into_the_rig() -> None:
+def test_fuzz_frames_into_the_rig() -> None:
     count = fuzz_rig(20_000, 7)
     assert count.failures == () and count.works and count.frames >= 20_000
 
@@ -65,7 +65,7 @@ def test_a_node_that_breaks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(count.failures) == 10 and "IndexError: three bytes" in count.failures[0] and not count.works
 
 
-def test_invented_datagrams_on_the_udp_bus() -> None:
+def test_fuzz_datagrams_on_the_udp_bus() -> None:
     count = fuzz_datagrams(3000, 9, "239.74.164.9")
     assert count.verdict == "PASS" and count.problems == () and max(count.growth.values()) < 16 << 20
 
