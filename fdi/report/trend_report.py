@@ -102,8 +102,9 @@ def _describe_arrival(remaining: Remaining, trend: Trend, unit: UnitTrend) -> st
 
 
 def _tabulate_remaining(trend: Trend, unit: UnitTrend) -> Table:
-    columns = [Column("reaches"), Column("time left"), Column("not before (97.5 %)"), Column("median"),
-               Column("not after (97.5 %)"), Column("probability", align="right")]
+    columns = [Column("reaches"), Column("time left", align="right"), Column("not before (97.5 %)", align="right"),
+               Column("median", align="right"), Column("not after (97.5 %)", align="right"),
+               Column("probability", align="right")]
     rows: list[list[Cell | str]] = []
     for level, remaining in trend.remaining.items():
         times = (remaining.low, remaining.value, remaining.high)

@@ -88,7 +88,7 @@ def choose_model_file(args: argparse.Namespace, trace: str | None) -> Path:
 
 def format_command_line() -> str:
     """The command as the user typed it, for the history of a model file; "rig" in another program."""
-    is_command = Path(sys.argv[0]).name in ("rig", "cli.py")
+    is_command = Path(sys.argv[0]).name in ("rig", "main.py")  # main.py: python -m rig.cli.main
     return shlex.join(["rig", *sys.argv[1:]]) if is_command else "rig"
 
 

@@ -44,7 +44,7 @@ def count_usable_threads(job: int) -> int:
 
 def run_sleeping_process(folder: str) -> None:
     """Start a process that sleeps, as `rig explain` in a trial, and write both process numbers to a file."""
-    command = [sys.executable, "-c", "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60)"]
+    command = [sys.executable, "-c", "import os, sys, time; print(os.getpid(), flush=True); time.sleep(1200)"]
     with Path(folder, "pids").open("a") as out:
         out.write(f"{os.getpid()}\n")
         out.flush()
@@ -66,11 +66,11 @@ def lose_first_signal(file: str) -> str:
         return ""
     try:
         Path(file).touch()
-        time.sleep(60)
+        time.sleep(1200)
     except SystemExit:
         Path(file).write_text("lost")
     try:
-        time.sleep(60)
+        time.sleep(1200)
     except SystemExit as error:
         Path(file).write_text(f"lost, ended by {error.code}")
         raise

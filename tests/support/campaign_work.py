@@ -1,4 +1,4 @@
-"""Judgements for the tests of rig campaign: quick, or as slow as the environment says."""
+"""Judgements for the tests of rig campaign: quick, or held up where the environment says."""
 from __future__ import annotations
 
 import os
@@ -13,12 +13,17 @@ from plant import Model
 
 
 def judge_quickly(trace: Trace, model: Model) -> dict[str, Any]:
-    """Some numbers that depend on every bit of the trace; each call leaves its mark in $CAMPAIGN_CALLS."""
+    """Some numbers that depend on every bit of the trace; each call leaves its mark in $CAMPAIGN_CALLS.
+
+    After the first $CAMPAIGN_FREE calls each one waits until the file $CAMPAIGN_GATE is gone.
+    """
     source = f"{trace.provenance['source']} {trace.provenance.get('seed')}"
     if "CAMPAIGN_CALLS" in os.environ:
         with (Path(os.environ["CAMPAIGN_CALLS"])).open("a") as out:
             out.write(f"{os.getpid()} {source}\n")
-    time.sleep(float(os.environ.get("CAMPAIGN_SLOW", 0)))
+        if len(Path(os.environ["CAMPAIGN_CALLS"]).read_text().splitlines()) > int(os.environ.get("CAMPAIGN_FREE", 0)):
+            while Path(os.environ.get("CAMPAIGN_GATE", "")).is_file():
+                time.sleep(0.02)
     if source == "filter_clogging=0.9 1":
         raise ZeroDivisionError("nothing\nleft to divide")
     error = trace.com - trace.xj

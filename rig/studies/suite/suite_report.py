@@ -122,7 +122,7 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
 
     moods = {name: LEVEL_MOODS[level] for level, name in LEVEL_NAMES.items()}
     columns = [Column("case"), Column("rig fdi"), Column("fault", medium=Medium.PAGE), Column("level"),
-               Column("size (95 % interval)"), Column("finding", medium=Medium.PAGE)]
+               Column("size (95 % interval)", align="right"), Column("finding", medium=Medium.PAGE)]
     rows: list[list[Cell | str]] = []
     for result in diagnosed:
         word = result.fdi["verdict"]

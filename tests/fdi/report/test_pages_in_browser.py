@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import find_browser, measure_page, print_page, take_picture
+from page_pictures import FIND_SCROLLING
 from PIL import Image  # comes with matplotlib
 
 from fdi.report.html import render_html
+from fdi.report.report import Column, Report, Section, Table
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Check, Trace
 
@@ -56,6 +58,19 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_nothing_is_cut_off(page: Path, width: int) -> None:
     size = measure_page(page, width)
     assert size.inner == width and size.scroll <= size.client and size.beyond == [] and size.errors == []
+
+
+def test_a_wide_table_fits_into_a_window_of_800_pixels(tmp_path: Path) -> None:
+    """Ten columns with long headings, as rig explain has: none is hidden and none is squeezed to a word a line."""
+    headings = ["XJ", "P12", "XS", "XJ, held-out run", "P12, held-out run", "XS, held-out run", "evidence", "p"]
+    columns = [Column("effect"), *(Column(heading, align="right") for heading in headings), Column("size")]
+    size = "amplitude 0.00022 (-0.00016 .. 0.00060), frequency 344 Hz (338 .. 349), phase 4.3 rad (0.3 .. 8.3)"
+    rows = [["null_bias + supply_ripple", "0.997", "0.999", "1.00", "1.00", "1.00", "0.991", "362661", "<1e-99", size]]
+    page = tmp_path / "wide.html"
+    page.write_text(render_html(Report("explain", "run.csv", sections=[Section("Candidates", [Table(columns, rows)])])))
+    high = "row: String(document.querySelectorAll('tr')[1].offsetHeight)"
+    notes = measure_page(page, 800, FIND_SCROLLING + f"Object.assign(window.probeNotes, {{{high}}})").notes
+    assert notes["scrolling"] == "" and int(notes["row"]) < 200, notes
 
 
 def test_a_figure_is_zoomed_and_read(page: Path) -> None:

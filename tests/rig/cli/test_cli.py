@@ -229,10 +229,11 @@ def test_ctrl_c_runs_clean_up_and_closes_the_log(tmp_path: Path) -> None:
 
 def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Path) -> None:
     text = LONG.replace('kind = "ramp", to = 0.0, time = 0.05', 'kind = "hold", time = 60')
+    log = tmp_path / "out" / "trace.mcap"
     process = started("run", written(tmp_path / "long.toml", text), "--pace", "realtime", "--out", tmp_path / "out")
-    grown(tmp_path / "out" / "trace.mcap", 60_000)
+    grown(log, 60_000)
     process.send_signal(signal.SIGTERM)
-    time.sleep(0.5)
+    grown(log, log.stat().st_size + 30_000)  # the run goes on, in its clean-up
     process.send_signal(signal.SIGINT)
     said = finished(process)
     assert said.status == 130 and said.err.splitlines()[-1] == "rig run: interrupted" and "Traceback" not in said.err

@@ -50,7 +50,7 @@ def test_our_nodes_pass_as_processes_on_udp() -> None:
     """All at once, each on its own bus; wide limits, for the machine may be busy. Nothing is left behind."""
     skip_without_compiler()
     buses = {node: spec("udp_multicast") for node in NOT_FOR_OUR_NODES}
-    running = {node: started("conformance", node, "--bus", bus, "--json", "--timeout", 5, "--tolerance", 2000)
+    running = {node: started("conformance", node, "--bus", bus, "--json", "--timeout", 20, "--tolerance", 2000)
                for node, bus in buses.items()}
     for node, process in running.items():
         out, err = process.communicate(timeout=300)
@@ -161,7 +161,7 @@ def test_a_node_by_its_number_and_data_sheet() -> None:
     node = started("node", "controller", "--bus", bus)
     try:
         assert node.stdout is not None and "controller on" in node.stdout.readline()
-        words = ("conformance", 2, "--eds", EDS[2], "--bus", bus, "--json", "--timeout", 5, "--tolerance", 2000,
+        words = ("conformance", 2, "--eds", EDS[2], "--bus", bus, "--json", "--timeout", 20, "--tolerance", 2000,
                  "--chapter", "2", "--chapter", "4.15", "--chapter", "6.12")
         said, more = rig(*words), rig(*words, "--write")
         assert (said.status, more.status, node.poll()) == (0, 0, None)
@@ -190,7 +190,7 @@ def test_our_nodes_pass_on_a_can_interface(bus_kind: str, node: str) -> None:
         skip_without_compiler()
     numbers = [each.number for each in CASES if each.number[:2] in ("3.", "4.", "6.") and each.number != "3.15"]
     words = [word for number in numbers for word in ("--chapter", number)]
-    said = rig("conformance", node, "--bus", spec(bus_kind), "--json", "--timeout", 5, "--tolerance", 2000, *words)
+    said = rig("conformance", node, "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)
     assert [test["number"] for test in said.json["tests"]] == numbers
     failed = [(test["number"], test["measured"]) for test in said.json["tests"] if test["verdict"] == "fail"]
     assert (failed, said.status) == ([], 0)

@@ -7,9 +7,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,23 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """For processes: where the judgement is found, and the file in which it leaves its marks."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("CAMPAIGN_CALLS", str(tmp_path / "calls"))
-    monkeypatch.setenv("CAMPAIGN_SLOW", "0.15")
     return tmp_path / "calls"
+
+
+@pytest.fixture
+def gate(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that holds up every case while it is there."""
+    monkeypatch.setenv("CAMPAIGN_GATE", str(tmp_path / "gate"))
+    (tmp_path / "gate").touch()
+    return tmp_path / "gate"
+
+
+def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 600.0) -> None:
+    """Wait until something holds that `process` brings about; the limit only ends a test that hangs."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +81,8 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def cluster(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-            ) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+def cluster(gate: Path, tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """The address of a Dask scheduler with two worker processes, over TCP."""
-    monkeypatch.setenv("CAMPAIGN_SLOW", "0.6")  # long enough to kill a worker in the middle of a case on a busy machine
-
     def start(program: str, *words: object) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *map(str, words)]
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path)
@@ -87,30 +100,33 @@ def cluster(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
-        cluster: tuple[str, list[subprocess.Popen[bytes]]], environment: Path, local: Path, tmp_path: Path) -> None:
+        cluster: tuple[str, list[subprocess.Popen[bytes]]], environment: Path, gate: Path, local: Path,
+        tmp_path: Path) -> None:
     address, processes = cluster
     there = tmp_path / "there"
     process = started("campaign", *MATRIX, "--out", there, "--scheduler", address, "--quiet")
-    end = time.monotonic() + 60
-    while len({pid for pid, _ in calls(environment)}) < 2 and time.monotonic() < end:
-        time.sleep(0.02)
-    victim, at_work = calls(environment)[-1]  # it has just begun
+    wait_for(lambda: len({pid for pid, _ in calls(environment)}) == 2, process)
+    victim, at_work = calls(environment)[-1]  # in the middle of a case, for the gate holds it up
     assert victim in [worker.pid for worker in processes[1:]]
     os.kill(victim, signal.SIGKILL)
+    gate.unlink()
     assert finished(process).status == 1  # one case fails
     assert rows(there) == rows(local) == rows(there / folder.RESULTS)
     did = calls(environment)
     assert Counter(source for _, source in did)[at_work] == 2 and len({pid for pid, _ in did}) >= 2
 
 
-def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(environment: Path, local: Path, tmp_path: Path) -> None:
+def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
+        environment: Path, gate: Path, local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMPAIGN_FREE", "3")
     there, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
     process = started("campaign", *MATRIX, *few, "--out", there)
-    grown(there / folder.ROWS, 500)
+    wait_for(lambda: len(calls(environment)) == 4 and (there / folder.ROWS).read_bytes().count(b"\n") == 3, process)
     process.kill()
     process.wait()
+    gate.unlink()
     done = rows(there)
-    assert 0 < len(done) < 6
+    assert len(done) == 3
     with (there / folder.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
     said = rig("campaign", there, *few, *MATRIX[-2:], "--json")
@@ -138,9 +154,18 @@ class Dead:
         return False
 
 
-def test_processes_listen_to_no_port_and_give_the_same_rows(environment: Path, local: Path) -> None:
+def open_gate(gate: Path, environment: Path, workers: int, seconds: float = 600.0) -> None:
+    """Let the cases go on when so many workers have begun one; `seconds` only ends a test that hangs."""
+    end = time.monotonic() + seconds
+    while len({pid for pid, _ in calls(environment)}) < workers and time.monotonic() < end:
+        time.sleep(0.02)
+    gate.unlink()
+
+
+def test_processes_listen_to_no_port_and_give_the_same_rows(environment: Path, gate: Path, local: Path) -> None:
     import psutil
 
+    threading.Thread(target=open_gate, args=(gate, environment, 2), daemon=True).start()
     whole = folder.read_matrix_of_folder(local)
     plan, sockets = plan_batch(whole, cases.hash_campaign_sources(), 4), []
     found: dict[int, dict[str, Any]] = {}

@@ -76,23 +76,23 @@ def is_alive(pid: int) -> bool:
 def test_an_interruption_ends_the_workers_and_the_processes_they_started(work: str, tmp_path: Path) -> None:
     command = [sys.executable, str(Path(batch_work.__file__)), work, str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600  # only ends a test that hangs
     while (not (tmp_path / "pids").exists() or len((tmp_path / "pids").read_text().split()) < 4):
         assert time.monotonic() < end and process.poll() is None
         time.sleep(0.05)
     pids = [int(word) for word in (tmp_path / "pids").read_text().split()]
     assert all(is_alive(pid) for pid in pids)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=300)
     assert (out, err) == ("interrupted\n", "")
     assert not any(is_alive(pid) for pid in pids)
 
 
 def test_a_signal_that_is_lost_in_a_job_comes_again(tmp_path: Path) -> None:
     results = run_in_processes(batch_work.lose_first_signal, [str(tmp_path / "a"), str(tmp_path / "b"), ""], 3,
-                               fail_test, patience=60.0)
+                               fail_test, patience=300.0)
     assert next(results)[0] == ""  # type: ignore[call-overload]
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600
     while not ((tmp_path / "a").exists() and (tmp_path / "b").exists()):
         assert time.monotonic() < end
         time.sleep(0.05)
