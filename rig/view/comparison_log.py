@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 BEFORE, FLOOR = 0xE5534BFF, MEASURED
 # each plot has a colour of its own, so that a picture shows which one is empty
 MODELS = {"xj": 0xE8A33DFF, "p12": 0x45B8ACFF, "xs": 0xD96BA0FF}
-RESIDUALS = {"xj": 0xF2D94CFF, "p12": 0x7FD46BFF, "xs": 0xB57EDCFF}
+RESIDUALS = {"xj": 0xC2A83EFF, "p12": 0x7FD46BFF, "xs": 0xB57EDCFF}
 LANES, RESULT = "Command and error", "Result"  # titles of the views that are no plots
 NOT_JUDGED = "not judged"
 

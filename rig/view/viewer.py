@@ -9,9 +9,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,38 @@ def open_viewer(rrd: Path) -> None:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(f"no display here for a window; {rrd} is written: open it elsewhere, or ask for --screenshot")
     subprocess.Popen(_build_command(rrd, "auto"), start_new_session=True)
+
+
+@contextlib.contextmanager
+def serve_in_browser(rrd: Path, theme: str, patience: float = 20.0) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Serve the viewer for a web browser on 127.0.0.1; -> the address with `theme` (light, dark) and the server.
+
+    The viewer's own window has no option for its theme. The server ends with this context. Raises ViewerError without
+    rerun, and when nothing is served within `patience` s.
+    """
+    import_rerun()
+    data, web = find_free_port(), find_free_port()
+    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", "127.0.0.1", "--port", str(data),
+               "--web-viewer-port", str(web), str(rrd)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        deadline = time.monotonic() + patience
+        while not _is_listening(web):
+            if server.poll() is not None or time.monotonic() > deadline:
+                raise ViewerError(f"the viewer for the browser does not come up within {patience:g} s")
+            time.sleep(0.1)
+        source = quote(f"rerun+http://127.0.0.1:{data}/proxy", safe="")
+        yield f"http://127.0.0.1:{web}/?url={source}&theme={theme}", server
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+
+
+def _is_listening(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def take_screenshot(shown: Sequence[ShownView], rrd: Path, image: Path, patience: float = 60.0) -> dict[str, int]:

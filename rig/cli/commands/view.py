@@ -36,6 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="with --compare: another run of the same command, measures the noise floor (repeatable)")
     add("--signals", metavar="xj,p12,xs", help="with --compare: what to compare (default: what the trace has)")
     add("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it")
+    add("--theme", choices=("light", "dark"),
+        help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)")
     add("--headless", action="store_true", help="open no window (together with --screenshot)")
     add("--screenshot", metavar="FILE.png",
         help="draw without a display, check that every view shows its lines, and save the picture")
@@ -68,12 +70,37 @@ def run_command(args: argparse.Namespace) -> int:
             progress("the viewer draws the picture", 0.0)
             answer["screenshot"] = args.screenshot
             answer["pixels"] = viewer.take_screenshot(drawing.shown, rrd, Path(args.screenshot))
-        elif not (args.save or args.out):
+        elif not (args.save or args.out or args.theme):
             progress("opening the viewer", 0.0)
             viewer.open_viewer(rrd)
-    written = "\n".join(str(path) for path in (rrd, args.screenshot) if path)
-    show_answer(Report("view", join_words(sources), sentence=written, data=answer), args)
+    written = [str(path) for path in (rrd, args.screenshot) if path]
+
+    def show(*more: str) -> None:
+        show_answer(Report("view", join_words(sources), sentence="\n".join([*written, *more]), data=answer), args)
+
+    if args.theme:
+        _show_in_browser(rrd, args.theme, answer, show)
+    else:
+        show()
     return 0
+
+
+def _show_in_browser(rrd: Path, theme: str, answer: dict[str, object], show: Callable[[str], None]) -> None:
+    """Open the viewer in a browser; return at Ctrl-C."""
+    import sys
+    import time
+    import webbrowser
+
+    from rig.cli.interruption import catch_signals
+    from rig.view.viewer import serve_in_browser
+
+    with serve_in_browser(rrd, theme) as (address, server), catch_signals() as is_to_stop:
+        answer["address"] = address
+        show(f"{address}  (Ctrl-C ends it)")
+        sys.stdout.flush()
+        webbrowser.open(address)
+        while not is_to_stop() and server.poll() is None:
+            time.sleep(0.1)
 
 
 def _require_options_that_fit(args: argparse.Namespace) -> None:
@@ -81,9 +108,11 @@ def _require_options_that_fit(args: argparse.Namespace) -> None:
 
     if args.headless and not args.screenshot:
         raise InputError("--headless", "", "--screenshot FILE.png with it")
+    if args.theme and (args.screenshot or args.save or args.out):
+        raise InputError("--theme", args.theme, "no --screenshot, --save or --out with it: they open no browser")
     if args.compare and args.others:
         raise InputError("--compare", args.others[0], "one trace; rig view A B holds traces against each other")
-    for option in ("model", "set", "effects", "repeat", "signals"):
+    for option in ("model", "set", "effects", "trust", "repeat", "signals"):
         if getattr(args, option) and not args.compare:
             raise InputError(f"--{option}", "", "--compare with it")
 

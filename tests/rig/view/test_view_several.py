@@ -2,12 +2,19 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import os
+import signal
+import socket
+import time
+import urllib.request
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 from recording_rows import Rows, read_names, read_recording
-from rig_command import rig
+from rig_command import finished, rig, started
 from short_runs import build_command
 
 from fdi.comparison.compare import compare
@@ -129,3 +136,38 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
 def test_options_that_do_not_fit_are_one_line(folder: Path, words: list[str], message: str) -> None:
     said = rig("view", folder / "run.csv", *words)
     assert said.status == 2 and said.err == f"rig view: {message}\n"
+
+
+def test_a_theme_is_served_for_a_browser_until_ctrl_c(folder: Path) -> None:
+    """A script that notes the address stands in for a browser, which would open a window."""
+    script, note = folder / "browser", folder / "address.txt"
+    script.write_text(f'#!/bin/sh\nprintf %s "$1" > {note}.part\nmv {note}.part {note}\n')
+    script.chmod(0o755)
+    process = started("view", folder / "run.csv", "--theme", "light", "--json",
+                      env={**os.environ, "BROWSER": f"{script} %s"})
+    try:
+        assert process.stdout is not None
+        answer = json.loads(process.stdout.readline())
+        address = urlsplit(answer["address"])
+        assert address.hostname == "127.0.0.1" and parse_qs(address.query)["theme"] == ["light"]
+        with urllib.request.urlopen(answer["address"]) as page:
+            assert b"rerun" in page.read().lower()
+        while not note.exists():
+            time.sleep(0.05)
+        assert note.read_text() == answer["address"]
+        data = urlsplit(parse_qs(address.query)["url"][0])
+        with socket.create_connection(("127.0.0.1", data.port or 0)):
+            pass
+    finally:
+        process.send_signal(signal.SIGINT)
+        said = finished(process)
+    assert said.status == 0 and said.err == ""
+    with socket.socket() as probe:  # the server is gone
+        assert probe.connect_ex(("127.0.0.1", address.port or 0)) != 0
+
+
+def test_a_theme_needs_a_browser(folder: Path) -> None:
+    said = rig("view", folder / "run.csv", "--theme", "light", "--save", folder / "x.rrd")
+    assert said.status == 2
+    assert said.err == ("rig view: --theme: light: expected no --screenshot, --save or --out with it: they open no "
+                        "browser\n")
