@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
 AMBER = "#d9730d"
 LEVELS = 7  # contours
-LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "position [departure, um]",
-          ("ramp", "speed"): "speed [departure, mm/s]"}  # of the bands' axes
+LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "departure of\nposition [um]",
+          ("ramp", "speed"): "departure of\nspeed [mm/s]"}  # of the bands' axes
 
 
 def draw_steps(traces: Mapping[str, Trace], number: int = 0) -> str:
@@ -105,7 +105,8 @@ def draw_bands(excursions: list[Excursion], friction: float, bands: Bands, trace
             size = (e.section.last - e.section.first) * 1e3
             ax.set_title(f"{kind} of {size:+.2g} mm at {trace.t[e.section.start]:g} s", fontsize=9)
         axes[0].set_ylabel(LABELS[kind, signal])
-        axes[0].legend(loc="best", frameon=True, edgecolor="none", fontsize=7)
+        entries = axes[0].get_legend_handles_labels()
+        figure.legend(*entries, loc="outside upper right", ncols=5, frameon=False, fontsize=8)
         return to_svg(figure, f"banded {kind} {signal}")
 
 
@@ -169,7 +170,7 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
             ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}", fontsize=9)
             ax.set_xlabel("Kintas")
             if truth:
-                ax.plot(*truth, "x", color="white", ms=9, mew=1.6, label="injected")
+                ax.plot(*truth, "X", color="white", ms=9, mec=INK, mew=0.8, label="injected")
         if grid.step and grid.ramp:
             for ax in axes[:2]:
                 ax.plot(*zip(LOWER_CORNER, UPPER_CORNER, strict=True), color="white", lw=0.8, ls="--")

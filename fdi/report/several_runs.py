@@ -66,7 +66,8 @@ def tabulate_facts(heading: str, labels: Sequence[str], facts: Mapping[str, Sequ
     for name, texts in facts.items():
         differs = len(set(texts)) > 1
         if any(texts):
-            rows.append([name, *(Cell(text, is_strong=differs) if text else MISSING for text in texts)])
+            shown = [text[:12] for text in texts] if name == "commit" else texts  # as git abbreviates it
+            rows.append([name, *(Cell(text, is_strong=differs) if text else MISSING for text in shown)])
     columns = [Column(heading), *(Column(label) for label in labels)]
     return Table(columns, rows, caption, medium=medium) if rows else None
 
