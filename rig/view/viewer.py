@@ -71,15 +71,18 @@ def take_screenshot(shown: Sequence[ShownView], rrd: Path, image: Path, patience
     lane or no text.
     """
     import_rerun()
-    views = _draw_views(rrd, image, patience)
+    views, pixels = _draw_views(shown, rrd, image, patience)
     wrong = [f"{view.name}: {report.summary}" for view in views for report in view.reports]
     if wrong:
         raise ViewerError(f"views with errors: {'; '.join(wrong)}")
-    pixels = _count_view_pixels(shown, image)
-    empty = [view.title for view in shown if pixels[view.title] < view.fewest]
+    empty = _list_empty_views(shown, pixels)
     if empty:
         raise ViewerError(f"{image}: empty views: {', '.join(empty)}")
     return pixels
+
+
+def _list_empty_views(shown: Sequence[ShownView], pixels: dict[str, int]) -> list[str]:
+    return [view.title for view in shown if pixels[view.title] < view.fewest]
 
 
 def _count_view_pixels(shown: Sequence[ShownView], image: Path) -> dict[str, int]:
@@ -98,8 +101,9 @@ def _count_pixels(shades: NDArray[np.int64], colour: int, weight: float = 1.0, o
     return int((np.abs(shades - wanted).max(axis=2) < off).sum())
 
 
-def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
-    """Save the picture; -> the views' states."""
+def _draw_views(shown: Sequence[ShownView], rrd: Path, image: Path,
+                patience: float) -> tuple[list[Any], dict[str, int]]:
+    """Save the picture; -> the views' states, and the pixels of each view."""
     from rerun.experimental import ViewerClient
 
     port = find_free_port()
@@ -109,7 +113,7 @@ def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
                                   stdout=output, stderr=output, start_new_session=True)
         try:
             views = _wait_until_loaded(viewer, f"rerun+http://127.0.0.1:{port}/proxy", patience)
-            ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy").save_screenshot(str(image.resolve()))
+            pixels = _save_picture(ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy"), shown, image, patience)
         except (ConnectionError, TimeoutError, RuntimeError) as error:
             output.seek(0)
             last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it printed nothing")
@@ -118,7 +122,25 @@ def _draw_views(rrd: Path, image: Path, patience: float) -> list[Any]:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
             viewer.wait()
-    return views
+    return views, pixels
+
+
+def _save_picture(client: Any, shown: Sequence[ShownView], image: Path, patience: float) -> dict[str, int]:
+    """Save the picture; -> the pixels of each view.
+
+    The viewer loads a long recording piece by piece, so a picture with empty views is taken again until it is the same.
+    """
+    deadline = time.monotonic() + patience
+    client.save_screenshot(str(image.resolve()))
+    pixels = _count_view_pixels(shown, image)
+    while _list_empty_views(shown, pixels) and time.monotonic() < deadline:
+        before = pixels
+        time.sleep(3.0)
+        client.save_screenshot(str(image.resolve()))
+        pixels = _count_view_pixels(shown, image)
+        if pixels == before:
+            break
+    return pixels
 
 
 def _wait_until_loaded(viewer: subprocess.Popen[bytes], url: str, patience: float) -> list[Any]:
