@@ -63,8 +63,9 @@ class LiveView:
                 path = f"{plot.origin}/{line.path}"
                 if path in _SENT or path == _ERROR:
                     send_line_style(rr, stream, path, line)
-        self._declare_lane(_PHASE, {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL})
-        self._declare_lane(_COMMAND, dict.fromkeys(plan.sections, SECTIONS["dynamic"]))
+        phases = {"set-up": NEUTRAL, "main": MEASURED, "clean-up": NEUTRAL}
+        self._declare_lane(_PHASE, phases)
+        self._declare_lane(_COMMAND, phases | dict.fromkeys(plan.sections, SECTIONS["dynamic"]))
         for node in NAMES:
             self._declare_lane(name_node_lane(node), STATES)
         for label in plan.starts:
