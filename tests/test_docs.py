@@ -170,7 +170,7 @@ def values(args: argparse.Namespace, *names: str) -> list[str]:
 
 def test_a_command_of_the_tutorial_uses_only_what_is_there_by_then() -> None:
     there = {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
-    effects = {"null_bias", "jack_friction", "discovered"}
+    effects = {"null_bias", "jack_friction", "missing_force"}
     typed = commands_shown(ROOT / "docs" / "tutorial.md")
     assert len(typed) > 10
     for line in typed:
