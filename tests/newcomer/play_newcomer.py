@@ -54,13 +54,14 @@ def make_environment() -> dict[str, str]:
 
 
 def play_shown(folder: Path) -> Iterator[Row]:
-    """The lines of README and tutorial, in order, in one clone."""
+    """The lines of README and tutorial, in order, in one clone, in which the reader has written a test of his own."""
     clone = folder / "eha-rig"
     if (ROOT / ".git").exists():
         subprocess.run(["git", "clone", "--quiet", "--depth", "1", ROOT.as_uri(), str(clone)], check=True)
     else:
         clone.mkdir()
         shutil.copytree(ROOT / "docs", clone / "docs")
+    shutil.copy(ROOT / "rig/sequences/preflight.toml", clone / "my_test.toml")
     for page in ("README.md", "docs/tutorial.md"):
         for played in play_page((ROOT / page).read_text(), clone, make_environment()):
             status = "-" if played.status is None else str(played.status)
