@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tempfile
 
+from rig.run.outcome import INTERRUPTED
 from rig.sequences import load_sequence
 from rig.studies.benchmarks.stopwatch import measure_median_duration
 
@@ -26,5 +27,9 @@ def run_rig(*words: str) -> None:
 
     Raises:
         subprocess.CalledProcessError: it ended with a status other than 0.
+        KeyboardInterrupt: Ctrl-C in the terminal ended it, before this process heard of it.
     """
-    subprocess.run([sys.executable, "-m", "rig.cli.main", *words], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, "-m", "rig.cli.main", *words], check=False, stdout=subprocess.DEVNULL)
+    if done.returncode == INTERRUPTED:
+        raise KeyboardInterrupt
+    done.check_returncode()
