@@ -37,13 +37,13 @@ class Columns(NamedTuple):
     load: Array
 
 
-def draw_noise(seed: int, cycles: int) -> Array:
+def sample_noise(seed: int, cycles: int) -> Array:
     """The random numbers of a run, (cycles, NOISES), standard normal; the same for a bench run and a simulation."""
     return np.random.default_rng(seed).standard_normal((cycles, NOISES))
 
 
 def iterate_noise(seed: int, block: int = 64) -> Iterator[list[float]]:
-    """The rows of `draw_noise` without end; drawn `block` at a time, which costs a tenth of drawing single rows."""
+    """The rows of `sample_noise` without end; drawn `block` at a time, which costs a tenth of drawing single rows."""
     rng = np.random.default_rng(seed)
     while True:
         yield from rng.standard_normal((block, NOISES)).tolist()
@@ -73,7 +73,7 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
     record = model.build_record()
     with report_law_errors(model):
         run = build_kernel(run_closed_loop, model.effects, fast, model.plant)
-        noise = draw_noise(seed, len(com)) if drawn is None else drawn
+        noise = sample_noise(seed, len(com)) if drawn is None else drawn
         if fast:
             run_beside(partial(run, model.build_state(), com, force, noise, record, steps, out))
         else:

@@ -292,13 +292,14 @@ def choose_bands(com: Floats, load: Floats, period: float, model: Model | None =
                  progress: Progress = ignore_progress) -> Bands:
     """The preflight's own bands if they are of this command, load and model; else bands made for them."""
     from fdi.diagnosis.bands_file import load_default_bands
-    from fdi.diagnosis.learn_bands import simulate_bands
+    from fdi.diagnosis.learn_bands import make_bands_by_simulation
 
     if (model is None or is_nominal_plant(model)) and not is_loaded(load):
         own = load_default_bands()
         if matches_command(own, com, period):
             return own
-    return simulate_bands(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, progress=progress)
+    return make_bands_by_simulation(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK,
+                                    progress=progress)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -76,7 +76,7 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
         raise InputError("--learn-bands", "", "traces, or a command to simulate")
     else:
         model = model or load_model()
-        bands = simulate_bands(model, com, np.zeros_like(com), model["controller.period"], seed=seed,
+        bands = make_bands_by_simulation(model, com, np.zeros_like(com), model["controller.period"], seed=seed,
                                progress=progress, name=name)
     save_bands(bands, place)
     judged = [fault.name for fault, is_shown in zip((CLOGGING, FRICTION), bands.judges, strict=True) if is_shown]
@@ -87,10 +87,11 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
 # By simulation
 # ---------------------------------------------------------------------------------------------------------------------
 
-def simulate_bands(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS,
-                   faulty: int = BAND_UNITS, seed: int = 0, steps: int = 20, progress: Progress = ignore_progress,
-                   name: str = "", frictions: Sequence[float] = (20.0, 50.0, 100.0, 140.0), low_sliding: float = 0.2
-                   ) -> Bands:
+def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS,
+                             faulty: int = BAND_UNITS, seed: int = 0, steps: int = 20,
+                             progress: Progress = ignore_progress, name: str = "",
+                             frictions: Sequence[float] = (20.0, 50.0, 100.0, 140.0), low_sliding: float = 0.2
+                             ) -> Bands:
     """Bands of a command (n,) m with a known load (n,) N, one row per `period` s, by simulating units of a model.
 
     Args:

@@ -51,8 +51,8 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
         members = slice(first, min(first + NARROW, count))
         rng = np.random.default_rng([seed, first])
         before = make_lead_in(com, model["controller.period"]) if com[0] != 0.0 or first // NARROW % 2 else com[:0]
-        noise = draw_sensor_noise(rng, model, len(before) + len(com))
-        units = _draw_parameters(rng, model, tolerance, names, kind)[:members.stop - first]
+        noise = sample_sensor_noise(rng, model, len(before) + len(com))
+        units = _sample_parameters(rng, model, tolerance, names, kind)[:members.stop - first]
         asked, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
         out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
 
@@ -74,8 +74,8 @@ def make_lead_in(com: Floats, period: float, moving: float = 0.5, resting: float
     return asked
 
 
-def draw_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, most_colour: float = 0.85,
-                      most_hum: float = 0.55, hum_frequency: float = 50.0) -> Floats:
+def sample_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, most_colour: float = 0.85,
+                        most_hum: float = 0.55, hum_frequency: float = 50.0) -> Floats:
     """Noise of the position sensor, (cycles,) m: first order of a random colour, and mains hum of a random size.
 
     Args:
@@ -97,8 +97,8 @@ def draw_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, most_
     return coloured
 
 
-def _draw_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],
-                     kind: UnitKind) -> Floats:
+def _sample_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],
+                       kind: UnitKind) -> Floats:
     """Parameters of a block of units, (NARROW, len(names))."""
     table = np.tile([model[name] for name in names], (NARROW, 1))
     for name, size in tolerance.items():

@@ -52,8 +52,8 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
     return x
 
 
-def draw_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], seed: int, count: int = SCATTERED
-                ) -> Floats:
+def sample_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], seed: int, count: int = SCATTERED
+                  ) -> Floats:
     """Starts (m, p): `begin` (p,), the data sheet, and some scattered about `begin`.
 
     Those that are `known` from regressions are scattered by a tenth, tolerances not at all, the rest by 0.4 of what

@@ -29,10 +29,10 @@ from fdi.identification.experiments import Advice, advise_experiments
 from fdi.identification.free_parameters import Range, get_systematic_sd, list_unknowns
 from fdi.identification.global_fit import (
     descend,
-    draw_starts,
     fit_from_afar,
     is_fitted,
     polish_fit,
+    sample_starts,
     scale_values,
     search_other_valleys,
     start_fit,
@@ -168,7 +168,7 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     parts, remarks = cut_long_runs(fitted, sources, _replace_values(model, begun), floor)
     problem = make_problem(model, parts, floor, workers or count_threads())
     notes += remarks
-    starts = draw_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
+    starts = sample_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
     fit = fit_from_afar(problem, free, starts, progress)
     progress("which parameters the runs show", 0.65)
     hidden = find_hidden(problem, fit, {r.name: r for r in ranges})

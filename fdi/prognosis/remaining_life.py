@@ -30,11 +30,11 @@ class UnitError(NamedTuple):
     share: float = 0.0
 
 
-def draw_paths(posterior: Posterior, own: UnitError, seed: int = 0, paths: int = TREND_PATHS) -> Paths:
+def sample_paths(posterior: Posterior, own: UnitError, seed: int = 0, paths: int = TREND_PATHS) -> Paths:
     """Paths of equal probability."""
     rng = np.random.default_rng(seed)
     weights = posterior.weights
-    part, shape = np.unravel_index(_draw_stratified(weights.ravel(), paths, rng), weights.shape)
+    part, shape = np.unravel_index(_sample_stratified_rows(weights.ravel(), paths, rng), weights.shape)
     ahead = evaluate_shapes(posterior.shapes, 1.0 + AHEAD).T
     now, before = (evaluate_shapes(posterior.shapes, np.array([u])) for u in (1.0, 0.98))
     slopes = (now - before)[0] / 0.02
@@ -43,11 +43,11 @@ def draw_paths(posterior: Posterior, own: UnitError, seed: int = 0, paths: int =
         p, rows = posterior.parts[i], np.flatnonzero(part == i)
         kind, strength = WANDERS[p.wander]
         k = shape[rows]
-        rise = _draw_positive(p.rise[k], p.deviation[k], rng.uniform(size=len(rows)))
+        rise = _sample_positive_numbers(p.rise[k], p.deviation[k], rng.uniform(size=len(rows)))
         rise[[posterior.shapes[j].law == "none" for j in k]] = 0.0
         root = np.linalg.cholesky(p.spread + np.diag([1e-12, 1e-12]))
         level = p.level[:, None] - p.pull[:, k] * rise + root @ rng.standard_normal((2, len(rows)))
-        wander = _draw_wander(kind, strength, level[1], rng)
+        wander = _sample_wander(kind, strength, level[1], rng)
         sizes[rows] = rise[:, None] * ahead[k] + level[0][:, None] + wander
         rate[rows] = rise * slopes[k] + (level[1] if kind == "integrated" else 0.0)
     common = np.sqrt([NOISES[p.noise][0] for p in posterior.parts])[part] * rng.standard_normal(paths)
@@ -69,21 +69,21 @@ def find_first_passage(paths: Paths, limit: float) -> Floats:
     return np.where(above.any(axis=1), when, np.inf)
 
 
-def _draw_stratified(weights: Floats, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _sample_stratified_rows(weights: Floats, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Row numbers in proportion to the weights, less random than independent draws."""
     ends = np.cumsum(weights)
     return np.minimum(np.searchsorted(ends / ends[-1], (np.arange(count) + rng.uniform(size=count)) / count),
                       len(weights) - 1)
 
 
-def _draw_positive(mean: Floats, deviation: Floats, uniform: Floats) -> Floats:
+def _sample_positive_numbers(mean: Floats, deviation: Floats, uniform: Floats) -> Floats:
     """Normal numbers, truncated to positive ones."""
     below = ndtr(-mean / deviation)
     drawn: Floats = mean + deviation * ndtri(np.clip(below + uniform * (1.0 - below), 1e-300, 1.0 - 1e-16))
     return np.maximum(drawn, 0.0)
 
 
-def _draw_wander(kind: str, strength: float, slope: Floats, rng: np.random.Generator) -> Floats:
+def _sample_wander(kind: str, strength: float, slope: Floats, rng: np.random.Generator) -> Floats:
     """Distance of the wander from its present value, (paths, times)."""
     n, h = len(slope), np.diff(AHEAD)
     if kind == "still":

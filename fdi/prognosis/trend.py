@@ -86,7 +86,7 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
         return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
     span = float(t[-1] - t[found.first])
     posterior = fit_growth(found.data)
-    paths, laws = _draw_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
+    paths, laws = _sample_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
     remaining = {level: _summarise_remaining(getattr(fault, field), fault, unit, paths, span)
                  for level, field in LIMITS.items()}
     middle = np.linspace(0.0, 1.0, 60)
@@ -117,19 +117,20 @@ def _fit_unit_error(data: Scaled, used: NDArray[np.bool_]) -> remaining_life.Uni
     return remaining_life.UnitError(float(base), float(share))
 
 
-def _draw_paths(found: Cleaned, posterior: Posterior, own: remaining_life.UnitError) -> remaining_life.Paths:
+def _sample_paths(found: Cleaned, posterior: Posterior, own: remaining_life.UnitError) -> remaining_life.Paths:
     """Paths from the last trace on.
 
     A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
     """
     last = found.breaks[-1] if found.breaks else None
     if last is None or last.kind != "last" or last.size < 0.0:
-        return remaining_life.draw_paths(posterior, own)
+        return remaining_life.sample_paths(posterior, own)
     at = len(found.data.u) - 1
     tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
     third = TREND_PATHS // 3
     jumped = fit_growth(tight._replace(steps=(*tight.steps, at)))
-    three = [remaining_life.draw_paths(p, own, i, third) for i, p in enumerate((posterior, jumped, fit_growth(tight)))]
+    posteriors = posterior, jumped, fit_growth(tight)
+    three = [remaining_life.sample_paths(p, own, i, third) for i, p in enumerate(posteriors)]
     return remaining_life.Paths(np.concatenate([p.sizes for p in three]), np.concatenate([p.rate for p in three]))
 
 

@@ -101,7 +101,7 @@ class EmulatorService:
             self._last_sync = last
             self.device.sync.notice(t_ns)
         self.device.tick(t_ns)
-        self._draw_noise()
+        self._sample_noise()
         self._share_settings()
         self._watch_loop()
 
@@ -119,7 +119,7 @@ class EmulatorService:
         self._seen = self._last_sync = 0
         self._memory.words[ec.STATE] = state
         self._memory.words[ec.BEGUN] = self._memory.words[ec.FIRST] = int(state == ec.OPERATIONAL)
-        self._draw_noise()
+        self._sample_noise()
         self._share_settings()
 
     @contextmanager
@@ -227,7 +227,7 @@ class EmulatorService:
             wanted = 0, int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
             self._bus.set_filter([cob_id for cob_id in wanted if cob_id >= 0])
 
-    def _draw_noise(self, least: int = 1024) -> None:
+    def _sample_noise(self, least: int = 1024) -> None:
         """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
         filled = int(self._memory.words[ec.NOISE_FILLED])
         free = int(self._memory.words[ec.NOISE_USED]) + ec.NOISE_RING - filled

@@ -1,8 +1,8 @@
 """The rig's cycle as compiled code: due time, command, SYNC, collecting the answers. No Python object, no allocation.
 
-`play_realtime` runs in a thread of its own without the interpreter lock until the queue is empty and the end is asked
-for; `play_lockstep` plays one cycle a call. Both share their memory, `Buffers`, with Python (hard_loop.py): Python
-writes the inputs of the cycles ahead and reads rows and frames behind. Each word has one writer.
+`play_cycles_in_real_time` runs in a thread of its own without the interpreter lock until the queue is empty and the
+end is asked for; `play_cycle_in_lockstep` plays one cycle a call. Both share their memory, `Buffers`, with Python
+(hard_loop.py): Python writes the inputs of the cycles ahead and reads rows and frames behind. Each word has one writer.
 
 The command goes out before the SYNC is due: on a real bus a frame of 8 bytes takes 135 us at 1 Mbit/s and would delay
 the SYNC behind it. Times are those of CLOCK_MONOTONIC, ns.
@@ -81,7 +81,7 @@ def make_buffers(ahead: int, rows: int, frames: int, held: int) -> Buffers:
                    make_block(frames, 3), make_block(held, 2))
 
 
-def play_realtime(port: Port, buffers: Buffers) -> int:
+def play_cycles_in_real_time(port: Port, buffers: Buffers) -> int:
     """Play the queue at its due times until FINISH; returns DONE or the status of a bus that failed.
 
     Due times are a fixed grid. A SYNC that is late by whole periods drops the due times it has missed, and counts them.
@@ -119,7 +119,7 @@ def play_realtime(port: Port, buffers: Buffers) -> int:
         words[DUE] += words[PERIOD]
 
 
-def play_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
+def play_cycle_in_lockstep(port: Port, buffers: Buffers, until_ns: int) -> int:
     """Play one cycle: DONE when its answers are in or the time for them has passed; WAITING at `until_ns`, to be called
     again; or the status of a bus that failed.
     """

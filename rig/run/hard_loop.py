@@ -51,7 +51,7 @@ def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, pe
 @cache
 def compile_cycle(realtime: bool) -> Any:
     """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
-    play = compile_function(hc.play_realtime if realtime else hc.play_lockstep)
+    play = compile_function(hc.play_cycles_in_real_time if realtime else hc.play_cycle_in_lockstep)
     port, buffers = make_closed_port(), hc.make_buffers(1, 1, 1, 1)
     play(port, buffers) if realtime else play(port, buffers, 0)  # fails at once, on a bus that is not there
     return play

@@ -74,7 +74,7 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
     number, effect, factor = job
     target = folder / f"{number:04d}"
     first_seed = 7200
-    healthy = draw_healthy_case(first_seed + number, effect)
+    healthy = sample_healthy_case(first_seed + number, effect)
     claimed = claim_size(healthy, effect, target / "healthy")
     row: Row = {"case": number, "effect": effect, "factor": factor, "sources": sources,
                 "claimed": claimed if math.isfinite(claimed) else None, "verdict": "NOT_CLAIMED", "found": None}
@@ -87,10 +87,10 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
                   "found": effect in answer["effects"] and answer["verdict"] != "NOT_RESOLVABLE"}
 
 
-def draw_healthy_case(seed: int, effect: str) -> cases.Case:
+def sample_healthy_case(seed: int, effect: str) -> cases.Case:
     """A healthy unit of a seed, with the known load that an effect needs."""
     load = hidden.CATALOGUE[effect].known_load
-    return cases.draw_case(seed, kind="nothing", level="bench")._replace(signals="xj,p12,xs", load=load)
+    return cases.sample_case(seed, kind="nothing", level="bench")._replace(signals="xj,p12,xs", load=load)
 
 
 def claim_size(case: cases.Case, effect: str, folder: Path) -> float:

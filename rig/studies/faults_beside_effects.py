@@ -78,14 +78,14 @@ def run_study(jobs: Sequence[Job], folder: Path, report_progress: Callable[[Batc
 
 def make_case(job: Job) -> cases.Case:
     """The unit of a job: bench-level scatter and noise, the faults, the other effect at a typical size."""
-    healthy = cases.draw_case(job.seed, kind="nothing", level="bench")
+    healthy = cases.sample_case(job.seed, kind="nothing", level="bench")
     symbols, effects = nominal_symbols() | healthy.plant, []
     for name, size in job.valve.items():
         changes = hidden.CATALOGUE[name].apply(size, symbols)
         effects.append(Hidden(name, size, changes, size, 0.0))
         symbols |= changes
     if job.other != "none":
-        effects.append(hidden.draw_hidden_effect(job.other, symbols, np.random.default_rng([job.seed, 17]), 0.5, 0.5))
+        effects.append(hidden.sample_hidden_effect(job.other, symbols, np.random.default_rng([job.seed, 17]), 0.5, 0.5))
     load = max((effect.known_load for effect in effects), default=0.0)
     return healthy._replace(kind="two", effects=tuple(effects), load=load)
 

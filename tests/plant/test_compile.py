@@ -16,7 +16,7 @@ from plant.compile import compile_function, compute_fingerprint, find_cache_fold
 from plant.controller import Loop, compute_current
 from plant.effects import load_effects
 from plant.model import build_initial_state
-from plant.run import draw_noise, iterate_noise
+from plant.run import iterate_noise, sample_noise
 
 COMMAND = np.r_[np.zeros(5), np.full(95, 1e-3), np.linspace(1e-3, -2e-3, 200)]
 
@@ -69,7 +69,7 @@ def test_seeds() -> None:
     one, same, other = (simulate(Model(), COMMAND, seed=seed).xj for seed in (1, 1, 2))
     assert (one == same).all() and (one != other).any()
     rows = iterate_noise(5)
-    assert (np.array([next(rows) for _ in range(200)]) == draw_noise(5, 200)).all()
+    assert (np.array([next(rows) for _ in range(200)]) == sample_noise(5, 200)).all()
 
 
 def test_flat_state_and_back(tmp_path: Path) -> None:

@@ -40,8 +40,8 @@ def print_hashes() -> None:
         "interpreted simulate, every effect": np.column_stack(
             simulate(activate_effects(EVERY), SWING[:40], steps=5, fast=False)),
         "interpreted Actuator, effects": run_actuator(some, False),
-        "lanes, closed loop": build_lanes(bare, 40).closed_loop(draw_values(40), SHORT, LOAD),
-        "lanes, replay, effects": build_lanes(some, 20).replay(draw_values(20), 5.0 * SWING, LOAD, SWING, 2.0),
+        "lanes, closed loop": build_lanes(bare, 40).closed_loop(sample_values(40), SHORT, LOAD),
+        "lanes, replay, effects": build_lanes(some, 20).replay(sample_values(20), 5.0 * SWING, LOAD, SWING, 2.0),
     }
     hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}
     print(json.dumps({name: found.hexdigest() for name, found in hashes.items()}))
@@ -70,7 +70,7 @@ def build_lanes(model: Model, runs: int) -> Lanes:
     return Lanes(model, ["filter.clogging", "spool.static_friction", "jack.damping"], steps=10)
 
 
-def draw_values(runs: int) -> np.ndarray:
+def sample_values(runs: int) -> np.ndarray:
     """Their parameters."""
     return np.random.default_rng(6).uniform([0.0, 5.0, 1e3], [0.6, 40.0, 9e3], (runs, 3))
 

@@ -18,7 +18,7 @@ HUM = 0.4  # amplitude over the level, 50 Hz
 SHORT = np.concatenate([build_command()[3800:5200], build_command()[9000:11600]])  # a ramp and a sine: 4 s
 
 
-def draw_noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
+def sample_noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
     """(rows, 3) noise of XJ, P12, XS at the nominal levels; "hum": XJ coloured, with 50 Hz at the same phase always."""
     rng = np.random.default_rng(seed)
     out = rng.standard_normal((rows, 3))
@@ -34,7 +34,7 @@ def record_plant(changes: dict[str, float] | None = None, com: np.ndarray = PREF
                  colour: str = "white", sensor: Callable[[float], float] | None = None, load: float = 0.0) -> Trace:
     """A trace of the nominal plant with some `changes`; `sensor` turns the ram's position into what is sensed."""
     model = Model().replace(QUIET | (changes or {}))
-    plant, n = Actuator(model), draw_noise(seed, len(com), colour).tolist()
+    plant, n = Actuator(model), sample_noise(seed, len(com), colour).tolist()
     state = plant._flat
     gain, limit = model["controller.proportional_gain"], model["controller.current_limit"]
     out, current = np.empty((len(com), 4)), 0.0

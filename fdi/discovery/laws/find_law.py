@@ -167,7 +167,7 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, hol
     errors = {}
     if holdout is not None:
         errors = {name: _measure(search, h, holdout) for name, h in (("base", base), ("catalogue", catalogue)) if h}
-    curve = None if law is None else draw_curve(law, search, base.effects)
+    curve = None if law is None else compute_law_curve(law, search, base.effects)
     said = law.floor if law is not None and law.holds else floor
     return LawSearch(missing, hidden, law, base, catalogue, errors, said, curve)
 
@@ -426,7 +426,7 @@ def remove_law(law: Law, effects: tuple[str, ...]) -> Hypothesis:
     return Hypothesis(effects, replace(fit, free=free, x=fit.x[kept]), {})
 
 
-def draw_curve(law: Law, search: Search, effects: tuple[str, ...]) -> LawCurve:
+def compute_law_curve(law: Law, search: Search, effects: tuple[str, ...]) -> LawCurve:
     """Bin means of what is missing without the law, and of the law, over the first term's state.
 
     `effects` are those that the law stands beside.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.simulated_units import draw_sensor_noise
+from fdi.diagnosis.simulated_units import sample_sensor_noise
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
@@ -77,7 +77,7 @@ def record_unit(com: Array, seed: int) -> Trace:
     rng, model = np.random.default_rng([seed, 1]), Model().replace(HIDDEN)
     sizes = {name: size for name, size in list_tolerance_sizes(model).items() if name not in HIDDEN}
     values = np.array([[model[name] + size * rng.standard_normal() for name, size in sizes.items()]])
-    noise = [draw_sensor_noise(rng, model, len(com)) for _ in range(3)]
+    noise = [sample_sensor_noise(rng, model, len(com)) for _ in range(3)]
     noise = [x * model[f"sensors.{name}_noise"] / model["sensors.position_noise"]
              for x, name in zip(noise, ("position", "pressure", "spool"), strict=True)]
     run = Lanes(model, list(sizes), 100).closed_loop(values, com - noise[0], np.zeros(len(com)))[0].T

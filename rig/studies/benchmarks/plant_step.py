@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plant import Model, simulate
 from plant.model import STEPS, build_kernel
-from plant.run import draw_noise
+from plant.run import sample_noise
 from plant.solve import run_closed_loop
 from rig.studies.benchmarks.rivals import FLAGS, SAME_ROUNDING, build_library, find_gcc
 from rig.studies.benchmarks.stopwatch import Work, measure_durations
@@ -53,7 +53,7 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
     """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
     if not find_gcc():
         return None
-    model, draws = Model(), draw_noise(0, len(command))
+    model, draws = Model(), sample_noise(0, len(command))
     with tempfile.TemporaryDirectory() as folder:
         runs, outs = {}, {}
         runs["python"], outs["python"] = _make_python_run(model, command, draws, steps)

@@ -78,7 +78,7 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
         InputError: values that contradict each other, or a fault or change that the chosen simulator does not have.
     """
     com = np.round(command.preflight_command(), 12)
-    random_parts = draw_random_parts(case, len(com), spec["colour"], spec["hum"])
+    random_parts = sample_random_parts(case, len(com), spec["colour"], spec["hum"])
     provenance = {"source": case.label, "seed": str(case.seed)}
     if spec["simulator"] == "independent":
         columns = _simulate_independently(case, model, com, random_parts)
@@ -90,7 +90,7 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
                     provenance)
 
 
-def draw_random_parts(case: Case, cycles: int, colour: float, hum: float) -> RandomParts:
+def sample_random_parts(case: Case, cycles: int, colour: float, hum: float) -> RandomParts:
     """Scatter and noise, drawn as in the blind trial.
 
     Another label gives other random numbers. Another tolerance gives the same, so that a unit is comparable with
@@ -98,8 +98,8 @@ def draw_random_parts(case: Case, cycles: int, colour: float, hum: float) -> Ran
     """
     rng = np.random.default_rng([case.seed, 11, zlib.crc32(case.label.encode())])
     nominal = truth.nominal_symbols()
-    symbols = cases.draw_healthy_plant(case.tolerance, rng)
-    position = cases.draw_position_noise(cycles, cases.BenchLevel(case.tolerance, colour, hum), rng)
+    symbols = cases.sample_healthy_plant(case.tolerance, rng)
+    position = cases.sample_position_noise(cycles, cases.BenchLevel(case.tolerance, colour, hum), rng)
     noise = np.column_stack([position / cases.FLOORS["xj"], rng.standard_normal((cycles, NOISES - 1))])
     return RandomParts({truth.SYMBOLS[symbol]: value / nominal[symbol] for symbol, value in symbols.items()}, noise)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fdi.trace.trace import Trace
 from rig.sequences.timing import PERIOD
 from rig.studies.trial import command
-from rig.studies.trial.cases import FLOORS, draw_healthy_plant
+from rig.studies.trial.cases import FLOORS, sample_healthy_plant
 from rig.studies.trial.truth import SYMBOLS, nominal_symbols, simulate_truth
 
 Array = NDArray[np.float64]
@@ -35,10 +35,10 @@ class Unit(NamedTuple):
         return {SYMBOLS[symbol]: value for symbol, value in self.plant.items()}
 
 
-def draw_actuator(seed: int, scatter: float = 0.015) -> dict[str, float]:
+def sample_actuator(seed: int, scatter: float = 0.015) -> dict[str, float]:
     """The parameters of an actuator about twice as large as the nominal one, by symbol, with the usual scatter."""
     rng = np.random.default_rng([seed, 11])
-    plant = nominal_symbols() | draw_healthy_plant(scatter, rng)
+    plant = nominal_symbols() | sample_healthy_plant(scatter, rng)
     for symbol, (low, high) in FACTORS.items():
         plant[symbol] *= float(np.exp(rng.uniform(np.log(low), np.log(high))))
     for symbol, (other, (low, high)) in FRICTION_RATIO.items():
@@ -50,14 +50,14 @@ def simulate_unit(seed: int) -> Unit:
     """A random actuator with its runs: the preflight's command; both end stops and a random command with known loads;
     and another random command with known loads, held out.
     """
-    plant = draw_actuator(seed)
+    plant = sample_actuator(seed)
     rng = np.random.default_rng([seed, 13])
     stop, force = 1.05 * plant["XJM"], 0.25 * plant["AJ"] * plant["PSR"]
     seconds = 1.0 + 2.0 * stop / 0.025
     stops = np.concatenate([np.zeros(500), np.full(round(500 * seconds), stop), np.full(round(1000 * seconds), -stop),
                             np.zeros(1000)])
-    commands = [command.preflight_command(), np.concatenate([stops, command.draw_holdout_command(rng)]),
-                command.draw_holdout_command(rng)]
+    commands = [command.preflight_command(), np.concatenate([stops, command.sample_holdout_command(rng)]),
+                command.sample_holdout_command(rng)]
     forces = (0.0, force, 0.5 * force)
     first, second, third = (_measure(plant, np.round(com, 12), f, [seed, 17, i])
                             for i, (com, f) in enumerate(zip(commands, forces, strict=True)))

@@ -44,7 +44,7 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
             problems.append(f"fuzz frames, {count.target}: does not work afterwards")
         if count.growth > most_growth:
             problems.append(f"fuzz frames, {count.target}: {count.growth >> 20} MiB more memory")
-    datagrams = fuzz_datagrams(frames // 10, seed, _draw_group(seed, 1), controller, progress) if frames else None
+    datagrams = fuzz_datagrams(frames // 10, seed, _sample_group(seed, 1), controller, progress) if frames else None
     if datagrams and datagrams.verdict != "PASS":
         problems.append(f"fuzz datagrams: a run afterwards is {datagrams.verdict or 'impossible'}")
     problems += [f"fuzz datagrams: {problem}" for problem in (datagrams.problems if datagrams else ())]
@@ -61,7 +61,7 @@ def run_study(frames: int, trials: int, minutes: float, seed: int, controller: s
                      for problem in one.problems]
         if done:
             rows.append(_summarise_trials(done))
-    soak = soak_bench(minutes, _draw_group(seed, 2), controller=controller, progress=progress) if minutes else None
+    soak = soak_bench(minutes, _sample_group(seed, 2), controller=controller, progress=progress) if minutes else None
     if soak:
         problems += [f"long operation: {problem}" for problem in (*soak.problems, *soak.find_growth())]
     return {"frames": [count._asdict() for count in counts], "datagrams": datagrams._asdict() if datagrams else None,
@@ -87,7 +87,7 @@ def _list_kinds() -> Iterator[tuple[str, str]]:
             yield action, "rig"
 
 
-def _draw_group(seed: int, what: int) -> str:
+def _sample_group(seed: int, what: int) -> str:
     return "239." + ".".join(str(number) for number in np.random.default_rng([seed, what]).integers(1, 255, 3))
 
 

@@ -56,8 +56,8 @@ class Case(NamedTuple):
     load: float  # N, known load
 
 
-def draw_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
-              sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
+def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
+                sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
     """The case of a seed.
 
     Args:
@@ -70,33 +70,33 @@ def draw_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), l
     """
     rng = np.random.default_rng([seed, 3])
     kind = kind or ("one" if effects else str(rng.choice(list(KINDS), p=list(KINDS.values()))))
-    random_level = _draw_level(rng)
+    random_level = _sample_level(rng)
     bench = LEVELS[level] if level else random_level
     signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
-    plant = draw_healthy_plant(bench.scatter, rng)
+    plant = sample_healthy_plant(bench.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
-    drawn = tuple(hidden.draw_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
-                  for name in effects or _draw_effect_names(kind, rng))
+    drawn = tuple(hidden.sample_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
+                  for name in effects or _sample_effect_names(kind, rng))
     load = max((effect.known_load for effect in drawn), default=0.0)
     is_loaded = rng.random() < 0.1 and bench.scatter > 0  # one in ten of the cases that do not need a known load
     random_load = float(rng.uniform(2000, 8000)) if is_loaded else 0.0
     return Case(seed, kind, drawn, signals, bench, plant, load or random_load)
 
 
-def draw_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
+def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
     """The parameters of a healthy plant, by symbol; `spread` is their relative standard deviation about nominal."""
     nominal = nominal_symbols()
     return {symbol: nominal[symbol] * (1 + spread * rng.standard_normal()) for symbol in SCATTERED_SYMBOLS}
 
 
-def _draw_level(rng: np.random.Generator) -> BenchLevel:
+def _sample_level(rng: np.random.Generator) -> BenchLevel:
     """A scatter of 0 to 2 %; white noise in one case of three, otherwise coloured noise with hum."""
     scatter, white = float(rng.uniform(0, 0.02)), rng.random() < 1 / 3
     colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
     return BenchLevel(scatter, 0.0, 0.0) if white else BenchLevel(scatter, colour, hum)
 
 
-def _draw_effect_names(kind: str, rng: np.random.Generator) -> list[str]:
+def _sample_effect_names(kind: str, rng: np.random.Generator) -> list[str]:
     """The names of a kind's hidden effects, without pairs that cannot be hidden together."""
     if kind == "nothing":
         return []
@@ -128,15 +128,15 @@ def measure_case(case: Case, name: str) -> Measured:
     """The trace `name` ("est", "repeat" or "holdout") of a case as its bench records it."""
     turn = ("est", "repeat", "holdout").index(name)
     rng = np.random.default_rng([case.seed, 5, turn])
-    com = np.round(command.draw_holdout_command(rng) if name == "holdout" else command.preflight_command(), 12)
+    com = np.round(command.sample_holdout_command(rng) if name == "holdout" else command.preflight_command(), 12)
     n = len(com)
-    noise = {"xj": draw_position_noise(n, case.level, rng)}
+    noise = {"xj": sample_position_noise(n, case.level, rng)}
     noise |= {signal: FLOORS[signal] * rng.standard_normal(n) for signal in ("p12", "xs")}
     run = simulate_truth(com, list_changed_symbols(case), noise["xj"], command.known_load_profile(n, case.load))
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
 
 
-def draw_position_noise(n: int, level: BenchLevel, rng: np.random.Generator) -> Array:
+def sample_position_noise(n: int, level: BenchLevel, rng: np.random.Generator) -> Array:
     """Noise of the position sensor, (n,) m: first-order noise with the RMS of the noise floor, and hum of 50 Hz."""
     white, colour = FLOORS["xj"] * rng.standard_normal(n), level.colour
     noise, last = np.empty(n), float(white[0])
@@ -223,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     for seed in range(args.seed, args.seed + args.count):
         kind = args.kind or ("two" if len(args.effect) > 1 else None)
-        case = draw_case(seed, kind, args.effect, args.level, tuple(args.sizes))
+        case = sample_case(seed, kind, args.effect, args.level, tuple(args.sizes))
         write_case(case, args.out / f"{seed:04d}")
         print(f"{seed:04d} {case.kind}: {', '.join(f'{e.name} {e.size:.4g}' for e in case.effects)}", flush=True)
     return 0

@@ -28,7 +28,7 @@ def preflight_command() -> Array:
         _ramp(MM, 0, 2), _hold(0, 0.5), 3 * MM * np.sin(2 * np.pi * t), chirp, _hold(0, 0.5)])
 
 
-def draw_holdout_command(rng: np.random.Generator) -> Array:
+def sample_holdout_command(rng: np.random.Generator) -> Array:
     """A random command of six steps, ramps and sines, (n,) m, 7 to 14 s."""
     level, parts = 0.0, [_hold(0, 0.4)]
     for _ in range(6):

@@ -41,8 +41,8 @@ class Hidden(NamedTuple):
     known_load: float
 
 
-def draw_hidden_effect(name: str, plant: Symbols, rng: np.random.Generator, low: float = 0.0, high: float = 1.0
-                       ) -> Hidden:
+def sample_hidden_effect(name: str, plant: Symbols, rng: np.random.Generator, low: float = 0.0, high: float = 1.0
+                         ) -> Hidden:
     """Effect `name` on the plant; its random size is between the fractions `low` and `high` of a logarithmic range."""
     law = (CATALOGUE | OUTSIDE)[name]
     size = law.low * (law.high / law.low) ** float(rng.uniform(low, high))

@@ -90,7 +90,7 @@ def prepare_case(seed: int, folder: Path) -> Path:
     if not target.exists():
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
-        cases.write_case(cases.draw_case(seed), part)
+        cases.write_case(cases.sample_case(seed), part)
         part.rename(target)
     return target
 

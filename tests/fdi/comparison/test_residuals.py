@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from noisy_traces import LEVELS, draw_noise, record_healthy
+from noisy_traces import LEVELS, record_healthy, sample_noise
 
 from fdi.comparison.residuals import (
     WHITE,
@@ -41,7 +41,7 @@ def m(c: Trace) -> Motion:
 
 
 def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
-    return draw_noise(seed, rows)[:, 0] ** 2 / LEVELS[0] ** 2 + extra
+    return sample_noise(seed, rows)[:, 0] ** 2 / LEVELS[0] ** 2 + extra
 
 
 def test_derivatives_of_a_parabola() -> None:
@@ -97,7 +97,7 @@ def test_signals_are_weighed_by_their_floors() -> None:
 def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
     outside, reached, dependent = 0, 0, 0
     for seed in range(100, 120):  # not that of the trace, whose noise is in its own XJ
-        d = examine_residuals(c, {"xj": draw_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
+        d = examine_residuals(c, {"xj": sample_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
         outside += d.departs > d.allowed
         reached += any(abs(f.correlation) > f.bound for f in d.follows)
         dependent += bool(d.depends) and d.depends[0].share > 0.02
@@ -105,7 +105,7 @@ def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
 
 
 def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Motion) -> None:
-    r, repeat = (draw_noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
+    r, repeat = (sample_noise(seed, len(c), "hum")[:, 0] for seed in (1, 2))
     alone = examine_residuals(c, {"xj": r}, {}, m)["xj"]
     d = examine_residuals(c, {"xj": r}, {"xj": (r - repeat) / np.sqrt(2)}, m)["xj"]
     assert alone.departs > 5 * alone.allowed and d.departs < 3 * d.allowed
@@ -113,7 +113,7 @@ def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Mot
 
 
 def test_a_colour_is_taken_out() -> None:
-    x = draw_noise(1, 13_500, "hum")[:, 0]
+    x = sample_noise(1, 13_500, "hum")[:, 0]
     e = apply_whitener(x, fit_whitener(x))
     assert np.abs(np.corrcoef(e[1:], e[:-1])[0, 1]) < 0.03 < np.corrcoef(x[1:], x[:-1])[0, 1]
     assert (fit_whitener(np.zeros(100)) == WHITE).all() and np.isfinite(fit_whitener(np.sin(np.arange(500.0)))).all()

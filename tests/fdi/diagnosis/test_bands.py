@@ -21,7 +21,7 @@ from fdi.diagnosis.bands import (
 )
 from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands, parse_bands, save_bands
 from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import simulate_bands
+from fdi.diagnosis.learn_bands import make_bands_by_simulation
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
@@ -182,7 +182,7 @@ SHORT = (Hold(time=0.3), Step(to=2e-3, time=0.4), Ramp(to=3e-3, time=1.5), Hold(
 @cache
 def short_bands(force: float = 0.0) -> Bands:
     com = profile(SHORT).command
-    return simulate_bands(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
+    return make_bands_by_simulation(load_model(), com, np.full(len(com), force), 1e-3, count=64, faulty=48, seed=1)
 
 
 def test_any_command() -> None:
@@ -210,7 +210,7 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_command_that_shows_nothing() -> None:
     """A hold has no band."""
     with pytest.raises(InputError, match="steps or slow ramps"):
-        simulate_bands(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
+        make_bands_by_simulation(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
 
 
 def test_the_file(tmp_path: Path) -> None:

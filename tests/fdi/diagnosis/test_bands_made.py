@@ -11,7 +11,7 @@ import pytest
 from fdi.diagnosis.bands import judge_trace
 from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands
 from fdi.diagnosis.learn_bands import learn_bands
-from fdi.diagnosis.simulated_units import UnitKind, draw_sensor_noise, simulate_units
+from fdi.diagnosis.simulated_units import UnitKind, sample_sensor_noise, simulate_units
 from fdi.trace.trace import Trace
 from plant import InputError, load_model
 from plant.profile import build_profile as profile
@@ -96,7 +96,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_noise_of_the_healthy() -> None:
     """As large as the sensor's, of different colours, with hum: what false alarms are counted with."""
-    drawn = [draw_sensor_noise(np.random.default_rng(k), load_model(), 4000) for k in range(40)]
+    drawn = [sample_sensor_noise(np.random.default_rng(k), load_model(), 4000) for k in range(40)]
     sizes = np.array([x.std() for x in drawn])
     colours = np.array([np.corrcoef(x[:-1], x[1:])[0, 1] for x in drawn])
     assert sizes.min() > 1.6e-6 and sizes.max() < 3e-6

@@ -13,7 +13,7 @@ from fdi.diagnosis.bands import describe_other_model, list_design
 from fdi.diagnosis.bands_file import format_bands, load_default_bands, parse_bands
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.diagnosis.learn_bands import simulate_bands
+from fdi.diagnosis.learn_bands import make_bands_by_simulation
 from fdi.report.diagnosis_report import explain_grid
 from plant import InputError, Model
 
@@ -29,7 +29,7 @@ def test_faults_and_noise_are_no_other_design() -> None:
 def test_bands_remember_their_model_through_a_file() -> None:
     com = SHORT[:1400]
     model = Model().replace(OTHER)
-    made = parse_bands(format_bands(simulate_bands(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
+    made = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
     assert describe_other_model(made, model) == ""
     assert describe_other_model(made, model.replace({CLOGGING.parameter: 0.3})) == ""
     assert describe_other_model(made, Model()) == "the model eha with jack.mass = 150"

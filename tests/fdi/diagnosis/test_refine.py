@@ -55,7 +55,7 @@ def test_scatter_and_coloured_noise_of_an_independent_simulator() -> None:
     """A bench-level case of the blind trial, FSS 30 N: no tolerance of ours is at its centre."""
     if not truth.has_compiler():
         pytest.skip("needs gcc")
-    case = cases.draw_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
+    case = cases.sample_case(11, "one", ["spool_friction"], "bench", (0.5, 0.5))
     run = cases.measure_case(case, "est").trace
     columns = {name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}
     trace = record_plant({}).from_columns(columns, 1e-3, {})

@@ -28,7 +28,7 @@ from plant.state import Drag, Input, Line, State
 BY_NAME = {term.name: term for term in TERMS}
 
 
-def draw_states(seed: int = 0, n: int = 6000) -> dict[str, np.ndarray]:
+def sample_states(seed: int = 0, n: int = 6000) -> dict[str, np.ndarray]:
     """States as a run might have them: smooth, of usual sizes."""
     rng = np.random.default_rng(seed)
     t = np.arange(n) * 1e-3
@@ -57,7 +57,7 @@ def test_terms_are_well_formed() -> None:
                                   "friction_run_in", "leakage_root", "leakage_slope", "flow_square", "feedback_cube",
                                   "dead_band", "gain_drift", "ripple"])
 def test_the_regression_ranks_the_right_term_first(name: str) -> None:
-    term, states = BY_NAME[name], draw_states()
+    term, states = BY_NAME[name], sample_states()
     rng = np.random.default_rng(1)
     values: dict[str, float] = {name: 1.0}
     if term.shape is not None:
@@ -78,7 +78,7 @@ def test_the_regression_ranks_the_right_term_first(name: str) -> None:
 
 
 def test_what_the_residual_follows_is_tested_on_rows_that_the_curve_never_saw() -> None:
-    states, other = draw_states(2), draw_states(3)
+    states, other = sample_states(2), sample_states(3)
     names = ("position", "speed", "pressure", "spool", "current")
     rng = np.random.default_rng(5)
     there = {name: states[name] for name in names}
@@ -105,7 +105,7 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
     """Bit for bit: what was chosen with the library is what the file adds; at its off values it changes no bit."""
     terms = [BY_NAME[name] for name in LAWS[place]]
     values = {field: SIZES[field] for term in terms for field in term.fields}
-    states = draw_states(7, 300)
+    states = sample_states(7, 300)
     with registered_library(), restored_catalogue():
         (tmp_path / "law.py").write_text(write_effects({place: "own_law"}, terms, values, "A law."))
         assert load_effects(tmp_path / "law.py") == ["own_law"]

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from noisy_traces import LEVELS, draw_noise
+from noisy_traces import LEVELS, sample_noise
 
 from fdi.estimation.noise import find_floors, find_hum_lines, floor_from_data, floor_from_repeats, measure_quiet_level
 
@@ -11,7 +11,7 @@ ROWS = 13_500
 
 
 def pair(seed: int, colour: str, rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
-    first, second = (draw_noise(2 * seed + number, rows, colour)[:, 0] / LEVELS[0] for number in (0, 1))
+    first, second = (sample_noise(2 * seed + number, rows, colour)[:, 0] / LEVELS[0] for number in (0, 1))
     return first, second
 
 
@@ -68,7 +68,7 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
 
 def test_more_repeats_say_the_same_with_less_doubt() -> None:
     def scatter(count: int) -> float:
-        return float(np.std([floor_from_repeats(draw_noise(10 * s, 2000)[:, 0], [draw_noise(10 * s + i, 2000)[:, 0]
+        return float(np.std([floor_from_repeats(sample_noise(10 * s, 2000)[:, 0], [sample_noise(10 * s + i, 2000)[:, 0]
                                                                       for i in range(1, count + 1)]).value
                              for s in range(20)]))
 
@@ -88,7 +88,7 @@ def test_gaps_and_other_lengths() -> None:
 
 def test_second_differences_are_a_lower_bound() -> None:
     slow = 1e3 * np.sin(np.arange(ROWS) / 200)
-    white, coloured = (draw_noise(5, ROWS, colour)[:, 0] / LEVELS[0] for colour in ("white", "hum"))
+    white, coloured = (sample_noise(5, ROWS, colour)[:, 0] / LEVELS[0] for colour in ("white", "hum"))
     assert floor_from_data(white + slow).value == pytest.approx(1.0, abs=0.05)
     assert floor_from_data(coloured + slow).value < 0.6
     assert floor_from_data(white).lower_bound and floor_from_data(np.array([1.0, 2.0])).value == 0.0

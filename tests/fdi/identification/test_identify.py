@@ -22,7 +22,7 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 from rig.cli.main import main
-from rig.studies.identification.actuators import draw_actuator
+from rig.studies.identification.actuators import sample_actuator
 from rig.studies.trial.truth import SYMBOLS, has_compiler, simulate_truth
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="no gcc for the independent simulator")
@@ -32,14 +32,14 @@ SIZED = ("AJ", "XJM", "GQ", "PSR", "MJ", "GAP")  # what differs from nominal in 
 MM = 1e-3
 
 
-def draw_plant() -> dict[str, float]:
-    drawn = draw_actuator(5, scatter=0.0)
+def sample_plant() -> dict[str, float]:
+    drawn = sample_actuator(5, scatter=0.0)
     return {symbol: drawn[symbol] for symbol in SIZED}
 
 
 def measure(com: np.ndarray, load: np.ndarray, seed: int, name: str) -> Trace:
     rng, n = np.random.default_rng(seed), len(com)
-    run = simulate_truth(com, draw_plant(), 2e-6 * rng.standard_normal(n), load)
+    run = simulate_truth(com, sample_plant(), 2e-6 * rng.standard_normal(n), load)
     noise = {"p12": 2e4 * rng.standard_normal(n), "xs": 1e-6 * rng.standard_normal(n)}
     columns = run._asdict() | {"p12": run.p12 + noise["p12"], "xs": run.xs + noise["xs"]}
     return Trace.from_columns(columns, 1e-3, {"source": name})
@@ -50,7 +50,7 @@ def runs() -> tuple[Trace, Trace, Trace]:
     """Without load; against both end stops with a known load; held out."""
     t = np.arange(2500) * 1e-3
     wave = np.where(t < 0.3, 0.0, 4 * MM * np.sin(2 * np.pi * (t + t**2)))
-    stop = 1.05 * draw_plant()["XJM"]
+    stop = 1.05 * sample_plant()["XJM"]
     stops = np.repeat([0.0, stop, -stop, 0.0], [200, 1400, 2000, 400])
     load = np.where((np.arange(4000) > 600) & (np.arange(4000) < 2600), 6e3, 0.0)
     last = np.repeat([0.0, 3 * MM, -5 * MM, 1 * MM], [200, 600, 600, 600])
@@ -71,13 +71,13 @@ def found(runs: tuple[Trace, Trace, Trace]) -> Identification:
 
 
 def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None:
-    truth = {SYMBOLS[symbol]: value for symbol, value in draw_plant().items()}
+    truth = {SYMBOLS[symbol]: value for symbol, value in sample_plant().items()}
     assert found.verdict == "IDENTIFIED", found.reason
     assert all(e.low <= truth[e.name] <= e.high for e in found.estimates)
     assert all((e.high - e.low) < 0.1 * e.value for e in found.estimates)
     assert max(e.ratio for e in found.holdouts) <= 1.1
     assert max(e.before["p12"] / e.floor["p12"] for e in found.holdouts) > 5.0
-    assert found.model["controller.proportional_gain"] == pytest.approx(draw_plant()["GAP"], rel=1e-5)
+    assert found.model["controller.proportional_gain"] == pytest.approx(sample_plant()["GAP"], rel=1e-5)
 
 
 def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identification) -> None:
@@ -189,7 +189,7 @@ def test_run_at_rest_identifies_nothing() -> None:
 def test_regressions_find_size_and_controller(runs: tuple[Trace, Trace, Trace]) -> None:
     model = load_model()
     own = collect_identification_runs(model, parse_free_parameters(FREE, model, "test"), runs[:2], [])
-    begun, truth = estimate_by_regressions(own.fitted, model), draw_plant()
+    begun, truth = estimate_by_regressions(own.fitted, model), sample_plant()
     for name, symbol in (("jack.area", "AJ"), ("valve.flow_gain", "GQ"), ("jack.travel", "XJM")):
         assert begun[name] == pytest.approx(truth[symbol], rel=0.15), name
     gains = read_controller(own.fitted)

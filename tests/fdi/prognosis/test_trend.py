@@ -91,7 +91,7 @@ def test_the_future_has_the_spread_of_the_wander() -> None:
     """An integrated Wiener process, conditioned on nothing but its value and slope, spreads as its closed form says."""
     rng = np.random.default_rng(0)
     for kind, variance in (("wiener", 0.09 * remaining_life.AHEAD), ("integrated", 0.09 * remaining_life.AHEAD ** 3)):
-        moved = remaining_life._draw_wander(kind, 0.3, np.zeros(4000), rng)
+        moved = remaining_life._sample_wander(kind, 0.3, np.zeros(4000), rng)
         assert moved.std(axis=0)[1:] == pytest.approx(np.sqrt(variance)[1:], rel=0.08)
 
 

@@ -281,7 +281,7 @@ def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
     broken = cases.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
     assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
     assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
-    chance = [cases.draw_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
+    chance = [cases.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
     assert np.std([x.scatter[SYMBOLS["GQ"]] for x in chance]) == pytest.approx(0.015, rel=0.3)
     noise = chance[0].noise
     assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)

@@ -17,7 +17,7 @@ def test_the_hidden_size_is_the_claimed_one_in_the_unit_of_the_fit(effect: str) 
     first = CATALOGUE[effect].fitted[0]
     off = CATALOGUE[effect].off.get(first, Model().kind.nominal.get(first, 0.0))
     size = 0.3 * min(abs(start[first] - off) for start in CATALOGUE[effect].starts)
-    healthy = detectable_sizes.draw_healthy_case(1, effect)
+    healthy = detectable_sizes.sample_healthy_case(1, effect)
     (hidden,) = detectable_sizes.hide_effect(healthy, effect, size).effects
     assert hidden.value == pytest.approx(off + size)
     shown = {"jack_friction": "FSJ", "viscous_drag": "CJ", "moving_mass": "MJ", "spool_friction": "FSS",

@@ -67,7 +67,7 @@ def test_commands_and_loads_are_those_of_the_practice_traces() -> None:
 
 def test_hold_outs_are_random_commands_within_the_stroke() -> None:
     rng = np.random.default_rng(1)
-    made = [command.draw_holdout_command(rng) for _ in range(50)]
+    made = [command.sample_holdout_command(rng) for _ in range(50)]
     assert all(5000 < len(com) < 40_000 and np.abs(com).max() < 10e-3 and com[-1] == 0 for com in made)
     assert len({len(com) for com in made}) > 40
 
@@ -85,7 +85,7 @@ def test_a_hidden_effect_shows_and_grows(name: str) -> None:
     load = command.known_load_profile(len(com), 6000.0)
     bare, shown = simulate_truth(com, {}, load=load, steps=200), []
     for part in (0.3, 1.0):
-        effect = hidden.draw_hidden_effect(name, nominal_symbols(), np.random.default_rng(2), part, part)
+        effect = hidden.sample_hidden_effect(name, nominal_symbols(), np.random.default_rng(2), part, part)
         changes = {key: value for key, value in effect.changes.items() if key in parameter_names()}
         assert changes.keys() | set(hidden.NOT_SIMULATED) >= effect.changes.keys()
         run = simulate_truth(com, changes, load=load, steps=200)
@@ -113,7 +113,7 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     load = command.known_load_profile(len(com), 6000.0)
     drive = simulate_truth(com, {}, load=load).cor
     # of a signed effect one seed gives the sign -, one +
-    drawn = [hidden.draw_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
+    drawn = [hidden.sample_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
              for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
     drawn = [effect for effect in drawn if effect.name != "command_rate_limit"]  # not in the plant
     model = Model().with_effects(effect.name for effect in drawn)
@@ -130,8 +130,8 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
 
 
 def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
-    case = cases.draw_case(11, level="bench")
-    assert str(case) == str(cases.draw_case(11, level="bench")) != str(cases.draw_case(12, level="bench"))
+    case = cases.sample_case(11, level="bench")
+    assert str(case) == str(cases.sample_case(11, level="bench")) != str(cases.sample_case(12, level="bench"))
     cases.write_case(case, tmp_path)
     again, holdout = cases.measure_case(case, "holdout").trace, read(tmp_path / "holdout.csv.gz")
     for name in ("com", "xj", "cor", "p12", "xs", "load"):
@@ -144,7 +144,7 @@ def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
 
 
 def test_kinds_are_drawn_as_often_as_they_should() -> None:
-    drawn = [cases.draw_case(seed) for seed in range(600)]
+    drawn = [cases.sample_case(seed) for seed in range(600)]
     for kind, share in cases.KINDS.items():
         assert sum(case.kind == kind for case in drawn) / 600 == pytest.approx(share, abs=0.06)
     assert {len(case.effects) for case in drawn if case.kind == "two"} == {2}
@@ -153,7 +153,7 @@ def test_kinds_are_drawn_as_often_as_they_should() -> None:
 
 
 def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
-    noise = cases.measure_case(cases.draw_case(5, "nothing", level="bench"), "est").noise
+    noise = cases.measure_case(cases.sample_case(5, "nothing", level="bench"), "est").noise
     xj, t = noise["xj"], np.arange(13_500) * 1e-3
     hum = abs(2 * np.mean(xj * np.exp(-2j * np.pi * 50 * t)))
     assert hum == pytest.approx(0.7e-6, abs=0.1e-6)
@@ -163,7 +163,7 @@ def test_the_noise_of_a_bench_is_coloured_and_hums() -> None:
 
 
 def test_nothing_hidden_leaves_no_trace_of_an_effect() -> None:
-    case = cases.draw_case(5, "nothing", level="bench")
+    case = cases.sample_case(5, "nothing", level="bench")
     ratios = cases.measure_effect_ratios(case, cases.measure_case(case, "est"), [])
     assert max(ratios.values()) < 1e-6
 
@@ -230,7 +230,7 @@ def knowing(est: Path, holdout: Path, repeats: Sequence[Path], signals: Sequence
 def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
     told: list[str] = []
     by = f"{__name__}:knowing"
-    seeds = [next(s for s in range(99) if cases.draw_case(s).kind == kind) for kind in ("one", "outside")]
+    seeds = [next(s for s in range(99) if cases.sample_case(s).kind == kind) for kind in ("one", "outside")]
     run_trial(by, seeds[:1], tmp_path, processes=1)
     with (tmp_path / "results.jsonl").open("a") as results:
         results.write('{"seed": 3, "cut')  # a process that was killed
