@@ -35,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--cases", type=int, default=200, metavar="N", help="number of cases (default: 200)")
     add("--seed", type=parse_whole_number, default=0, metavar="N",
         help="seed of the first case; each case uses the next seed (default: 0)")
+    add("--signals", metavar="NAMES",
+        help="measure these in every case: xj or xj,p12 or xj,p12,xs; a seed stays the same case otherwise "
+             "(default: random)")
     add("--jobs", type=int, default=2, metavar="N", help="cases at a time; use 1 for reliable timings (default: 2)")
     add("--folder", metavar="DIR", help="keep cases and answers there; an interrupted trial resumes there")
     add = parser.add_argument_group("rig bench recordings").add_argument
@@ -178,7 +181,7 @@ def _run_trial(args: argparse.Namespace) -> int:
     """The blind trial; exit status 0 if every requested rate that was counted is reached, 1 otherwise.
 
     Raises:
-        InputError: no cases, no C compiler, or a place that cannot be written.
+        InputError: no cases, unknown signals, no C compiler, or a place that cannot be written.
     """
     import tempfile
     from pathlib import Path
@@ -206,7 +209,8 @@ def _run_trial(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(args.folder or temporary)
         seeds = range(args.seed, args.seed + args.cases)
-        figures = summarise_trial(run_trial(RIG_EXPLAIN, seeds, folder, args.jobs, report_progress))
+        rows = run_trial(RIG_EXPLAIN, seeds, folder, args.jobs, report_progress, args.signals)
+        figures = summarise_trial(rows)
     if args.out is not None:
         write_text(args.out, json.dumps(figures, indent=1) + "\n")
     show_answer(build_trial_report(figures), args)

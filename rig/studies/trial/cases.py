@@ -57,7 +57,7 @@ class Case(NamedTuple):
 
 
 def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (), level: str | None = None,
-                sizes: tuple[float, float] = (0.0, 1.0)) -> Case:
+                sizes: tuple[float, float] = (0.0, 1.0), signals: str | None = None) -> Case:
     """The case of a seed.
 
     Args:
@@ -67,12 +67,14 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
         level: one of LEVELS; default: random.
         sizes: the fractions of an effect's logarithmic range that its size is drawn from. Of two effects both are in
             the upper half of their range.
+        signals: the measured signals, one of SIGNALS; default: random. They are drawn all the same, so that nothing
+            else about the case depends on this choice.
     """
     rng = np.random.default_rng([seed, 3])
     kind = kind or ("one" if effects else str(rng.choice(list(KINDS), p=list(KINDS.values()))))
     random_level = _sample_level(rng)
     bench = LEVELS[level] if level else random_level
-    signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
+    random_signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
     plant = sample_healthy_plant(bench.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
     drawn = tuple(hidden.sample_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
@@ -80,7 +82,7 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
     load = max((effect.known_load for effect in drawn), default=0.0)
     is_loaded = rng.random() < 0.1 and bench.scatter > 0  # one in ten of the cases that do not need a known load
     random_load = float(rng.uniform(2000, 8000)) if is_loaded else 0.0
-    return Case(seed, kind, drawn, signals, bench, plant, load or random_load)
+    return Case(seed, kind, drawn, signals or random_signals, bench, plant, load or random_load)
 
 
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
@@ -218,12 +220,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--effect", action="append", default=[], choices=[*hidden.CATALOGUE, *hidden.OUTSIDE],
                         help="the hidden effect; give it twice to hide two")
     parser.add_argument("--level", choices=list(LEVELS), help="scatter and noise of the bench (default: random)")
+    parser.add_argument("--signals", choices=list(SIGNALS), help="the measured signals (default: random)")
     parser.add_argument("--sizes", type=float, nargs=2, default=(0.0, 1.0), metavar=("LOW", "HIGH"),
                         help="fractions of the logarithmic range of sizes (default: 0 1)")
     args = parser.parse_args(arguments)
     for seed in range(args.seed, args.seed + args.count):
         kind = args.kind or ("two" if len(args.effect) > 1 else None)
-        case = sample_case(seed, kind, args.effect, args.level, tuple(args.sizes))
+        case = sample_case(seed, kind, args.effect, args.level, tuple(args.sizes), args.signals)
         write_case(case, args.out / f"{seed:04d}")
         print(f"{seed:04d} {case.kind}: {', '.join(f'{e.name} {e.size:.4g}' for e in case.effects)}", flush=True)
     return 0

@@ -1,7 +1,8 @@
 """The blind trial's cases through an explanation, on the resumable runner.
 
-The folder holds results.jsonl, one row per finished case, and the cases' traces. A row counts only for the sources it
-was made with; the folder of the traces is named after a hash of the code that makes them.
+The folder holds results.jsonl, one row per finished case, and the cases' traces. A row counts only for the sources and
+the choice of signals it was made with; the folder of the traces is named after that choice and a hash of the code that
+makes them.
 """
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.sources import hash_sources, import_function
+from plant.errors import InputError
 from rig.network.clock import WallClock
 from rig.studies.resumable.batch import Batch, BatchProgress, Workers, run_batch
 from rig.studies.resumable.row_file import Row, RowFile
@@ -27,41 +29,52 @@ CASE_SOURCES = tuple(f"rig/studies/trial/{name}" for name in ("truth.c", "truth.
 
 
 def run_trial(explain: str, seeds: Sequence[int], folder: Path, processes: int = 2,
-              report_progress: Callable[[BatchProgress], None] = lambda _: None) -> list[Row]:
+              report_progress: Callable[[BatchProgress], None] = lambda _: None, signals: str | None = None
+              ) -> list[Row]:
     """The rows of the cases of `seeds`, in their order; cases with a row in `folder` are not done again.
 
-    `explain` names the explanation as "module:function", because other processes have to import it.
+    Args:
+        explain: names the explanation as "module:function", because other processes have to import it.
+        seeds: of the cases.
+        folder: for rows and traces.
+        processes: cases at a time.
+        report_progress: called after each finished case.
+        signals: what is measured in every case, one of `cases.SIGNALS`; default: random, from the seed.
 
     Raises:
-        InputError: there is no such function, no C compiler, or the folder cannot be made.
+        InputError: there is no such function, there are no such signals, no C compiler, or the folder cannot be made.
     """
     load_explain(explain)
+    if signals is not None and signals not in cases.SIGNALS:
+        raise InputError("--signals", signals, " or ".join(cases.SIGNALS))
     truth.parameter_names()  # compile the simulator before several processes need it
     with RowFile(folder / RESULTS) as file:
-        rows = run_batch(plan_batch(explain, seeds, folder), file, Workers(processes), report_progress)
+        rows = run_batch(plan_batch(explain, seeds, folder, signals), file, Workers(processes), report_progress)
     return list(rows.values())
 
 
-def plan_batch(explain: str, seeds: Sequence[int], folder: Path) -> Batch:
-    """The cases of `seeds` as a batch."""
+def plan_batch(explain: str, seeds: Sequence[int], folder: Path, signals: str | None) -> Batch:
+    """The cases of `seeds` as a batch; `signals` are those of every case, None if they are random."""
     sources = hash_trial_sources()
 
     def describe_failure(seed: int, reason: str) -> Row:
-        return make_row(explain, seed, read_truth(prepare_case(seed, folder)), describe_crash(reason), 0.0)
+        hidden = read_truth(prepare_case(seed, folder, signals))
+        return make_row(explain, seed, signals, hidden, describe_crash(reason), 0.0)
 
     def is_valid(row: Row) -> bool:
-        return bool(row["sources"] == sources and row["by"] == explain)
+        return bool(row["sources"] == sources and row["by"] == explain and row["signals"] == signals)
 
     def is_failed(row: Row) -> bool:
         return bool(row["answer"]["verdict"] == "CRASHED")
 
-    return Batch(jobs={seed: seed for seed in seeds}, work=partial(explain_case, explain=explain, folder=folder),
-                 key="seed", describe_failure=describe_failure, is_valid=is_valid, is_failed=is_failed)
+    work = partial(explain_case, explain=explain, folder=folder, signals=signals)
+    return Batch(jobs={seed: seed for seed in seeds}, work=work, key="seed", describe_failure=describe_failure,
+                 is_valid=is_valid, is_failed=is_failed)
 
 
-def explain_case(seed: int, explain: str, folder: Path) -> Row:
+def explain_case(seed: int, explain: str, folder: Path, signals: str | None) -> Row:
     """Explain one case: its truth, the shortened answer and the time it took. A crash is an answer as well."""
-    case = prepare_case(seed, folder)
+    case = prepare_case(seed, folder, signals)
     hidden = read_truth(case)
     clock = WallClock()
     start = clock.now()
@@ -70,13 +83,14 @@ def explain_case(seed: int, explain: str, folder: Path) -> Row:
                                                       [case / "repeat.csv.gz"], hidden["signals"].split(",")))
     except Exception as error:
         answer = describe_crash(f"{type(error).__name__}: {error}")
-    return make_row(explain, seed, hidden, answer, (clock.now() - start) * 1e-9)
+    return make_row(explain, seed, signals, hidden, answer, (clock.now() - start) * 1e-9)
 
 
-def make_row(explain: str, seed: int, hidden: Mapping[str, Any], answer: Mapping[str, Any], seconds: float) -> Row:
-    """One line of results.jsonl."""
-    return {"seed": seed, "by": explain, "sources": hash_trial_sources(), "truth": hidden, "answer": answer,
-            "seconds": seconds}
+def make_row(explain: str, seed: int, signals: str | None, hidden: Mapping[str, Any], answer: Mapping[str, Any],
+             seconds: float) -> Row:
+    """One line of results.jsonl; `signals` are those asked for in every case, `hidden` has those of this case."""
+    return {"seed": seed, "by": explain, "sources": hash_trial_sources(), "signals": signals, "truth": hidden,
+            "answer": answer, "seconds": seconds}
 
 
 def describe_crash(reason: str) -> dict[str, Any]:
@@ -84,13 +98,14 @@ def describe_crash(reason: str) -> dict[str, Any]:
     return {"verdict": "CRASHED", "effects": [], "error": reason}
 
 
-def prepare_case(seed: int, folder: Path) -> Path:
-    """The folder with the traces of a seed; they are made if they are missing."""
-    target = folder / f"cases-{hash_sources(*CASE_SOURCES)[:8]}" / f"{seed:05d}"
+def prepare_case(seed: int, folder: Path, signals: str | None) -> Path:
+    """The folder with the traces of a seed; they are made if they are missing. `signals`: None if they are random."""
+    chosen = f"-{signals.replace(',', '-')}" if signals else ""
+    target = folder / f"cases-{hash_sources(*CASE_SOURCES)[:8]}{chosen}" / f"{seed:05d}"
     if not target.exists():
         part = target.with_name(target.name + ".part")
         shutil.rmtree(part, ignore_errors=True)
-        cases.write_case(cases.sample_case(seed), part)
+        cases.write_case(cases.sample_case(seed, signals=signals), part)
         part.rename(target)
     return target
 

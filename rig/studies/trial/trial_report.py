@@ -26,7 +26,12 @@ def _describe_hidden(sizes: Mapping[str, float]) -> str:
 def build_trial_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.studies.trial.trial_score.summarise_trial`, which are its `data`."""
     missed = [rate["name"].strip() for rate in figures["rates"] if rate["of"] and not rate["met"]]
-    sentence = f"{len(missed)} rates are not met: {'; '.join(missed)}." if missed else "Every counted rate is met."
+    if missed:
+        sentence = f"{len(missed)} rates are not met: {'; '.join(missed)}."
+    elif any(rate["of"] for rate in figures["rates"]):
+        sentence = "Every counted rate is met."
+    else:
+        sentence = "No rate is required of them: in none are all three signals measured."
     return Report(
         command="bench", title="blind trial of rig explain", sentence=f"{figures['cases']} cases. {sentence}",
         sections=[Section("Rates", [_tabulate_rates(figures["rates"]), _tabulate_by_signals(figures["by_signals"])]),

@@ -143,6 +143,14 @@ def test_a_case_repeats_by_its_seed(tmp_path: Path) -> None:
     assert len(est) == 13_500 and (est.com == repeat.com).all() and not (est.xj == repeat.xj).any()
 
 
+def test_chosen_signals_change_nothing_else_about_a_case() -> None:
+    for seed in range(30):
+        random = cases.sample_case(seed)
+        for signals in cases.SIGNALS:
+            chosen = cases.sample_case(seed, signals=signals)
+            assert chosen.signals == signals and str(chosen._replace(signals=random.signals)) == str(random)
+
+
 def test_kinds_are_drawn_as_often_as_they_should() -> None:
     drawn = [cases.sample_case(seed) for seed in range(600)]
     for kind, share in cases.KINDS.items():
@@ -239,6 +247,21 @@ def test_a_trial_is_taken_up_where_it_was_left(tmp_path: Path) -> None:
     assert [r["answer"]["verdict"] for r in records] == ["EXPLAINED", "CRASHED"]
     assert "out of my depth" in records[1]["answer"]["error"]
     assert len(told) == 1 and told[0].startswith("2/2")
+
+
+def test_a_folder_does_not_mix_choices_of_signals(tmp_path: Path) -> None:
+    by, seed = f"{__name__}:knowing", next(s for s in range(99) if cases.sample_case(s).signals == "xj")
+    for choices, done in ((None, 1), ("xj,p12,xs", 2), ("xj,p12,xs", 2), ("xj", 3)):
+        (row,) = run_trial(by, [seed], tmp_path, processes=1, signals=choices)
+        assert row["truth"]["signals"] == (choices or "xj")
+        assert sum(len(tally.read_text()) for tally in tmp_path.glob("cases-*/tally")) == done
+
+
+def test_signals_that_no_bench_measures_are_refused_in_one_line(tmp_path: Path) -> None:
+    said = rig("bench", "explain", "--cases", 1, "--signals", "xj,pressure", "--folder", tmp_path / "trial")
+    assert said.status == 2
+    assert said.err == "rig bench: --signals: xj,pressure: expected xj or xj,p12 or xj,p12,xs\n"
+    assert not (tmp_path / "trial").exists()
 
 
 def test_an_explanation_that_is_not_there_is_said_in_one_line() -> None:
