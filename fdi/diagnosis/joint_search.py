@@ -34,7 +34,6 @@ from fdi.diagnosis.refine import (
     make_start,
     measure_ratios,
     report_fit,
-    scale_noise,
 )
 from fdi.discovery.candidates import list_fitted_parameters
 from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
@@ -42,7 +41,8 @@ from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation.final_rounds import descend_valley, guess_covariance, linearise_across
 from fdi.estimation.fit import Fit
 from fdi.estimation.judgement import judge_on_all
-from fdi.estimation.likelihood import Free
+from fdi.estimation.likelihood import Free, scale_noise
+from fdi.estimation.population import follow_population
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import FITTED_RUN_WORST, FURTHER_EFFECT_SHARE, GAIN_CONVINCES, GAIN_TIE, GAIN_WORTH_A_FIT
@@ -120,6 +120,9 @@ def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole:
     return Explanation(effects, values, found)
 
 
+# factor on the noise and generations of a search by a population
+POPULATION_STAGES = ((30.0, 40), (6.0, 40), (1.0, 40))
+
 Named = tuple[tuple[str, ...], Fit]
 """Effects beside the faults, and the fit with them."""
 
@@ -183,8 +186,11 @@ class JointSearch:
         if count == 1:
             # The forecast from a start that nobody has fitted is poor beside a finished fit. Where that fit leaves more
             # than noise, a fault may have made up for the effect in it, so both lists count, each by itself.
-            prospects.append(self.scan(self.start_afresh(), effects, fit.cost if is_enough else np.inf))
-        worth = _interleave(prospects, 8 if count == 1 else 5)
+            afresh = self.start_afresh()
+            prospects.append(self.scan(afresh, effects, fit.cost if is_enough else np.inf))
+            if not is_enough:
+                prospects.append(self.scan_with_more_noise(afresh, effects))
+        worth = _interleave(prospects, (8 if is_enough else 10) if count == 1 else 5)
         if not worth:
             return []
         named = ", ".join(dict.fromkeys(p.effect for p in worth))
@@ -201,6 +207,16 @@ class JointSearch:
         """The effects that promise to gain on this fit and to come below the cost `most`, best first."""
         least = min(fit.cost, most) - GAIN_WORTH_A_FIT
         return [p for p in scan_effects(self.problem, fit, effects, self.problem.workers) if p.cost < least]
+
+    def scan_with_more_noise(self, fit: Fit, effects: Sequence[str], factor: float = 30.0, rounds: int = 4
+                             ) -> list[Prospect]:
+        """The effects that promise to gain on this fit when the noise is taken for so many times as large.
+
+        Priors then hold the tolerances, and stops of the ram that are made or missed hardly count: what is left is the
+        course of the signals, in which an effect shows although no fit without it comes near them.
+        """
+        loud = JointSearch(scale_noise(self.problem, factor), effects, self.model, self.progress)
+        return loud.scan(loud.descend(fit, ((1.0, rounds),)), effects, np.inf)
 
     def start_afresh(self) -> Fit:
         """A unit with the best pair of faults and no other deviation: an effect may lead fits into a wrong valley."""
@@ -225,7 +241,38 @@ class JointSearch:
         alike: dict[frozenset[str], Named] = {}
         for each in sorted(done, key=_get_cost):
             alike.setdefault(frozenset(each[0]), each)
-        return self._begin_again(list(alike.values()))
+        return self._search_other_valleys(self._begin_again(list(alike.values())))
+
+    def _search_other_valleys(self, done: Sequence[Named], most: int = 2) -> list[Named]:
+        """The fits, the likeliest of them also from searches by populations while none leaves only noise.
+
+        Where static friction of the ram ends far off, no start on the way to a healthy unit leads out of that valley:
+        the frictions have to move together (`fdi.estimation.population`).
+        """
+        done = list(done)
+        ranked = sorted(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))[:most]
+        if any(is_noise_left(self.problem, fit) for _, fit in done):
+            return done
+        named = ", ".join(_describe(effects) for effects, _ in ranked)
+        self.progress(f"search of other valleys, {named}", 0.95)
+        seeds = range(len(ranked))
+        found = self.map_alone(lambda k: (ranked[k][0], self.search_widely(ranked[k][1], k)), seeds)
+        for before, after in zip(ranked, found, strict=True):
+            if after[1].cost < before[1].cost:
+                done[done.index(before)] = after
+        return done
+
+    def search_widely(self, fit: Fit, seed: int, steps: int = 10) -> Fit:
+        """The fit at which a population ends that begins at a unit with these faults and effects, otherwise healthy.
+
+        The population takes so many solver steps a cycle; its end is fitted with those of the problem.
+        """
+        coarse = replace(self.problem, steps=steps, workers=1, _lanes={})
+        begun = self._descend_in(coarse, replace(fit, x=self._place_home(fit)), 3, POPULATION_STAGES[0][0])
+        frictions = np.array([_get_friction_width(f) for f in fit.free])
+        spread = 9.0 * begun.covariance + np.diag(frictions**2)
+        end = follow_population(coarse, begun, spread, POPULATION_STAGES, seed, self._descend_in)
+        return self.descend(end, ((1.0, 8),))
 
     def _begin_again(self, done: Sequence[Named], most: int = 2) -> list[Named]:
         """The fits, the best of them also from other places; again as long as that changes which is best."""
@@ -255,19 +302,26 @@ class JointSearch:
 
     def restart(self, fit: Fit, part: float) -> Fit:
         """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
+        begun = replace(fit, x=fit.x + part * (self._place_home(fit) - fit.x), cost=np.inf)
+        return self.descend(begun, ((6.0, 4), (1.0, 8)))
+
+    def _place_home(self, fit: Fit) -> Floats:
+        """Scaled unknowns, (p,), of a unit with a fit's faults and effects and no other deviation."""
         home = make_start(fit.free, 0.0, FRICTION.healthy, estimate_offsets(self.problem))
         kept = [f.name in FAULT_PARAMETERS or not np.isfinite(f.prior) for f in fit.free]
         home[kept] = fit.x[kept]
-        begun = replace(fit, x=fit.x + part * (home - fit.x), cost=np.inf)
-        return self.descend(begun, ((6.0, 4), (1.0, 8)))
+        return home
 
     def descend(self, fit: Fit, schedule: Sequence[tuple[float, int]]) -> Fit:
         """The fit after rounds with the noise so many times as large: (factor, rounds) each."""
         for factor, rounds in schedule:
-            loud = scale_noise(self.problem, factor)
-            start = replace(fit, covariance=guess_joint_covariance(fit.free), cost=np.inf)
-            fit = descend_valley(replace(loud, workers=1, _lanes={}), start, rounds, self.find_flat(fit.free, fit.x))
+            fit = self._descend_in(replace(self.problem, workers=1, _lanes={}), fit, rounds, factor)
         return fit
+
+    def _descend_in(self, problem: CountedProblem, fit: Fit, rounds: int, factor: float) -> Fit:
+        """The fit to this problem after so many rounds, with its noise so many times as large."""
+        start = replace(fit, covariance=guess_joint_covariance(fit.free), cost=np.inf)
+        return descend_valley(scale_noise(problem, factor), start, rounds, self.find_flat(fit.free, fit.x))
 
     def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
         """Directions that the data do not see, with what of the effects goes along."""
@@ -296,6 +350,11 @@ def guess_joint_covariance(free: Sequence[Free]) -> Floats:
         if not np.isfinite(f.prior):
             guess[k, k] = (f.step / 3.0) ** 2
     return guess
+
+
+def _get_friction_width(f: Free, width: float = 0.25) -> float:
+    """Width, scaled, of a population's first trials along a friction of ram or spool, given of the logarithm."""
+    return width / f.scale if f.name.endswith("_friction") and f.name.split(".")[0] in ("jack", "spool") else 0.0
 
 
 def _interleave(prospects: Sequence[Sequence[Prospect]], most: int) -> list[Prospect]:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
 from fdi.estimation.excerpt import Excerpt, choose_excerpt
-from fdi.estimation.final_rounds import descend_valley, guess_covariance
+from fdi.estimation.final_rounds import descend_valley, guess_covariance, start_fit
 from fdi.estimation.fit import Fit
 from fdi.estimation.judgement import judge_on_all
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, span_all_rows
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, scale_noise, span_all_rows
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
 from fdi.estimation.unidentifiable import FLAPPER, find_flat_directions
 from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, silence_readings
@@ -318,17 +318,6 @@ def is_noise_left(problem: Problem, found: Fit) -> bool:
 def measure_ratios(problem: Problem, found: Fit) -> list[float]:
     """RMS residual over noise, signal by signal."""
     return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
-
-
-def scale_noise(problem: CountedProblem, factor: float) -> CountedProblem:
-    """The problem with its noise taken for `factor` times as large."""
-    return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise))
-
-
-def start_fit(free: Sequence[Free], x: Floats) -> Fit:
-    """A fit at `x` (p,) before its first round."""
-    none = np.empty((0, 0))
-    return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
 
 
 def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Floats:

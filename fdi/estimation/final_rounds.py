@@ -145,6 +145,12 @@ def invert_hessian(hessian: Floats) -> Floats:
     return covariance
 
 
+def start_fit(free: Sequence[Free], x: Floats) -> Fit:
+    """A fit at `x` (p,) before its first round."""
+    none = np.empty((0, 0))
+    return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
+
+
 def guess_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
     """A covariance, (p, p), that gives differences across the valley their first width."""
     return np.diag([min(across / f.scale, 0.1) ** 2 if type(f) is not Free else 1e-4 for f in free])

@@ -7,9 +7,9 @@ is missing is not made up for by parameters that no healthy unit has.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +139,14 @@ class Problem:
     def whiten_residuals(self, residuals: Floats) -> Floats:
         """Residuals (m, s, n) as white noise of variance 1, if only noise is left; where nothing was measured, 0."""
         return np.stack([n.whiten(residuals[:, i]) for i, n in enumerate(self.noise)], axis=1)
+
+
+P = TypeVar("P", bound=Problem)
+
+
+def scale_noise(problem: P, factor: float) -> P:
+    """The problem with its noise taken for `factor` times as large: small events then count less, priors more."""
+    return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise))
 
 
 def span_all_rows(trace: Trace) -> Part:

@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.final_rounds import descend_valley, guess_covariance
+from fdi.estimation.final_rounds import descend_valley, guess_covariance, start_fit
 from fdi.estimation.fit import Fit
-from fdi.estimation.likelihood import Free, compute_misfit, scaled_bounds
+from fdi.estimation.likelihood import Free, compute_misfit, scale_noise, scaled_bounds
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogProblem, compute_values
+from fdi.estimation.population import evolve_fit, follow_population
 from fdi.estimation.unidentifiable import find_flat_directions
-from fdi.identification.population import evolve_population
 from fdi.progress import Progress, ignore_progress
 from plant.threads import map_in_threads
 
@@ -81,7 +81,7 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, pro
                   ) -> Fit:
     """The best fit from some starts (m, p), scaled."""
     factor = FIT_STAGES[0][0]
-    costs = compute_misfit(make_loud(problem, factor).compute_white_residuals(free, starts))
+    costs = compute_misfit(scale_noise(problem, factor).compute_white_residuals(free, starts))
     chosen = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
     fits = [start_fit(free, x) for x in chosen]
     for number, (factor, count, rounds, steps) in enumerate(FIT_STAGES):
@@ -90,7 +90,7 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], starts: Floats, pro
 
         def advance(fit: Fit, stage: LogProblem = stage, rounds: int = rounds, factor: float = factor) -> Fit:
             alone = replace(stage, _lanes={})
-            return descend(alone, scan_unknowns(make_loud(alone, factor), fit), rounds, factor)
+            return descend(alone, scan_unknowns(scale_noise(alone, factor), fit), rounds, factor)
 
         fits = sorted(map_in_threads(advance, fits[:count], problem.workers), key=lambda fit: fit.cost)
     return fits[0]
@@ -126,7 +126,7 @@ def search_other_valleys(problem: LogProblem, found: Fit, begin: Floats, seed: i
 def _search_narrowly(problem: LogProblem, best: Fit, seed: int) -> Fit:
     begun = descend(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
     spread = 4.0 * begun.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
-    return _follow_population(problem, begun, spread, NARROW_STAGES, seed)
+    return follow_population(problem, begun, spread, NARROW_STAGES, seed, descend)
 
 
 def _search_widely(problem: LogProblem, free: Sequence[Free], begin: Floats, seed: int) -> Fit:
@@ -134,40 +134,13 @@ def _search_widely(problem: LogProblem, free: Sequence[Free], begin: Floats, see
     widths = _widen_frictions(free, 0.3, 0.2)
     spread = 9.0 * begun.covariance + np.diag(widths**2)
     home = replace(begun, x=np.where(widths > 0.0, begin, begun.x))
-    return _follow_population(problem, home, spread, WIDE_STAGES, seed)
+    return follow_population(problem, home, spread, WIDE_STAGES, seed, descend)
 
 
 def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Floats:
     """Widths (p,), scaled, of the first trials along static and dynamic frictions, given of the logarithm."""
     return np.array([0.0 if not is_wide(f) else static / f.scale if f.name.endswith("static_friction")
                      else dynamic / f.scale if f.name.endswith("dynamic_friction") else 0.0 for f in free])
-
-
-def _follow_population(problem: LogProblem, begun: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int
-                       ) -> Fit:
-    """The fit at which a population ends whose noise counts for less from stage to stage."""
-    fit = begun
-    for number, (factor, generations) in enumerate(stages):
-        found = evolve_fit(make_loud(problem, factor), fit, spread, generations, 10 * seed + number)
-        spread = 4.0 * found.covariance
-        slid = descend(problem, found, 2, factor)
-        fit = slid if slid.cost < found.cost else found
-    return fit
-
-
-def evolve_fit(problem: LogProblem, fit: Fit, spread: Floats, generations: int, seed: int) -> Fit:
-    """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
-    is that of the last trials.
-    """
-    prior = np.array([f.prior**-2 for f in fit.free])
-    low, high = scaled_bounds(fit.free)
-
-    def measure_costs(trials: Floats) -> Floats:
-        costs: Floats = compute_misfit(problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
-        return costs
-
-    end = evolve_population(measure_costs, fit.x, spread, low, high, generations, seed)
-    return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
 
 
 def polish_fit(problem: LogProblem, fit: Fit, seed: int, generations: int = 25) -> Fit:
@@ -182,23 +155,12 @@ def is_fitted(fit: Fit) -> bool:
     return bool(fit.misfit <= FITTED_SQUARE * np.count_nonzero(fit.white))
 
 
-def start_fit(free: Sequence[Free], x: Floats) -> Fit:
-    """A fit at `x` (p,) before its first round."""
-    none = np.empty((0, 0))
-    return Fit(tuple(free), x, np.inf, np.inf, guess_covariance(free), none, none, none)
-
-
-def make_loud(problem: LogProblem, factor: float) -> LogProblem:
-    """The problem with its noise taken for `factor` times as large."""
-    return replace(problem, noise=tuple(n._replace(innovation=factor * n.innovation) for n in problem.noise), _lanes={})
-
-
 def descend(problem: LogProblem, fit: Fit, rounds: int, factor: float = 1.0) -> Fit:
     """A fit after so many rounds from where it is, with a covariance that begins anew; the noise `factor` times as
     large.
     """
     begun = replace(fit, covariance=guess_covariance(fit.free))
-    return descend_valley(make_loud(problem, factor), begun, rounds, find_flat(problem, fit.free, fit.x))
+    return descend_valley(scale_noise(problem, factor), begun, rounds, find_flat(problem, fit.free, fit.x))
 
 
 def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:

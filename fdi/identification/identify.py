@@ -18,6 +18,7 @@ from fdi.discovery.runs import Source
 from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation import noise as noises
 from fdi.estimation.excerpt import can_be_cut, choose_excerpt, cut_excerpt, is_long
+from fdi.estimation.final_rounds import start_fit
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms, limit_friction_values
 from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
@@ -35,7 +36,6 @@ from fdi.identification.global_fit import (
     sample_starts,
     scale_values,
     search_other_valleys,
-    start_fit,
 )
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (

@@ -6,15 +6,19 @@ Strategy: A Tutorial", arXiv:1604.00772) needs no slopes, only the order of the 
 """
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Problem, compute_misfit, scale_noise, scaled_bounds
 from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 
 Floats = NDArray[np.float64]
+P = TypeVar("P", bound=Problem)
 
 
 class Population(NamedTuple):
@@ -82,3 +86,39 @@ def evolve_population(measure_costs: Callable[[Floats], Floats], x: Floats, cova
         if idle >= patience:
             break
     return Population(best, best_cost, step**2 * spread)
+
+
+def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, seed: int) -> Fit:
+    """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
+    is that of the last trials.
+    """
+    prior = np.array([f.prior**-2 for f in fit.free])
+    low, high = scaled_bounds(fit.free)
+
+    def measure_costs(trials: Floats) -> Floats:
+        costs: Floats = compute_misfit(problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
+        return costs
+
+    end = evolve_population(measure_costs, fit.x, spread, low, high, generations, seed)
+    return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
+
+
+def follow_population(problem: P, begun: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
+                      descend: Callable[[P, Fit, int, float], Fit]) -> Fit:
+    """The fit at which a population ends whose noise counts for less from stage to stage.
+
+    Args:
+        problem: the run, with its own noise.
+        begun: where the first trials are centred.
+        spread: their covariance, (p, p).
+        stages: factor on the noise and generations, each.
+        seed: of the trials.
+        descend: takes a fit of a problem so many rounds further, with its noise so many times as large.
+    """
+    fit = begun
+    for number, (factor, generations) in enumerate(stages):
+        found = evolve_fit(scale_noise(problem, factor), fit, spread, generations, 10 * seed + number)
+        spread = 4.0 * found.covariance
+        slid = descend(problem, found, 2, factor)
+        fit = slid if slid.cost < found.cost else found
+    return fit
