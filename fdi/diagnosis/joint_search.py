@@ -121,7 +121,7 @@ def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole:
 
 
 # factor on the noise and generations of a search by a population
-POPULATION_STAGES = ((30.0, 40), (6.0, 40), (1.0, 40))
+POPULATION_STAGES = ((100.0, 30), (30.0, 40), (6.0, 40), (1.0, 40))
 
 Named = tuple[tuple[str, ...], Fit]
 """Effects beside the faults, and the fit with them."""
@@ -250,16 +250,15 @@ class JointSearch:
         the frictions have to move together (`fdi.estimation.population`).
         """
         done = list(done)
-        ranked = sorted(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))[:most]
-        if any(is_noise_left(self.problem, fit) for _, fit in done):
-            return done
-        named = ", ".join(_describe(effects) for effects, _ in ranked)
-        self.progress(f"search of other valleys, {named}", 0.95)
-        seeds = range(len(ranked))
-        found = self.map_alone(lambda k: (ranked[k][0], self.search_widely(ranked[k][1], k)), seeds)
-        for before, after in zip(ranked, found, strict=True):
-            if after[1].cost < before[1].cost:
-                done[done.index(before)] = after
+        ranked = sorted(done, key=lambda each: each[1].cost + GAIN_CONVINCES * len(each[0]))
+        worst = 1.5  # times the least cost, above which no valley is looked for
+        for each in [one for one in ranked if one[1].cost < worst * ranked[0][1].cost][:most]:
+            if any(is_noise_left(self.problem, fit) for _, fit in done):
+                break
+            effects, fit = each
+            self.progress(f"search of other valleys, {_describe(effects)}", 0.95)
+            found = self.map_alone(partial(self.search_widely, fit), (0, 1))
+            done[done.index(each)] = (effects, min(fit, *found, key=lambda f: f.cost))
         return done
 
     def search_widely(self, fit: Fit, seed: int, steps: int = 10) -> Fit:
@@ -268,9 +267,11 @@ class JointSearch:
         The population takes so many solver steps a cycle; its end is fitted with those of the problem.
         """
         coarse = replace(self.problem, steps=steps, workers=1, _lanes={})
-        begun = self._descend_in(coarse, replace(fit, x=self._place_home(fit)), 3, POPULATION_STAGES[0][0])
+        home = self._place_home(fit)
+        begun = self._descend_in(coarse, replace(fit, x=home), 3, POPULATION_STAGES[0][0])
         frictions = np.array([_get_friction_width(f) for f in fit.free])
         spread = 9.0 * begun.covariance + np.diag(frictions**2)
+        begun = replace(begun, x=np.where(frictions > 0.0, home, begun.x))
         end = follow_population(coarse, begun, spread, POPULATION_STAGES, seed, self._descend_in)
         return self.descend(end, ((1.0, 8),))
 
@@ -352,7 +353,7 @@ def guess_joint_covariance(free: Sequence[Free]) -> Floats:
     return guess
 
 
-def _get_friction_width(f: Free, width: float = 0.25) -> float:
+def _get_friction_width(f: Free, width: float = 0.1) -> float:
     """Width, scaled, of a population's first trials along a friction of ram or spool, given of the logarithm."""
     return width / f.scale if f.name.endswith("_friction") and f.name.split(".")[0] in ("jack", "spool") else 0.0
 

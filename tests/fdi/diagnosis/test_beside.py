@@ -157,3 +157,18 @@ def test_a_lag_is_found_although_more_clogging_makes_up_for_it() -> None:
     assert found.levels[CLOGGING.name] == Level.NON_NOMINAL
     lag = found.beside.best.parameters["coil_lag.time"]
     assert lag.low < 4.58e-4 < lag.high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "seed", "valve", "other"), [
+    (9, 9609, {CLOGGING.name: 0.25}, "compressibility"),  # the ram's static friction has to move with the dynamic one
+    (22, 9622, {FRICTION.name: 70.0}, "nozzle_asymmetry"),  # only a scan with more noise promises it
+])
+def test_what_no_fit_without_it_comes_near_is_found(number: int, seed: int, valve: dict[str, float], other: str
+                                                    ) -> None:
+    job = study.Job(number, seed, valve, other)
+    found = diagnose(study.record_case(job), with_effects=True)
+    assert found.beside is not None and found.beside.best.effects == (other,)
+    fault, size = next(iter(valve.items()))
+    assert found.sizes[fault].low < size < found.sizes[fault].high
+    assert found.levels[fault] == (Level.MAINTENANCE if size == 0.25 else Level.NON_NOMINAL)
