@@ -37,10 +37,13 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself. `stage` takes a step
     with each round.
     """
-    now, idle = relax_fit(problem, fit), 0
+    now = relax_fit(problem, fit)
+    if now is fit:  # its residuals may be those of other steps, another noise or another place
+        now = replay_fit(problem, fit)
     _, flat = find_tangents(slopes or problem, now.free, now.x)
+    idle = 0
     for _ in range(rounds):
-        here = linearise_along(problem, now.free, now.x, now.covariance, slopes or problem, flat)
+        here = linearise_along(problem, now, slopes or problem, flat)
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = there
@@ -50,25 +53,38 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     return replace(relax_fit(problem, now), converged=True)
 
 
-def linearise_along(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, slopes: Problem,
-                    flat: Floats) -> Fit:
-    """The model at `x` (p,), its Jacobian by differences along the principal directions of a `covariance` (p, p).
-
-    Along `flat` (p, k) there is no slope.
-    """
-    directions = _find_principal(covariance)
-    moves = np.array([cut_at_bounds(free, x, d) for d in directions.T])
-    near = slopes.compute_white_residuals(free, np.vstack([x, x + moves]))
-    residuals = problem.compute_residuals(free, x[None])
+def replay_fit(problem: Problem, fit: Fit) -> Fit:
+    """The fit with the residuals, the misfit and the cost that `problem` has at its unknowns."""
+    residuals = problem.compute_residuals(fit.free, fit.x[None])
     white = problem.whiten_residuals(residuals)
-    steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (near[1:] - near[0]).reshape(len(x), -1)
-    jacobian = remove_slope(steep.reshape(len(x), *white[0].shape), flat)
-    prior = np.diag([f.prior**-2 for f in free])
-    heavy = (jacobian * compute_weights(white[0])).reshape(len(x), -1)
     held = float(compute_misfit(white)[0])
-    hessian = heavy @ jacobian.reshape(len(x), -1).T + prior
+    return replace(fit, cost=_add_prior(fit, held), misfit=held, residuals=residuals[0], white=white[0])
+
+
+def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -> Fit:
+    """A fit with its Jacobian by differences along the principal directions of its covariance, and the next covariance.
+
+    The residuals of `now` are those of `problem` at its unknowns; they are not replayed again. The differences are
+    those of `slopes`. Along `flat` (p, k) there is no slope.
+    """
+    x = now.x
+    moves = np.array([cut_at_bounds(now.free, x, d) for d in _find_principal(now.covariance).T])
+    if slopes is problem:
+        differences = slopes.compute_white_residuals(now.free, x + moves) - now.white
+    else:
+        near = slopes.compute_white_residuals(now.free, np.vstack([x, x + moves]))
+        differences = near[1:] - near[0]
+    steep = np.asarray(np.linalg.pinv(moves), np.float64) @ differences.reshape(len(x), -1)
+    jacobian = remove_slope(steep.reshape(len(x), *now.white.shape), flat)
+    heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
+    hessian = heavy @ jacobian.reshape(len(x), -1).T + np.diag([f.prior**-2 for f in now.free])
     known = np.asarray(np.linalg.pinv(hessian), np.float64)
-    return Fit(tuple(free), x, held + float(x @ prior @ x), held, known, residuals[0], white[0], jacobian)
+    return replace(now, cost=_add_prior(now, now.misfit), covariance=known, jacobian=jacobian)
+
+
+def _add_prior(fit: Fit, misfit: float) -> float:
+    """The cost of a fit with this misfit."""
+    return misfit + float(fit.x @ np.diag([f.prior**-2 for f in fit.free]) @ fit.x)
 
 
 def _find_principal(covariance: Floats) -> Floats:
