@@ -21,7 +21,7 @@ HELP_OF_COMMAND = {
     "identify": "find the parameters of your actuator from its runs, with intervals, and what the runs do not show",
     "import": "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
     "list": "list the names that other commands take: parameters, signals, sequences, effects, checks or models",
-    "node": "run one node (plant or controller) on a bus, for example with real hardware",
+    "node": "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",
     "recover": "recover a log whose writer was killed: keep all up to the last intact chunk and rebuild the index",
     "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",
     "report": "write one HTML file about a trace; it needs no network",

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from plant.model import Model
 
 
-def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Add --model, --set, --effects and --seed, which choose the plant."""
+def add_model_options(parser: argparse._ActionsContainer) -> None:
+    """Add --model, --set, --effects and --seed, which choose the plant, to a parser or to a group of its options."""
     add = parser.add_argument
     add("--model", metavar="FILE|NAME",
         help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)")
@@ -24,13 +24,13 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
     add_seed_option(parser)
 
 
-def add_trust_option(parser: argparse.ArgumentParser) -> None:
+def add_trust_option(parser: argparse._ActionsContainer) -> None:
     """Add --trust."""
     parser.add_argument("--trust", action="store_true",
                         help="run the code that a log or a model file brings along; it is listed first, with its hash")
 
 
-def add_seed_option(parser: argparse.ArgumentParser) -> None:
+def add_seed_option(parser: argparse._ActionsContainer) -> None:
     """Add --seed."""
     parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
 

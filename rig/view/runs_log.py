@@ -37,7 +37,7 @@ from rig.view.recording import (
 from rig.view.rerun_log import ACTIVE, SECTIONS, VERDICTS, list_fault_states, make_command_lane
 
 REFERENCE, NOISE = COMMAND, 0x7FD46BFF
-COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, by turns
+COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation
 SIGNALS, LANES, RESULT = "signals and differences", "Runs", "Result"  # the first is all plots together
 Drawn = list[tuple[Line, Floats, Floats]]  # lines with times of the first run, s, and values in the unit of the plot
 

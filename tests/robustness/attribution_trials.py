@@ -8,7 +8,7 @@ Each trial is one `rig run` on the UDP bus with plant and controller as processe
 the three processes is stopped (SIGSTOP) for 2, 10 or 50 ms, or one of the nodes is killed (SIGKILL). A stall of the rig
 or of the plant must never be held against the controller; a killed node must be named, and its run must end within 2 s.
 The table has a line per case: the verdicts, whom the first cause names, and how many trials were attributed wrongly.
-With `--mixed` the three processes are stopped by turns in one pace, each time for one of the three times at random,
+With `--mixed` the three processes are stopped alternately in one pace, each time for one of the three times at random,
 and the table has a line per process. A trial that came too late, after the run, is repeated. With `--stay` plant and
 controller are started once and stay for all trials.
 """
@@ -171,7 +171,7 @@ def format_case(case: object, trials: list[Trial]) -> str:
 
 def run_mixed(trials: int, pace: str, folder: Path, group: str,
               standing: dict[str, int] | None = None) -> Iterator[Trial]:
-    """Stop the three processes by turns, for times at random, and print a line per process at the end."""
+    """Stop the three processes alternately, for random times, and print a line per process at the end."""
     sequence = folder / "stall.toml"
     sequence.write_text(SEQUENCE)
     done: dict[str, list[Trial]] = {process: [] for process in PROCESSES}
@@ -210,7 +210,7 @@ def main() -> int:
     """Run the trials; exit status 1 if a single one was attributed wrongly."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--trials", type=int, default=3, help="trials per case (default 3)")
-    parser.add_argument("--mixed", action="store_true", help="stop the processes by turns for times at random")
+    parser.add_argument("--mixed", action="store_true", help="stop the processes alternately for random times")
     parser.add_argument("--pace", choices=("realtime", "lockstep"), default="realtime", help="of --mixed")
     parser.add_argument("--stay", action="store_true", help="--mixed: start the nodes once for all trials")
     parser.add_argument("--controller", choices=("builtin", "c"), default="builtin", help="of --stay")

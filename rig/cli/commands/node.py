@@ -18,21 +18,33 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig node`."""
     parser.add_argument("node", choices=("plant", "controller"),
-                        help="plant: the plant emulator, node 3; controller: the reference firmware, node 2")
+                        help="plant: the plant emulator, CANopen node 3; controller: the reference firmware of the "
+                             "controller, CANopen node 2")
     parser.add_argument("--bus", default="auto", metavar="INTERFACE:CHANNEL",
-                        help="for example socketcan:vcan0 or udp_multicast (default: the value of EHA_RIG_BUS)")
+                        help="the bus to join: socketcan:can0 is a CAN interface, udp_multicast works between programs "
+                             "on this machine (needed, unless EHA_RIG_BUS names a bus)")
     parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # the node ends when this process ends
-    options.add_model_options(parser)
+    options.add_model_options(parser.add_argument_group(
+        "model", "The emulator simulates it and the firmware takes its gains from it, until a rig on the bus loads "
+                 "another. The bench drives servovalves: ehs and servo are refused."))
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """The node runs until Ctrl-C or SIGTERM ends it.
+    """It runs until Ctrl-C or SIGTERM ends it, then reports the frames that it lost.
 
     It runs with --model, --set and --seed until a rig loads another scenario.
+
+    Raises:
+        InputError: no bus between programs, a model that the bench cannot drive, or a place that cannot be written.
+        RigError: the bus cannot be opened.
     """
+    import json
     import signal
 
+    from fdi.output import require_writable, write_text
+    from fdi.report.report import Report
     from plant import InputError
+    from rig.cli.answer import show_answer
     from rig.network.bus import choose_bus, open_can
     from rig.network.clock import WallClock
     from rig.network.link import Link
@@ -43,7 +55,10 @@ def run_command(args: argparse.Namespace) -> int:
 
     bus, _ = choose_bus(args.bus)
     if bus.partition(":")[0] in EMBEDDED_NAMES:
-        raise InputError("--bus", args.bus, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+        given = "" if args.bus == "auto" else args.bus
+        raise InputError("--bus", given, "a bus between programs, such as udp_multicast or socketcan:vcan0")
+    if args.out is not None:
+        require_writable(args.out, "--out")
     is_compiled = args.node == "plant" and can_open(bus)
     clock = WallClock()
     ended: list[int] = []
@@ -56,14 +71,17 @@ def run_command(args: argparse.Namespace) -> int:
             node = choose_node(args)(link.send)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda got, frame: ended.append(got))
-        if not args.quiet:
+        if not (args.quiet or args.json):
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
         stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))
         serve_node(node, link, clock, lambda: bool(ended) or args.parent not in (0, os.getppid()))
-    if not args.quiet:
-        print(f"{args.node}: incoming frames lost {link.overflows}, not sent {link.unsent}, "
-              f"error frames {link.error_frames}")
+    counts = {"node": args.node, "bus": bus, "lost": link.overflows, "unsent": link.unsent,
+              "error_frames": link.error_frames}
+    if args.out is not None:
+        write_text(args.out, json.dumps(counts, indent=1) + "\n")
+    sentence = f"incoming frames lost {link.overflows}, not sent {link.unsent}, error frames {link.error_frames}"
+    show_answer(Report("node", args.node, sentence=sentence, data=counts), args)
     return 0
 
 

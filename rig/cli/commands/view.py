@@ -31,10 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", action="store_true",
         help="the trace beside the model's replay, with residual and noise floor, as rig compare does; if --model or "
              "--set adds effects or values, before and after that")
-    options.add_model_options(parser)
-    add("--repeat", action="append", default=[], metavar="TRACE",
-        help="with --compare: another run of the same command, measures the noise floor (repeatable)")
-    add("--signals", metavar="xj,p12,xs", help="with --compare: what to compare (default: what the trace has)")
+    compare = parser.add_argument_group("with --compare")
+    options.add_model_options(compare)
+    parser.set_defaults(seed=None)  # so that one that is given without --compare is noticed
+    compare.add_argument("--repeat", action="append", default=[], metavar="TRACE",
+                         help="another run of the same command, measures the noise floor (repeatable)")
+    compare.add_argument("--signals", metavar="xj,p12,xs", help="what to compare (default: what the trace has)")
     add("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it")
     add("--theme", choices=("light", "dark"),
         help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)")
@@ -115,6 +117,8 @@ def _require_options_that_fit(args: argparse.Namespace) -> None:
     for option in ("model", "set", "effects", "trust", "repeat", "signals"):
         if getattr(args, option) and not args.compare:
             raise InputError(f"--{option}", "", "--compare with it")
+    if args.seed is not None and not args.compare:
+        raise InputError("--seed", str(args.seed), "--compare with it")
 
 
 def _choose_recording(args: argparse.Namespace) -> Path:

@@ -22,8 +22,8 @@ def build_live_runs_report(figures: Mapping[str, Any]) -> Report:
     priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
     overruns = ", ".join(f"{name} {count} of {figures['cycles'][name]}" for name, count in figures["overruns"].items())
     lines: list[Item] = [
-        Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} blocks by turns on {figures['bus']}, "
-                         f"1 ms a cycle, {figures['cpus']} CPUs, {priority}"),
+        Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks on "
+                         f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}"),
         Line("overruns", overruns),
         *(Line("ended early", f"{name}: {count}") for name, count in figures["ended_early"].items() if count),
         *(Line(name, reason) for name, reason in figures["missing"].items())]

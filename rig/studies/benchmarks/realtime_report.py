@@ -39,8 +39,8 @@ def build_realtime_report(figures: Mapping[str, Any]) -> Report:
                   *(Section(title, [_tabulate_times(figures["times_us"][quantity], _NAMES[quantity], caption)])
                     for quantity, (title, caption) in _TITLES.items()),
                   Section("Conditions", [
-                      Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} blocks by turns, 1 ms a "
-                                       f"cycle, {figures['cpus']} CPUs, {priority}"),
+                      Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks, 1 ms "
+                                       f"a cycle, {figures['cpus']} CPUs, {priority}"),
                       *(Line(f"no answer, {name}", f"{count} of {figures['cycles'][name]} cycles")
                         for name, count in figures["lost"].items() if count),
                       *_list_missing(figures["missing"])])],

@@ -18,7 +18,7 @@ from bus_stations import spec
 from mcap.reader import make_reader
 from rig_command import finished, gone, nodes_on, rig, started
 from short_sequences import SHORT, SLOW_START, job, play
-from standing_nodes import stand_nodes
+from standing_nodes import stand_nodes, wait_for_node
 from vcan_host import kernel_has_vcan0
 
 from fdi.report.run_report import build_run_report
@@ -340,10 +340,10 @@ def test_an_external_node_that_does_not_answer(tmp_path: Path) -> None:
 def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, reference: np.ndarray) -> None:
     """`rig node` twice, and a run that finds them."""
     where = spec("udp_multicast")
-    nodes = [started("node", name, "--bus", where) for name in ("plant", "controller")]
+    nodes = [started("node", "plant", "--bus", where), started("node", "controller", "--bus", where, "--json")]
     try:
-        for node in nodes:
-            assert node.stdout is not None and where in node.stdout.readline()
+        wait_for_node(where, CONTROLLER)
+        assert nodes[0].stdout is not None and where in nodes[0].stdout.readline()
         outcome = play(job(seed=1, bus=where, controller="external", plant="external"), tmp_path / "b")
         assert all(node.poll() is None for node in nodes)
     finally:
@@ -351,6 +351,8 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(tmp_path: Path, r
             node.send_signal(signal.SIGTERM)
         said = [finished(node) for node in nodes]
     assert outcome.verdict == "PASS" and [one.status for one in said] == [0, 0]
+    assert "incoming frames lost 0" in said[0].out
+    assert said[1].json == {"node": "controller", "bus": where, "lost": 0, "unsent": 0, "error_frames": 0}
     assert np.array_equal(columns(tmp_path / "b"), reference), outcome.counters
 
 
