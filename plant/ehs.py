@@ -14,7 +14,7 @@ from plant.effects.sensors import Quantisation
 from plant.effects.valve import Compressibility
 from plant.friction import clip
 from plant.parameters import GROUPS, convert_group_unit, read_shipped_model
-from plant.plants import Array, Plant, Table, Term
+from plant.plants import Array, MeasuredPressures, Plant, Table, Term
 from plant.ports import at_current, at_position, at_valve
 from plant.quantity import Quantity
 from plant.state import Input, Line, Ports, State
@@ -200,7 +200,9 @@ PLANT = Plant(
     tables=(Table(skip=60, separator=";", load=estimate_load, columns=PROCESSED_COLUMNS),
             Table(skip=60, separator=";", load=estimate_load_in_motion, columns=LOGGER_COLUMNS,
                   derive=derive_logger_columns, derived_from=LOGGER_SOURCES)),
-    compute_force=compute_pressure_force,
-    force_parameters=frozenset(
-        {"pressure_sensors.delay_a", "pressure_sensors.delay_b", "pump.area_ratio", "jack.area"}),
+    measured_pressures=MeasuredPressures(
+        compute_pressure_force,
+        used=frozenset({"pressure_sensors.delay_a", "pressure_sensors.delay_b", "pump.area_ratio", "jack.area"}),
+        # the preload is in the measured pressures already
+        given={"pump.pressure_given": 1.0, "undissolved_air.preload": 0.0}),
 )

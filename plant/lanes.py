@@ -30,7 +30,7 @@ from plant.errors import InputError
 from plant.flat import list_state_values, make_lane_packers
 from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
 from plant.part import Part
-from plant.plants import find_plant
+from plant.plants import MeasuredPressures, find_plant
 from plant.ports import at_reading
 from plant.state import Input
 from plant.step import compute_coefficients, step_plant
@@ -66,8 +66,12 @@ class Lanes:
         self._rungs = list_kernel_variants(model)
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
-               anchor: float = 0.0, parts: Sequence[Part] = ()) -> Array:
-        """The plant without its controller, driven by a measured current.
+               anchor: float = 0.0, parts: Sequence[Part] = (), chambers: Array | None = None) -> Array:
+        """The plant without its controller, driven by a measured current or motor speed.
+
+        The position of a plant whose chamber pressures were measured follows from its flow alone: they are given as a
+        force, and all that acts on the ram is in them. P12 is predicted without them, from the drive and the model's
+        forces. So no signal is predicted from itself.
 
         Args:
             values: (m, len(names)) parameters of each run, SI.
@@ -76,6 +80,8 @@ class Lanes:
             position: (n,) m, measured, NaN where missing: runs start at rest where it shows position[0].
             anchor: 1/s, how fast the ram is pulled to the measured position; 0 is a free run.
             parts: pieces of a longer recording that the rows consist of: each begins anew; none: one piece.
+            chambers: (n, 2) Pa, pressures of both chambers as they were read; None: the model's forces move the ram.
+                A plant without `measured_pressures` does not use them.
 
         Returns:
             (m, n, 3): XJ as sensed m, P12 Pa, XS m at each sample, without noise; `[..., i]` has contiguous rows.
@@ -84,7 +90,33 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         where = np.empty(0) if position is None else position
-        return self._run(values, current, load, where, anchor, False, parts)
+        out = self._run(values, current, load, where, anchor, False, parts)
+        pressures = self.model.kind.measured_pressures
+        if chambers is None or pressures is None:
+            return out
+        flow = self._replay_flow(pressures, values, current, chambers, where, anchor)
+        return np.concatenate([flow, out[..., 1:]], axis=-1)
+
+    def _replay_flow(self, pressures: MeasuredPressures, values: Array, current: Array, chambers: Array,
+                     position: Array, anchor: float) -> Array:
+        """XJ, (m, n, 1), with measured pressures as the force; runs with equal parameters of this force share it.
+
+        Parts of a recording are one run: what pulls the ram to the measured position makes it forget the part before.
+        """
+        given = {name: value for name, value in pressures.given.items() if name in self.model.values}
+        lanes = Lanes(self.model.replace(given), self.names, self.steps, self.workers)
+        values = np.array(values, float)
+        for i, name in enumerate(self.names):
+            values[:, i] = pressures.given.get(name, values[:, i])
+        used = [i for i, name in enumerate(self.names) if name in pressures.used]
+        kinds, of = np.unique(values[:, used], axis=0, return_inverse=True)
+        out = np.empty((len(values), len(current), 1))
+        for i, kind in enumerate(kinds):
+            rows = of.reshape(-1) == i
+            own = dict(lanes.model.values) | dict(zip((self.names[j] for j in used), kind, strict=True))
+            force = pressures.compute_force(own, chambers, current, float(self.model["controller.period"]))
+            out[rows] = lanes._run(values[rows], current, force, position, anchor, False)[..., :1]
+        return out
 
     def replay_in_turns(self, values: Array, current: Array, load: Array, position: Array | None = None,
                         anchor: float = 0.0, rows: int = TURN) -> Iterator[tuple[int, Array]]:

@@ -53,6 +53,16 @@ class Table:
         return {term.source for terms in self.columns.values() for term in terms} | set(self.derived_from)
 
 
+class MeasuredPressures(NamedTuple):
+    """How measured chamber pressures drive a plant: as the force on the ram, so that its flow alone moves it."""
+
+    # The force, (n,) N, positive against extension: from parameter values, chamber pressures, (n, 2) Pa, drive `cor`,
+    # (n,), and period, s.
+    compute_force: Callable[[Mapping[str, float], Array, Array, float], Array]
+    used: frozenset[str]  # parameters that it needs
+    given: Mapping[str, float]  # parameters with which the step takes the load for this force
+
+
 @dataclass(frozen=True, eq=False)
 class Plant:
     """One kind of actuator."""
@@ -68,10 +78,7 @@ class Plant:
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their groups say
     controller: bool = True  # the controller is known, so that Cor can be held against com and XJ
     tables: tuple[Table, ...] = field(default=(), repr=False)  # of the files that its rig writes
-    # The force on the ram by its measured pressures, (n,) N, positive against extension: from parameter values, chamber
-    # pressures, (n, 2) Pa, drive `cor`, (n,), and period, s. And the names of the values that it uses.
-    compute_force: Callable[[Mapping[str, float], Array, Array, float], Array] | None = None
-    force_parameters: frozenset[str] = frozenset()
+    measured_pressures: MeasuredPressures | None = None  # how they drive the plant; None: they cannot
 
     @cached_property
     def nominal(self) -> Mapping[str, float]:

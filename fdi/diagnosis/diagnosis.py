@@ -32,7 +32,7 @@ from fdi.diagnosis.refine import (
     refine_sizes,
 )
 from fdi.diagnosis.rms_grid import Grid, search_grid
-from fdi.estimation.excerpt import cut_excerpt, is_long
+from fdi.estimation.long_recordings import cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
 from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress

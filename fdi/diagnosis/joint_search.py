@@ -40,8 +40,8 @@ from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
 from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation.final_rounds import descend_valley, guess_covariance, linearise_across
 from fdi.estimation.fit import Fit
-from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Free, scale_noise
+from fdi.estimation.long_recordings import judge_on_all
 from fdi.estimation.population import follow_population
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress

@@ -13,8 +13,8 @@ from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_qu
 from fdi.discovery.search import Hypothesis, Search, WholeRuns
 from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.discovery.undecided import find_undecided_rows
-from fdi.estimation.excerpt import is_long
 from fdi.estimation.likelihood import Problem, compute_typical_rms
+from fdi.estimation.long_recordings import is_long
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,

@@ -13,7 +13,7 @@ from fdi.discovery.explain import Explanation, explain
 from fdi.discovery.refit import lean_model
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import WholeRuns, choose_search_excerpt
-from fdi.estimation.excerpt import PIECE, can_be_cut, cut_excerpt, make_excerpt
+from fdi.estimation.long_recordings import PIECE, can_be_cut, cut_excerpt, make_excerpt
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace

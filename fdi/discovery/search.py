@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
-from fdi.estimation.excerpt import Excerpt, choose_excerpt
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
-from fdi.estimation.judgement import Judgement, judge_on_all
 from fdi.estimation.likelihood import Free, Problem, compute_misfit
+from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, ignore_progress

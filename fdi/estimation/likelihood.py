@@ -14,7 +14,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.driven import replay_measured
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
@@ -100,7 +99,8 @@ class Problem:
             bare = self.bare is not None and set(key) <= set(self.bare.values)
             self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key, self.steps, self.workers)
         trace = self.trace if trace is None else trace
-        out = replay_measured(self._lanes[key], values, trace, trace.cor, trace.position, self.anchor)
+        out = self._lanes[key].replay(values, trace.cor, trace.load, trace.position, self.anchor, trace.parts,
+                                      trace.chambers)
         signals: Floats = trace.pass_sensors(out).transpose(0, 2, 1)
         return signals
 

@@ -20,9 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.driven import replay_in_turns, replay_measured
-from fdi.estimation.excerpt import choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.likelihood import limit_dynamic_friction
+from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
 from fdi.estimation.noise import WINDOW
 from fdi.estimation.unknowns import WITHOUT_NOISE, list_tolerance_sizes
 from fdi.thresholds import (
@@ -70,7 +69,8 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, current: Floats | N
     """
     position = trace.unlagged_position if has_known_start(trace) else None
     driven = trace.cor if current is None else current
-    return trace.pass_sensors(replay_measured(lanes, values, trace, driven, position, anchor))
+    out = lanes.replay(values, driven, trace.load, position, anchor, trace.parts, trace.chambers)
+    return trace.pass_sensors(out)
 
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:

@@ -164,6 +164,23 @@ def test_the_force_is_that_of_the_chamber_that_is_fed() -> None:
     np.testing.assert_allclose(force, [2, 3, 4, 5, 6, 7, -0.7 * 105, -0.7 * 106, -0.7 * 107, -0.7 * 108])
 
 
+def test_measured_pressures_move_the_ram_and_are_not_predicted_from_themselves() -> None:
+    """XJ is that of the flow against their force, P12 that of the replay without them."""
+    names = ["pressure_sensors.delay_a", "undissolved_air.preload"]
+    values = np.array([[0.0, 2e5], [5e-3, 3e5]])
+    model = build_model(undissolved_air__volume=4e-7, undissolved_air__exponent=1.0, jack__static_friction=500.0)
+    rows = np.arange(300.0)
+    drive, chambers = np.full(300, SPEED), np.column_stack([1e6 + 2e3 * rows, 0.0 * rows])
+    lanes = Lanes(model, names, 20)
+    driven = lanes.replay(values, drive, 0.0 * rows, chambers=chambers)
+    assert (driven[..., 1:] == lanes.replay(values, drive, 0.0 * rows)[..., 1:]).all()
+    given = model.replace({"pump.pressure_given": 1.0, "undissolved_air.preload": 0.0})
+    for (delay, _), run in zip(values, driven, strict=True):
+        force = compute_pressure_force(dict(model.values) | {names[0]: delay}, chambers, drive, CYCLE)
+        own = Lanes(given, names, 20).replay(np.array([[delay, 0.0]]), drive, force)[0]
+        assert (run[:, 0] == own[:, 0]).all()
+
+
 def test_the_loggers_columns() -> None:
     """An encoder that turns one way over its zero, the valve's sign, and both pressure scales."""
     n = 60

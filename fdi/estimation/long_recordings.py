@@ -1,7 +1,8 @@
-"""The excerpt of a long recording that fits are made with: the pieces that say most about what is unknown.
+"""Recordings too long to be fitted whole: fits take the part that says most, and are judged on all of the recording.
 
 A fit makes hundreds of replays. Thirty minutes of recording say little more than the best fifteen seconds of them, so
-fits are made with these and their result is judged on all of the recording (`fdi.estimation.judgement`).
+fits are made with an excerpt, the pieces that say most about what is unknown. What a fit leaves of all of the recording
+is counted piece after piece, so that memory does not grow.
 
 Which seconds are best is asked of the model: one replay of the whole recording with a few steps a cycle, and one more
 for each unknown, side by side, tell how far each unknown moves each signal in each piece. Pieces are taken one after
@@ -11,20 +12,20 @@ act there alone.
 """
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.driven import is_driven_by_pressure, replay_in_turns
-from fdi.estimation.likelihood import limit_dynamic_friction
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import BLOCK, Problem, limit_dynamic_friction, remove_mains, sum_blocks
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
-from fdi.thresholds import ANCHOR_RATE
+from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
 from fdi.trace.trace import PER_ROW, Trace
-from plant.lanes import Lanes
+from plant.lanes import TURN, Lanes
 from plant.model import Model
 from plant.part import Part
 
@@ -37,6 +38,51 @@ LEAD_IN = 1.0  # s before a piece, in which a replay that is drawn to the measur
 SHORT_LEAD_IN = 3.0  # s; pieces that need a longer one are taken only where there are no others
 INFORMATION_STEPS = 5  # a cycle: what matters is where an unknown acts, not how much exactly
 LARGEST_SHIFT = 10.0  # floors: more is a single stop of the ram, made or missed
+SENSOR_MEMORY = 2000  # rows after which a sensor has forgotten what it was shown
+
+
+def is_long(trace: Trace) -> bool:
+    """Whether a recording is longer than fits need."""
+    return len(trace) * trace.period > LONGEST_WHOLE
+
+
+def can_be_cut(trace: Trace, model: Model) -> bool:
+    """Whether fits of a recording may be made with an excerpt: it is long, and no forces are computed from its rows."""
+    return is_long(trace) and not _is_driven_by_pressures(trace, model)
+
+
+def _is_driven_by_pressures(trace: Trace, model: Model) -> bool:
+    """Whether the position is predicted from measured chamber pressures."""
+    return trace.chambers is not None and model.kind.measured_pressures is not None
+
+
+def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats | None, anchor: float,
+                    rows: int = TURN) -> Iterator[tuple[int, Floats]]:
+    """XJ m, P12 Pa and XS m as the sensors of the trace show them, so many `rows` at a time: the first row, (m, k, 3).
+
+    Memory does not grow with the recording, unless the position is predicted from measured pressures.
+
+    Args:
+        lanes: runs of a model.
+        values: (m, len(lanes.names)) their parameters, SI.
+        trace: a prepared recording.
+        position: (n,) m, to which the ram is pulled; None for a run from the middle.
+        anchor: 1/s, how fast.
+        rows: of a turn.
+    """
+    if _is_driven_by_pressures(trace, lanes.model):
+        out = lanes.replay(values, trace.cor, trace.load, position, anchor, trace.parts, trace.chambers)
+        whole = trace.pass_sensors(out)
+        yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
+        return
+    before = np.empty((len(values), 0, 3))  # what a filtering sensor remembers
+    for first, out in lanes.replay_in_turns(values, trace.cor, trace.load, position, anchor, rows):
+        if not trace.sensors:
+            yield first, out
+            continue
+        known = np.concatenate([before, out], axis=1)
+        yield first, trace.pass_sensors(known)[:, before.shape[1]:]
+        before = known[:, -SENSOR_MEMORY:]
 
 
 class Excerpt(NamedTuple):
@@ -54,11 +100,6 @@ class Excerpt(NamedTuple):
         whole = len(trace) * trace.period
         return (f"fitted to {self.seconds(trace.period):.3g} s of {whole:.4g} s, the part that says most about the "
                 f"unknowns ({', '.join(times)}); judged on all of it")
-
-
-def is_long(trace: Trace) -> bool:
-    """Whether a recording is longer than fits need."""
-    return len(trace) * trace.period > LONGEST_WHOLE
 
 
 def choose_excerpt(trace: Trace, model: Model, floor: Mapping[str, float], changes: Iterable[Mapping[str, float]] = (),
@@ -183,6 +224,65 @@ def _find_lead_in(trace: Trace, first: int, wide: float = 0.5, longest: float = 
     return begin
 
 
-def can_be_cut(trace: Trace, model: Model) -> bool:
-    """Whether fits of a recording may be made with an excerpt: it is long, and no forces are computed from its rows."""
-    return is_long(trace) and not is_driven_by_pressure(trace, Lanes(model, (), 1))
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What one model leaves of a whole recording."""
+
+    outputs: tuple[str, ...]
+    blocks: Floats  # (s, b) sums of squared residuals over blocks, SI
+    count: Floats  # (s, b) measured samples in each
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """RMS residual of each signal, SI."""
+        return {name: float(np.sqrt(squares.sum() / max(n.sum(), 1.0)))
+                for name, squares, n in zip(self.outputs, self.blocks, self.count, strict=True)}
+
+    def holds(self, floor: Mapping[str, float]) -> bool:
+        """Whether only noise is left in the typical block, as on a held-out run."""
+        return all(x <= RESIDUAL_HELD_OUT for x in self.typical_ratio(floor).values())
+
+    def typical_ratio(self, floor: Mapping[str, float], share: float = 0.85) -> dict[str, float]:
+        """RMS residual over the floor, without the worst blocks: a stop that is made or missed by a hair is luck."""
+        found = {}
+        for name, squares, n in zip(self.outputs, self.blocks, self.count, strict=True):
+            full = n > 0.5 * BLOCK
+            means = np.sort(squares[full] / n[full])
+            kept = means[:max(1, round(share * len(means)))]
+            found[name] = float(np.sqrt(kept.mean())) / floor[name] if len(kept) else 0.0
+        return found
+
+    def find_worst_piece(self, floor: Mapping[str, float], rows: int, apart: Sequence[tuple[int, int]]
+                         ) -> tuple[int, int] | None:
+        """The piece of so many `rows` with the largest typical ratio, but for the pieces `apart`; None: none left."""
+        size = rows // BLOCK
+        scale = np.array([floor[name] for name in self.outputs])[:, None] ** 2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.where(self.count > 0.5 * BLOCK, self.blocks / self.count / scale, np.nan)
+        pieces = ratio[:, :ratio.shape[1] // size * size].reshape(len(self.outputs), -1, size)
+        typical = np.nan_to_num(np.median(pieces, axis=-1), nan=0.0).max(axis=0)
+        for first, stop in apart:
+            typical[first // rows:-(-stop // rows)] = 0.0
+        k = int(np.argmax(typical)) if len(typical) else 0
+        return (k * rows, (k + 1) * rows) if len(typical) and typical[k] > RESIDUAL_HELD_OUT**2 else None
+
+
+def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int) -> list[Judgement]:
+    """What each fit leaves of a whole recording `trace`, replayed with `steps` a cycle, side by side."""
+    names = list(dict.fromkeys(f.name for fit in fits for f in fit.free))
+    found = [dict(zip((f.name for f in fit.free), problem.convert_unknowns(fit.free, fit.x[None])[0], strict=True))
+             for fit in fits]
+    values = np.array([[own.get(name, problem.model[name]) for name in names] for own in found])
+    lanes = Lanes(problem.model, names, steps)
+    period, outputs = trace.period, trace.output_columns
+    squares, counts = [], []
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.position, problem.anchor)
+    for first, out in turns:
+        seen = trace.measurements[:, first:first + out.shape[1]]
+        left = out.transpose(0, 2, 1)[:, outputs] - seen
+        if seen.shape[1] > BLOCK:
+            left = remove_mains(left, period)
+        squares.append(sum_blocks(np.nan_to_num(left)))
+        counts.append(sum_blocks((~np.isnan(seen)).astype(float)))
+    blocks, count = np.concatenate(squares, axis=-1), np.concatenate(counts, axis=-1)
+    return [Judgement(trace.outputs, own, count) for own in blocks]

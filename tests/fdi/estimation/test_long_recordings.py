@@ -10,10 +10,9 @@ from physics_cases import QUIET
 
 from fdi.comparison.compare import compare
 from fdi.discovery.runs import collect_runs
-from fdi.estimation.excerpt import PIECE, choose_excerpt, cut_excerpt, is_long, make_excerpt
 from fdi.estimation.fit import Fit, linearise
-from fdi.estimation.judgement import judge_on_all
 from fdi.estimation.likelihood import Problem
+from fdi.estimation.long_recordings import PIECE, choose_excerpt, cut_excerpt, is_long, judge_on_all, make_excerpt
 from fdi.estimation.noise import white_noise
 from fdi.estimation.unknowns import list_tolerance_unknowns
 from fdi.trace.trace import Trace
