@@ -13,12 +13,12 @@ from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
-from fdi.estimation.likelihood import Free, Problem, compute_misfit
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, scale_noise
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, ignore_progress
-from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE
+from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE, WHITE_SQUARE_POOR
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -50,6 +50,11 @@ class Hypothesis:
     def is_at_floor(self) -> bool:
         """True when nothing but noise is left."""
         return max(self.ratio.values()) <= RESIDUAL_IS_NOISE
+
+    @property
+    def is_poor(self) -> bool:
+        """True when the fit leaves more than the noise that it was made with: it may have ended in a wrong valley."""
+        return bool(self.fit.misfit > WHITE_SQUARE_POOR * np.count_nonzero(self.fit.white))
 
     @property
     def cost(self) -> float:
@@ -106,12 +111,14 @@ class Search:
             return first
         return self.retry_from(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
-    def find_eased_start(self, free: Sequence[Free]) -> Floats:
-        """Where a fit gets to, (p,), that takes the noise for larger at first: priors hold it, small events vanish."""
-        x = np.zeros(len(free))
+    def find_eased_start(self, free: Sequence[Free], x: Floats | None = None, rounds: int = 4) -> Floats:
+        """Where a fit gets to, (p,), that takes the noise for larger at first: priors hold it, small events vanish.
+
+        It begins at `x` (p,), default the centres.
+        """
+        x = np.zeros(len(free)) if x is None else x
         for factor in EASED:
-            noise = tuple(n._replace(innovation=factor * n.innovation) for n in self.noise)
-            x = fit_unknowns(replace(self.problem, noise=noise), free, x, 4).x
+            x = fit_unknowns(scale_noise(self.problem, factor), free, x, rounds).x
         return x
 
     def retry_from(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
@@ -155,6 +162,31 @@ class Search:
             has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
             ranked[0] = self.retry_from(ranked[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
         return ranked
+
+    def add_each_with_more_noise(self, start: Hypothesis, tried: Sequence[Hypothesis], fitted: int = 6
+                                 ) -> list[Hypothesis]:
+        """`start` with one more effect each, chosen and fitted with the noise first taken for larger; best first.
+
+        Where the fit of `start` has ended in a wrong valley, a scan believes what that fit tells it, and fits begin
+        there. With more noise the tolerances stay near a healthy unit, and an effect is judged by the course of the
+        signals. The best two effects that have been `tried` are fitted in any case.
+        """
+        effects = [e for e in self.effects if e not in start.effects and not self._is_excluded(e, start.effects)]
+        loud = scale_noise(self.problem, EASED[0])
+        own = np.where([np.isfinite(f.prior) for f in start.fit.free], 0.0, start.fit.x)
+        begun = fit_unknowns(loud, start.fit.free, own, 4)
+        prospects = scan_effects(loud, begun, effects, self.workers)
+        known = {h.effects[-1] for h in tried[:2]}
+        worth = [p for p in prospects if p.cost < begun.cost - GAIN_WORTH_A_FIT]
+        chosen = dict.fromkeys([p.effect for p in worth[:fitted]] + [p.effect for p in worth if p.effect in known])
+
+        def fit_eased(p: Prospect) -> Hypothesis:
+            has_prior = np.array([np.isfinite(f.prior) for f in p.free])
+            x = self.find_eased_start(p.free, np.where(has_prior, 0.0, p.x))
+            return self.judge_fit((*start.effects, p.effect), fit_unknowns(self.problem, p.free, x))
+
+        eased = [p for p in worth if p.effect in chosen]
+        return sorted(self.map_parallel(fit_eased, eased), key=lambda h: h.cost)
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effect_files import restored_catalogue
-from noisy_traces import record_plant
+from noisy_traces import SHORT, record_plant
 from scipy.signal import lfilter
 
 from fdi.discovery.fingerprints import compute_firmware_residual, find_firmware_marks, find_quantisation
@@ -14,6 +14,7 @@ from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_e
 from fdi.discovery.scan import find_tones
 from fdi.discovery.search import Search, measure_repeating
 from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
+from fdi.estimation.fit import linearise
 from fdi.estimation.likelihood import BLOCK, compute_misfit, compute_weights
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.preparation import hold_inputs
@@ -181,3 +182,15 @@ def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None
     starts = find_tones(search.problem, search.fit_base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10
+
+
+def test_with_more_noise_an_effect_is_found_from_a_fit_in_a_wrong_valley() -> None:
+    """Where the tolerances of the fit before have ended does not matter: these fits begin at a healthy unit."""
+    trace = hold_inputs(record_plant({"sensor_lag.time": 1e-3}, SHORT, seed=4))
+    search = Search(Model(), trace, [], ["sensor_lag", "coil_lag"], 1)
+    base = search.fit_base()
+    wrong = search.judge_fit((), linearise(search.problem, base.fit.free, base.fit.x + 1.0))
+    assert wrong.is_poor and not wrong.is_at_floor
+    best = search.add_each_with_more_noise(wrong, [])[0]
+    assert best.effects == ("sensor_lag",) and best.is_at_floor and not best.is_poor
+    assert best.fit.values["sensor_lag.time"] == pytest.approx(1e-3, rel=0.1)
