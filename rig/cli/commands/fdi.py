@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--bands", metavar="FILE", help="bands to judge by (default: the shipped ones, for the preflight command)")
     add("--with-effects", action="store_true",
         help="search the catalogue for what else is wrong, and size both faults beside it "
-             "(up to half a minute of computing more)")
+             "(half a minute of computing more, two minutes where the search is hard)")
     add("--optimisers", action="store_true",
         help="compare with differential evolution, simulated annealing and a genetic algorithm: error, simulations, "
              "time")
