@@ -29,7 +29,6 @@ from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
 from plant.flat import list_state_values, make_lane_packers
 from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
-from plant.part import Part
 from plant.plants import MeasuredPressures, find_plant
 from plant.ports import at_reading
 from plant.state import Input
@@ -43,6 +42,17 @@ WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
 # two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
 NARROW, WIDE = 16, 32
 TURN = 20_000  # samples that a kernel makes in one call
+
+
+class Part(NamedTuple):
+    """A piece of a longer recording, one of several that follow one another in an array.
+
+    Its rows are first to stop - 1; they were `later` rows further on when they were recorded.
+    """
+
+    first: int
+    stop: int
+    later: int
 
 
 class Block(NamedTuple):

@@ -12,9 +12,9 @@ from fdi.discovery.detectable import Detectable, find_hidden_effects
 from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
 from fdi.discovery.search import Hypothesis, Search, WholeRuns
 from fdi.discovery.significance import Sensitivity, compute_sensitivity
-from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.estimation.long_recordings import is_long
+from fdi.estimation.replay import find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
-from plant.lanes import Lanes
+from plant.lanes import Lanes, Part
 from plant.model import Model
-from plant.part import Part
 from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]

@@ -25,9 +25,8 @@ from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
 from fdi.trace.trace import PER_ROW, Trace
-from plant.lanes import TURN, Lanes
+from plant.lanes import TURN, Lanes, Part
 from plant.model import Model
-from plant.part import Part
 
 Floats = NDArray[np.float64]
 

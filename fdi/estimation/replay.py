@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.likelihood import limit_dynamic_friction
+from fdi.estimation.fit import Fit
+from fdi.estimation.likelihood import Problem, limit_dynamic_friction
 from fdi.estimation.long_recordings import choose_excerpt, cut_excerpt, is_long, replay_in_turns
 from fdi.estimation.noise import WINDOW
 from fdi.estimation.unknowns import WITHOUT_NOISE, list_tolerance_sizes
@@ -190,6 +191,37 @@ def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Fla
     power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0) / sizes
     out: Flags = np.repeat(power > floor**2, sizes)
     return out
+
+
+def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
+    """Rows of the problem's run, (n,), in windows that a friction level off by `FRICTION_UNCERTAINTY` changes.
+
+    On soft oil a slow ramp is a chain of slips, and the time of each follows from the one before. A replay at the true
+    values drifts out of phase within a second, however fine its steps are, and is then wrong by the height of the
+    slips.
+
+    Args:
+        problem: with the run and its solver steps.
+        fit: the values to replay.
+        floor: of each signal, SI; smaller changes do not count.
+    """
+    frictions = list_frictions(problem.model)
+    names = [f.name for f in fit.free]
+    names += [name for name in frictions if name not in names]
+    values = {**problem.model.values, **fit.values}
+    base = np.array([values[name] for name in names])
+    moved = [base.copy() for _ in range(2 * len(frictions))]
+    for k, name in enumerate(frictions):
+        at = names.index(name)
+        moved[2 * k][at] *= 1.0 + FRICTION_UNCERTAINTY
+        moved[2 * k + 1][at] *= 1.0 - FRICTION_UNCERTAINTY
+    runs = problem.predict_outputs(names, limit_dynamic_friction(names, np.array([base, *moved])))
+    changes = np.abs(runs[1:] - runs[0])
+    undecided = np.zeros(runs.shape[2], bool)
+    for i, signal in enumerate(problem.trace.outputs):
+        large = find_large_windows(changes[:, i], max(floor[signal], UNDECIDED_SMALLEST[signal]))
+        undecided |= large & ~np.isnan(problem.trace.measurements[i])
+    return undecided
 
 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:

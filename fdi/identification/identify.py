@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.runs import Source
-from fdi.discovery.undecided import find_undecided_rows
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import start_fit
 from fdi.estimation.fit import Fit
@@ -23,6 +22,7 @@ from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_r
 from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
 from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
+from fdi.estimation.replay import find_undecided_rows
 from fdi.estimation.unknowns import silence_readings
 from fdi.identification.closed_form import estimate_by_regressions
 from fdi.identification.controller import ControllerGains, read_controller

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,9 @@ from fdi.trace.sections import Section, find_sections
 from fdi.trace.sensor_dynamics import SensorDynamics, read_sensors
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, escape_control_characters
-from plant.part import Part
+
+if TYPE_CHECKING:
+    from plant.lanes import Part  # a bench that reads its own log does not load the compiler
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -21,9 +21,8 @@ from plant.anchor import (
 )
 from plant.compile import interpret_function
 from plant.effects import CATALOGUE, load_effects
-from plant.lanes import Lanes, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
+from plant.lanes import Lanes, Part, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
-from plant.part import Part
 from plant.solve import read_sensors, step_cycle
 from plant.state import State
 
