@@ -383,9 +383,9 @@ def report_fit(last: Fit, problem: CountedProblem) -> Refinement:
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
     return Refinement(estimate_parameter(last, CLOGGING.parameter),
-                   estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
-                   {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
-                   sum(problem.counts))
+                      estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
+                      {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+                      sum(problem.counts))
 
 
 def estimate_parameter(found: Fit, name: str, factor: float = 1.0) -> Estimate:
