@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit, fit_unknowns
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds
-from fdi.estimation.unidentifiable import list_powers, scale_together
+from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED
 from plant.effects import CATALOGUE
 from plant.model import Model
@@ -27,7 +27,6 @@ Floats = NDArray[np.float64]
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
 REFIT_ROUNDS = 4
-VISCOSITY = {"viscosity_drift.factor": -1.0, "jack.damping": 1.0, "flapper.damping": 1.0, "jack.leakage": -1.0}
 SMALLEST_SEARCHED = 0.015  # of the smallest start: a scan tries no smaller sizes
 WITHOUT_SIZE = ("Hz", "rad")  # units of parameters that say where an effect is and not how large
 

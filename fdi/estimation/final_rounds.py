@@ -78,7 +78,7 @@ def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -
     jacobian = remove_slope(steep.reshape(len(x), *now.white.shape), flat)
     heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
     hessian = heavy @ jacobian.reshape(len(x), -1).T + np.diag([f.prior**-2 for f in now.free])
-    known = np.asarray(np.linalg.pinv(hessian), np.float64)
+    known = invert_hessian(hessian)
     return replace(now, cost=_add_prior(now, now.misfit), covariance=known, jacobian=jacobian)
 
 

@@ -1,21 +1,23 @@
 """What may be scaled in the plant without any signal showing it: directions along which priors alone decide.
 
 Torques, pressures and forces inside the servovalve are not measured. A filter that lets through less and pilot gains
-that are larger by as much are the same plant to every sensor; so are stronger springs behind a stronger motor. Slopes
-by differences do not show it, as each parameter shifts a hundred small stops of the spool; so along these directions
-slopes are set to zero, where a trial replay confirms it.
+that are larger by as much are the same plant to every sensor; so are stronger springs behind a stronger motor. Where
+the spool or the pressure of the jack is not measured, its scale is not seen either. Slopes by differences do not show
+this, as each parameter shifts a hundred small stops of the spool; so along these directions slopes are set to zero,
+where a trial replay confirms it.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit, cut_at_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, scaled_bounds
-from fdi.thresholds import FLAT_DIRECTION_MISFIT
+from fdi.thresholds import FLAT_DIRECTION_MISFIT, PRIORS_KNOW_MORE_MISFIT
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +25,10 @@ TRIED = 0.01  # of the logarithms: a way along a direction that is said to be fl
 # A stop of the spool that moves by chance can hide a flat direction in one of these trials, hardly in all four.
 TRIED_SHARES = (1.0, -1.0, 0.3, -0.3)  # of TRIED
 LOAD = "constant_load.force"  # one that nobody measured goes with the area that it acts against
-# Powers with which parameters move together; that of Kintas is one of what the filter lets through, 1 - Kintas.
+# Some parameters move by their distance from another value than 0: what a filter lets through is 1 - Kintas, what a
+# sensor shows of a position 1 + error.
+ORIGINS: Mapping[str, float] = {"filter.clogging": 1.0, "sensor_gain.error": -1.0}
+# Powers with which parameters move together.
 FLAT: tuple[Mapping[str, float], ...] = (
     {"filter.clogging": 1.0, "pilot.flow_gain": -0.5, "pilot.pressure_gain": -1.0, "supply.pressure": -1.0},
     {"spool.static_friction": 1.0, "spool.dynamic_friction": 1.0, "pilot.pressure_gain": 1.0, "supply.pressure": 1.0},
@@ -41,6 +46,64 @@ FLAPPER: Mapping[str, float] = {"pilot.flow_gain": 1.0, "pilot.pressure_gain": 1
                                 "flapper.damping": 1.0, "flapper.inertia": 1.0}
 
 
+class Direction(NamedTuple):
+    """Powers with which parameters move together, the signals that would show it, and what a replay may show of it."""
+
+    powers: Mapping[str, float]
+    shown_by: frozenset[str] = frozenset()  # where one of them is measured, the direction is not tried
+    allowed: float = FLAT_DIRECTION_MISFIT
+
+
+# Parameters of effects that move with those of each of `FLAT`.
+FLAT_WITH_EFFECTS: tuple[Mapping[str, float], ...] = (
+    {"supply_droop.slope": -1.0, "flow_force.coefficient": 1.0},
+    {"supply_droop.slope": 1.0},
+    {},
+    {"constant_load.force": 1.0, "aero_stiffness.stiffness": 1.0, "compressibility.coefficient": 1.0,
+     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0, "supply_droop.slope": -1.0},
+)
+
+# How far the spool moves: all that meets it moves with it. In a run in which it meets its stops the position shows it.
+SPOOL_WAY: Mapping[str, float] = {
+    "valve.flow_gain": -1.0, "valve.pressure_gain": -1.0, "feedback_spring.stiffness": -1.0, "pilot.flow_gain": 1.0,
+    "spool_overlap.overlap": 1.0, "spool_underlap.underlap": 1.0, "feedback_gap.gap": 1.0,
+    "flow_force.coefficient": -1.0}
+
+# The pressure across the piston, at the same forces on the ram.
+JACK_PRESSURE: Mapping[str, float] = {
+    "valve.pressure_gain": 1.0, "supply.pressure": 1.0, "jack.area": -1.0, "valve.flow_gain": -1.0,
+    "jack.leakage": -2.0, "compressibility.coefficient": -2.0, "supply_droop.slope": 2.0,
+    "flow_force.coefficient": -1.0}
+
+# A thicker oil drags more and leaks less.
+VISCOSITY: Mapping[str, float] = {"viscosity_drift.factor": -1.0, "jack.damping": 1.0, "flapper.damping": 1.0,
+                                  "jack.leakage": -1.0}
+
+# The scale of the position: where the sensor shows more, the ram moves less under larger forces.
+POSITION_SCALE: Mapping[str, float] = {
+    "sensor_gain.error": 1.0, "jack.area": 1.0, "jack.mass": 2.0, "jack.damping": 2.0, "jack.static_friction": 1.0,
+    "jack.dynamic_friction": 1.0, "constant_load.force": 1.0, "aero_stiffness.stiffness": 2.0,
+    "mount_compliance.compliance": -2.0, "mount_compliance.mass": 2.0, "rod_backlash.width": -1.0,
+    "stribeck.speed": -1.0, "presliding.deflection": -1.0}
+
+
+def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction]:
+    """What no measured signal may show, for linear unknowns; `at` are parameters by name, SI.
+
+    Of pressure gain and leakage only 1/GP + CLK/GQ shows: a smaller gain is a larger leakage.
+    """
+    pairs = zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)
+    share = at["valve.pressure_gain"] * at["jack.leakage"] / at.get("viscosity_drift.factor", 1.0)
+    loss = {"valve.pressure_gain": share / max(share, at["valve.flow_gain"]),
+            "jack.leakage": at["valve.flow_gain"] / max(share, at["valve.flow_gain"])}
+    every = [*(Direction({**flat, **effects}) for flat, effects in pairs), Direction(loss), Direction(VISCOSITY),
+             Direction(POSITION_SCALE),
+             Direction(FLAPPER, allowed=PRIORS_KNOW_MORE_MISFIT),
+             Direction(SPOOL_WAY, frozenset({"xs"}), PRIORS_KNOW_MORE_MISFIT),
+             Direction(JACK_PRESSURE, frozenset({"p12"}))]
+    return [each for each in every if not each.shown_by & set(problem.trace.outputs)]
+
+
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:
     """`FLAT` for the filter's law of this model."""
     law = problem.model.values.get("filter.law", 0.5)
@@ -53,12 +116,12 @@ def scale_together(free: Sequence[Free], x: Floats, said: Mapping[str, float], l
     for k, f in enumerate(free):
         if f.name in said:
             value, factor = f.centre + f.scale * float(x[k]), float(np.exp(said[f.name] * logarithm))
-            new = 1.0 - (1.0 - value) * factor if f.name == "filter.clogging" else value * factor
-            moved[k] = (new - f.centre) / f.scale
+            origin = ORIGINS.get(f.name, 0.0)
+            moved[k] = (origin + (value - origin) * factor - f.centre) / f.scale
     return moved
 
 
-def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Mapping[str, float]], Floats]:
+def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Direction], Floats]:
     """The directions that hold at `x` (p,), and their tangents of scaled unknowns as columns (p, k).
 
     Left out is a direction that a bound stops, or that a trial replay does not find flat.
@@ -67,16 +130,28 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
         return [], np.empty((len(x), 0))
     low, high = scaled_bounds(free)
     names = {f.name for f in free}
-    every = [said for said in list_powers(problem) if next(iter(said)) in names]
+    every = [each for each in _list_directions_at(problem, free, x) if next(iter(each.powers)) in names]
     if not every:
         return [], np.empty((len(x), 0))
-    trials = np.array([[scale_together(free, x, said, TRIED * share) for said in every] for share in TRIED_SHARES])
+    trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in every]
+                       for share in TRIED_SHARES])
     is_tried = ((trials >= low - 1e-9) & (trials <= high + 1e-9)).all(axis=2) & (trials != x).any(axis=2)
     samples = sum(len(trace) for trace in (problem.trace, *problem.also))
-    allowed = FLAT_DIRECTION_MISFIT * samples / 13500.0
+    allowed = np.array([each.allowed for each in every]) * samples / 13500.0
     held = [every[k] for k in np.flatnonzero(confirm_flat(problem, free, x, trials, is_tried, allowed))]
-    ways = [(scale_together(free, x, said, 1e-6) - x) / 1e-6 for said in held]
-    return held, np.array(ways).T if ways else np.empty((len(x), 0))
+    ways = _list_tangents(free, x, held)
+    apart = _find_independent(ways)
+    return [held[k] for k in apart], ways[apart].T
+
+
+def _list_directions_at(problem: Problem, free: Sequence[Free], x: Floats) -> list[Direction]:
+    return list_directions(problem, {**problem.model.values, **problem.list_values(free, x)})
+
+
+def _list_tangents(free: Sequence[Free], x: Floats, directions: Sequence[Direction]) -> Floats:
+    """Tangents at `x` (p,) as rows (k, p)."""
+    ways = [(scale_together(free, x, each.powers, 1e-6) - x) / 1e-6 for each in directions]
+    return np.array(ways).reshape(-1, len(x))
 
 
 def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: NDArray[np.bool_],
@@ -93,12 +168,14 @@ def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floa
             change its square's share.
     """
     limits = np.array(TRIED_SHARES)[:, None] ** 2 * allowed * np.ones(is_tried.shape[1])
-    confirmed = np.zeros(is_tried.shape, bool)
-    if is_tried.any():
-        white = problem.compute_white_residuals(free, np.vstack([x, trials[is_tried]]))
-        moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
-        confirmed[is_tried] = moved < limits[is_tried]
-    return np.asarray(confirmed.any(axis=0), np.bool_)
+    confirmed = np.zeros(is_tried.shape[1], bool)
+    for shares in ([0], [1, 2, 3]):  # most directions that are flat need no more than the first trial
+        due = is_tried & ~confirmed & np.isin(np.arange(len(is_tried)), shares)[:, None]
+        if due.any():
+            white = problem.compute_white_residuals(free, np.vstack([x, trials[due]]))
+            moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
+            confirmed[np.nonzero(due)[1][moved < limits[due]]] = True
+    return confirmed
 
 
 def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
@@ -114,18 +191,18 @@ def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
 def relax_fit(problem: Problem, found: Fit) -> Fit:
     """The fit moved along the flat directions to where the priors want it, if that leaves no more than before."""
     free, x = found.free, found.x
-    said, _ = find_tangents(problem, free, x)
-    if not said:
+    directions, _ = find_tangents(problem, free, x)
+    if not directions:
         return found
     prior = np.array([f.prior**-2 for f in free])
     low, high = scaled_bounds(free)
     for _ in range(6):  # Gauss-Newton on the priors alone, along the curved directions
-        ways = np.array([(scale_together(free, x, s, 1e-6) - x) / 1e-6 for s in said]).T
+        ways = _list_tangents(free, x, directions).T
         step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]
         for way in (1.0, 0.5, 0.25, 0.1):
             there = x
-            for s, part in zip(said, step, strict=True):
-                there = scale_together(free, there, s, way * float(part))
+            for each, part in zip(directions, step, strict=True):
+                there = scale_together(free, there, each.powers, way * float(part))
             if ((there >= low) & (there <= high)).all() and there**2 @ prior < x**2 @ prior:
                 x = there
                 break
