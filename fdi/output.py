@@ -41,6 +41,20 @@ def write_text(path: str | Path, text: str, option: str = "--out") -> None:
         raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
 
 
+def replace_text(path: str | Path, text: str) -> Path | None:
+    """Write a text file; return where the one that was there before is now (suffix .bak), None if there was none.
+
+    Raises:
+        InputError: a path that cannot be written.
+    """
+    path, backup = Path(path), None
+    if path.exists() and path.read_bytes():
+        backup = path.with_name(path.name + ".bak")
+        write_text(backup, path.read_text(encoding="utf-8"))
+    write_text(path, text)
+    return backup
+
+
 @contextlib.contextmanager
 def write_whole(path: str | Path) -> Iterator[Path]:
     """Give the path of a file to write, which takes the place of `path` at the end, if nothing went wrong.

@@ -24,7 +24,7 @@ from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import descend_valley, guess_covariance, start_fit
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, scale_noise, span_all_rows
-from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem
+from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem, take_logarithm
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
 from fdi.estimation.unidentifiable import FLAPPER, find_flat_directions
 from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, silence_readings
@@ -101,7 +101,7 @@ def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]
     usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
     ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
     taken = {f.name for f in (clogging, *friction, *suspects, ratio)}
-    tolerances = (_take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
+    tolerances = (take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
     return (clogging, *friction, *suspects, ratio, *tolerances)
 
 
@@ -113,13 +113,6 @@ def _make_suspect(s: Suspect, model: Model) -> Free:
                        0.02)
     usual = model.values.get(s.parameter, own.centre)
     return own._replace(centre=usual, scale=s.spread, prior=1.0, step=0.02)
-
-
-def _take_logarithm(f: Free) -> Free:
-    """A tolerance as one of the logarithm; unchanged if the parameter may be zero."""
-    if f.low <= 0.0:
-        return f
-    return LogFree(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
 
 
 def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping[str, float] | None = None,

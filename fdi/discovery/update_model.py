@@ -12,7 +12,7 @@ from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, build_fitted_model, check_addable, refit_effects
 from fdi.discovery.runs import Runs, read_runs, read_source
 from fdi.estimation.likelihood import limit_friction_values
-from fdi.output import write_text
+from fdi.output import replace_text
 from fdi.progress import Progress, ignore_progress
 from fdi.sources import name_software
 from fdi.thresholds import EFFECT_INTERVAL_FACTOR, INTERVAL_95_SD
@@ -170,11 +170,4 @@ def write_model_file(update: ModelUpdate, path: str | Path) -> Path | None:
     Raises:
         InputError: a file that cannot be written.
     """
-    path = Path(path)
-    text = model_file.format_model_file(update.model, update.compute_intervals(), update.provenance)
-    backup = None
-    if path.exists() and path.read_bytes():
-        backup = path.with_name(path.name + ".bak")
-        write_text(backup, path.read_text(encoding="utf-8"))
-    write_text(path, text)
-    return backup
+    return replace_text(path, model_file.format_model_file(update.model, update.compute_intervals(), update.provenance))

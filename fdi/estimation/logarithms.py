@@ -42,6 +42,13 @@ class LogOpenFilter(Free):
         return 1.0 - math.exp(super().value(x))
 
 
+def take_logarithm(f: Free) -> Free:
+    """A tolerance as one of the logarithm; unchanged if the parameter may be zero."""
+    if f.low <= 0.0:
+        return f
+    return LogFree(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
+
+
 def compute_values(free: Sequence[Free], x: Floats) -> Floats:
     """Parameters in SI units, (p,), of scaled unknowns (p,)."""
     found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])

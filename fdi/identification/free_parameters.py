@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fdi.estimation.likelihood import Free
-from fdi.estimation.logarithms import LogFree, LogFrictionRatio
+from fdi.estimation.logarithms import LogFree, LogFrictionRatio, take_logarithm
 from fdi.estimation.unknowns import list_tolerance_unknowns
 from fdi.thresholds import IDENTIFIED_SYSTEMATIC_SD, STATIC_FRICTION_SYSTEMATIC_SD
 from plant.errors import InputError
@@ -126,7 +126,7 @@ def get_systematic_sd(name: str) -> float:
 def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
     """What the fit may change: the free parameters, and the tolerances of the others."""
     free = {r.name: _make_free(r) for r in ranges}
-    free |= {f.name: _take_logarithm(f) for f in list_tolerance_unknowns(model) if f.name not in free}
+    free |= {f.name: take_logarithm(f) for f in list_tolerance_unknowns(model) if f.name not in free}
     if STATIC in free and DYNAMIC in free:
         usual = math.log(max(model[STATIC] / model[DYNAMIC], 1.0))
         is_free = STATIC in {r.name for r in ranges}
@@ -142,11 +142,3 @@ def _make_free(r: Range) -> Free:
     if r.is_relative:
         return LogFree(r.name, math.log(r.centre), r.half_width, 1.0, math.log(r.low), math.log(r.high), 0.02)
     return Free(r.name, r.centre, r.half_width, 1.0, r.low, r.high, 0.02)
-
-
-def _take_logarithm(f: Free) -> Free:
-    """A tolerance as one of the logarithm; unchanged if the parameter may be zero."""
-    if f.low <= 0.0:
-        return f
-    return LogFree(f.name, math.log(f.centre), f.scale / f.centre, f.prior, math.log(f.low), math.log(f.high), f.step)
-

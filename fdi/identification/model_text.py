@@ -7,7 +7,7 @@ from pathlib import Path
 from fdi.discovery.candidates import Value
 from fdi.discovery.model_file import Provenance, format_model_file
 from fdi.identification.identify import Identification
-from fdi.output import write_text
+from fdi.output import replace_text
 from fdi.sources import name_software
 
 
@@ -23,13 +23,7 @@ def write_identified_model(found: Identification, path: str | Path, command: str
     Raises:
         InputError: a file that cannot be written.
     """
-    path = Path(path)
-    backup = None
-    if path.exists() and path.read_bytes():
-        backup = path.with_name(path.name + ".bak")
-        write_text(backup, path.read_text(encoding="utf-8"))
-    write_text(path, format_identified_model(found, command, date))
-    return backup
+    return replace_text(path, format_identified_model(found, command, date))
 
 
 def format_identified_model(found: Identification, command: str = "", date: str = "") -> str:

@@ -17,8 +17,7 @@ from typing import Any
 from rig.live.dashboard import follow_run
 from rig.live.feed import LiveReader
 from rig.live.live_run import LivePlan, LiveRun
-from rig.live.viewer_place import is_listening
-from rig.view.viewer import find_free_port
+from rig.view.viewer import find_free_port, is_listening
 
 _EVERY = 0.1  # s between two pieces
 

@@ -3,13 +3,13 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import socket
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
 from fdi.output import require_writable
 from plant.errors import InputError
+from rig.view.viewer import is_listening
 
 
 class ViewerPlace(NamedTuple):
@@ -42,10 +42,3 @@ def find_viewer_place(text: str) -> ViewerPlace:
         raise InputError("--live", text, "a display for the viewer's window; without one rerun:FILE.rrd writes a file, "
                                          "and rerun:PORT uses a viewer that is open")
     return ViewerPlace()
-
-
-def is_listening(port: int) -> bool:
-    """Whether something accepts connections at a port of 127.0.0.1."""
-    with socket.socket() as probe:
-        probe.settimeout(1.0)
-        return probe.connect_ex(("127.0.0.1", port)) == 0

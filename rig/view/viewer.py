@@ -45,19 +45,25 @@ def serve_in_browser(rrd: Path, theme: str, patience: float = 20.0) -> Iterator[
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         deadline = time.monotonic() + patience
-        while not _is_listening(web):
+        while not is_listening(web):
             if server.poll() is not None or time.monotonic() > deadline:
                 raise ViewerError(f"the viewer for the browser does not come up within {patience:g} s")
             time.sleep(0.1)
         source = quote(f"rerun+http://127.0.0.1:{data}/proxy", safe="")
         yield f"http://127.0.0.1:{web}/?url={source}&theme={theme}", server
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGKILL)
-        server.wait()
+        kill_viewer(server)
 
 
-def _is_listening(port: int) -> bool:
+def kill_viewer(process: subprocess.Popen[Any]) -> None:
+    """End a viewer that was started in a session of its own: the process itself is only a wrapper around it."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def is_listening(port: int) -> bool:
+    """Whether something accepts connections at a port of 127.0.0.1."""
     with socket.socket() as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(("127.0.0.1", port)) == 0
@@ -119,9 +125,7 @@ def _draw_views(shown: Sequence[ShownView], rrd: Path, image: Path,
             last = next((line for line in reversed(output.read().splitlines()) if line.strip()), "it printed nothing")
             raise ViewerError(f"the viewer does not draw: {error}; its last line: {last.strip()}") from error
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
-            viewer.wait()
+            kill_viewer(viewer)
     return views, pixels
 
 

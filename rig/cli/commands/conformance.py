@@ -148,12 +148,12 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
         RigError: it does not boot.
     """
     import os
-    import subprocess
     import sys
 
     from plant.errors import RigError
     from rig.firmware.build import build_controller
     from rig.run.participants import require_firmware_bus
+    from rig.run.processes import NodeProcesses
 
     if name not in OWN_NODES:
         yield
@@ -171,21 +171,17 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
     else:
         command = [sys.executable, "-m", "rig.cli.main", "node", name, "--bus", bus, "--quiet", "--parent",
                    str(os.getpid())]
-    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+    processes = NodeProcesses()
+    processes.start(OWN_NODES[name], command)
     try:
         for _ in range(120):  # s: it may have to compile the plant first
-            if wire.wait(lambda: boot_up in booted, 1.0) or child.poll() is not None:
+            if wire.wait(lambda: boot_up in booted, 1.0) or processes.find_ended():
                 break
         if boot_up not in booted:
             raise RigError(f"our own node {OWN_NODES[name]} ({name}) did not start")
         yield
     finally:
-        child.terminate()
-        try:
-            child.wait(5)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
+        processes.stop()
 
 
 def _make_folder(out: str | None) -> Path | None:

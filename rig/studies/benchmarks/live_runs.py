@@ -30,13 +30,12 @@ from fdi.progress import Progress, ignore_progress
 from fdi.trace.trace import Trace
 from plant.errors import InputError, RigError
 from rig.live.viewer_feeder import make_viewer_command
-from rig.live.viewer_place import is_listening
 from rig.network.clock import WallClock
 from rig.network.raw_bus import can_open
 from rig.run.hard_loop import compile_cycle
 from rig.run.priority import list_cpus
 from rig.studies.benchmarks.realtime import choose_priority, compute_percentiles
-from rig.view.viewer import find_free_port
+from rig.view.viewer import find_free_port, is_listening, kill_viewer
 
 Seconds = NDArray[np.float64]
 WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"
@@ -131,9 +130,7 @@ def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
             clock.sleep_until(clock.now() + 100_000_000)
         yield port
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(viewer.pid, signal.SIGKILL)  # the module we start is only a wrapper around the viewer
-        viewer.wait()
+        kill_viewer(viewer)
 
 
 def play_run(bus: str, seconds: float, options: Sequence[str]) -> dict[str, Seconds]:
