@@ -10,6 +10,7 @@ import numpy as np
 
 from fdi.discovery.candidates import Answer, assess_explanation
 from fdi.discovery.explain import Explanation, explain
+from fdi.discovery.laws.effect_source import write_law_file
 from fdi.discovery.refit import lean_model
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import WholeRuns, choose_search_excerpt
@@ -24,7 +25,7 @@ from plant.run import report_law_errors
 from plant.starts import ensure_starts
 
 if TYPE_CHECKING:
-    from fdi.discovery.laws.find_law import Law, LawSearch
+    from fdi.discovery.laws.find_law import LawSearch
     from fdi.discovery.residual_pattern import Pattern
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
@@ -68,20 +69,9 @@ def look_for_law(explanation: Explanation, holdout: Trace | None, progress: Prog
         return None
     if explanation.search.model.plant != "eha":
         return None  # the terms have been tried on the reference model's balances only
-    from fdi.discovery.laws.law_file import find_law_beside  # takes half a second to import
+    from fdi.discovery.laws.find_law import find_law_beside  # takes half a second to import
 
     return find_law_beside(explanation, holdout, progress)
-
-
-def write_law_file(law: Law, path: str | Path) -> dict[str, str]:
-    """Write a law as an effect file; the names of its effects, by balance.
-
-    Raises:
-        InputError: a place that cannot be written.
-    """
-    from fdi.discovery.laws import law_file
-
-    return law_file.write_law_file(law, path)
 
 
 def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:

@@ -52,7 +52,7 @@ def _describe_result(found: LawSearch) -> str:
 
 
 def _tabulate_terms(law: Law) -> Table:
-    from fdi.discovery.laws.law_file import describe_formula
+    from fdi.discovery.laws.effect_source import describe_formula
 
     rows: list[list[Cell | str]] = []
     for term in law.terms:
@@ -124,7 +124,7 @@ def collect_law_data(found: LawSearch, effects: Sequence[str]) -> dict[str, Any]
         "not_observable": dict(found.hidden), "law": None}
     if law is None:
         return data
-    from fdi.discovery.laws.law_file import describe_formula
+    from fdi.discovery.laws.effect_source import describe_formula
 
     terms = [{"term": t.name, "place": t.place, "meaning": t.words,
               "parameters": {f: vars(law.values[f]) for f in t.fields}} for t in law.terms]

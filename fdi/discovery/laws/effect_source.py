@@ -1,13 +1,20 @@
-"""The text of an effect file: a law's terms as plain Python, with its parameters, their units and ranges."""
+"""The effect file of a law: its terms as plain Python, with its parameters, their units and ranges."""
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fdi.discovery.laws.terms import PARTS, STATES, Term, find_states
+from fdi.output import write_text
+from plant.effects import CATALOGUE
+
+if TYPE_CHECKING:
+    from fdi.discovery.laws.find_law import Law
 
 PORTS = {"force": "jack_drag", "flow": "valve", "current": "current"}
 """Where the terms of a balance act; a law of forces alone acts at `load`."""
@@ -21,6 +28,33 @@ from plant.state import Drag, Line
 
 
 """
+
+
+def write_law_file(law: Law, path: str | Path) -> dict[str, str]:
+    """Write a law as an effect file; the names of its effects, by balance.
+
+    Raises:
+        InputError: a place that cannot be written.
+    """
+    names = _name_effects(law)
+    lines = [f"Found by rig explain: {describe_formula(law)}.", ""]
+    for term in law.terms:
+        v = law.values[term.name]
+        lines.append(f"{term.name}: {term.words}, {v.value:.4g} {v.unit} (95 %: {v.low:.4g} to {v.high:.4g}).")
+    text = "\n".join([*lines, "", f"{law.reason[0].upper()}{law.reason[1:]}."]) + "\n"
+    values = {name: v.value for name, v in law.values.items()}
+    write_text(path, write_effects(names, law.terms, values, text), "--write-effect")
+    return names
+
+
+def _name_effects(law: Law) -> dict[str, str]:
+    """Names of the law's effects, by balance, that no other effect has."""
+    known, names = CATALOGUE.list_all(), {}
+    for place in dict.fromkeys(term.place for term in law.terms):
+        free = [name for number in range(1, 100)
+                if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in known]
+        names[place] = free[0]
+    return names
 
 
 def write_effects(names: Mapping[str, str], terms: Sequence[Term], values: Mapping[str, float], text: str) -> str:
@@ -108,6 +142,12 @@ def format_formula(terms: Sequence[Term]) -> str:
     sign = " - " if terms[0].place != "force" else " + "
     simple = [part.replace(" * (1.0)", "").replace("(1.0 * (", "((") for part in parts]
     return f"{terms[0].place}{sign}" + sign.join(_strip_brackets(part) for part in simple)
+
+
+def describe_formula(law: Law) -> str:
+    """The law in symbols, one balance after the other."""
+    places = dict.fromkeys(term.place for term in law.terms)
+    return "; ".join(format_formula([t for t in law.terms if t.place == place]) for place in places)
 
 
 def _strip_brackets(part: str) -> str:

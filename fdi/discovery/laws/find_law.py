@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.balance import EDGE, Balance, States, compute_balances
+from fdi.discovery.explain import Explanation
 from fdi.discovery.laws.dependence import Dependence, find_dependences
 from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
 from fdi.discovery.laws.regression import THINNED, Proposal, evaluate_columns, propose_terms, select_rows
@@ -170,6 +171,28 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, hol
     curve = None if law is None else compute_law_curve(law, search, base.effects)
     said = law.floor if law is not None and law.holds else floor
     return LawSearch(missing, hidden, law, base, catalogue, errors, said, curve)
+
+
+def find_law_beside(e: Explanation, holdout: Trace | None, progress: Progress = ignore_progress) -> LawSearch:
+    """The law behind what an explanation leaves.
+
+    Of a part that the catalogue explains, the law is tried alone first, then beside the named effects.
+    """
+    best = e.ranked[0] if e.ranked else None
+    found = find_law(e.search, e.base, best, holdout, e.floor, progress)
+    if e.verdict != "PARTLY" or len(e.ledger) < 2 or (found.law is not None and found.law.hypothesis.is_at_floor):
+        return found
+    beside = find_law(e.search, e.ledger[-1], best, holdout, e.floor, progress)
+    if beside.law is None or not beside.law.holds:
+        return found
+    if found.law is None or not found.law.holds or _measure_left(beside, e.floor) < _measure_left(found, e.floor):
+        return beside
+    return found
+
+
+def _measure_left(found: LawSearch, floor: Mapping[str, float]) -> float:
+    assert found.law is not None
+    return measure_excess(found.law.holdout or found.law.hypothesis.errors, floor)
 
 
 def _describe_balance(b: Balance, states: States, there: tuple[list[Balance], States] | None) -> Missing:

@@ -12,9 +12,8 @@ from short_runs import STEPS, build_command, build_other_command
 
 from fdi.discovery.balance import Balance, States, measure_way
 from fdi.discovery.laws.dependence import find_dependences
-from fdi.discovery.laws.effect_source import format_formula, write_effects, write_law
+from fdi.discovery.laws.effect_source import format_formula, write_effects, write_law, write_law_file
 from fdi.discovery.laws.find_law import LawSearch, find_law
-from fdi.discovery.laws.law_file import write_law_file
 from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
 from fdi.discovery.laws.regression import evaluate_columns, propose_terms, select_rows
 from fdi.discovery.laws.terms import PARTS, STATES, TERMS, find_states
