@@ -175,6 +175,19 @@ EFFECT_SYSTEMATIC_SD = 0.01
 SUSPICIOUS_TOLERANCES = 3.0
 """Tolerances by which a fitted parameter may be off before it is reported as suspicious."""
 
+FIRMWARE_DIFFERS = 3.0
+"""RMS of Cor against the model's firmware, in units of what rounding leaves, above which the firmware differs.
+
+Rounding of what the bus and the file hold gives 1; columns that are rounded twice, 1.9."""
+
+FINEST_COMB = 2.5e-7
+"""Steps of a recorded position, m, above which they are none of the bus, whose counts are 1e-7 m."""
+
+ROUNDED_SHARE = 0.95
+"""Share of the samples that must differ by half a step of XJ at most for the recorder to have rounded it.
+
+All do if the controller reads the position finer than the recording holds it; a firmware that differs leaves more."""
+
 PATTERN_VISIBLE_RATIO = 1.3
 """Missing force, flow or current over what sensor noise alone gives, from which on its pattern is shown."""
 

@@ -29,10 +29,12 @@ from fdi.thresholds import (
     BLOCK_EXCESS_LEAST,
     CONTROLLER_ERROR_RATIO,
     CONTROLLER_LAG_RATIO,
+    FINEST_COMB,
     NOISY_SENSOR_RATIO,
     SHAPE_TIE_GAIN,
     SPOOL_FITS_RATIO,
 )
+from fdi.trace.resolution import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Trace, bridge_gaps, hold_last, rms, shift_rows
 from plant.controller import compute_answers
 from plant.forced import compute_flow_balance, compute_force_balance
@@ -340,22 +342,12 @@ def _compare_at_lags(trace: Trace, model: Model, com: int, xj: int) -> Controlle
     single_precision = 1e-7  # of the current limit: a firmware may calculate in single precision
     rounding = float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0)
     floor = max(rounding, single_precision * limit)
+    comb = find_comb(trace.xj, FINEST_COMB)
+    if comb and is_rounding_left(residual, gain * comb.step, floor):
+        # the controller reads XJ finer than the recording holds it
+        floor = math.hypot(floor, gain * comb.step / math.sqrt(12.0))
     error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
     return ControllerBlock(residual, error, floor, com, xj, limit=limit)
-
-
-def measure_resolution(x: Floats) -> float:
-    """The RMS step between the values that a column can hold, from the digits they are written with."""
-    values = np.unique(x[~np.isnan(x)])
-    values = values[:: max(1, len(values) // 400)]  # a few hundred show as many digits as all
-    digits, places = 1, -30
-    for value in values[values != 0.0].tolist():
-        mantissa, _, exponent = f"{value:.11e}".partition("e")  # 12 digits: more is rounding of a float
-        shown = mantissa.lstrip("-").replace(".", "").rstrip("0")
-        digits, places = max(digits, len(shown)), max(places, len(shown) - 1 - int(exponent))
-    size = np.floor(np.log10(np.maximum(np.abs(values), 1e-300)))
-    steps = np.where(values == 0.0, 0.0, 10.0 ** (size - digits + 1))
-    return float(np.sqrt(np.mean(np.maximum(steps, 10.0**-places) ** 2)))
 
 
 def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int, int, float]:

@@ -36,7 +36,7 @@ from fdi.diagnosis.refine import (
     report_fit,
 )
 from fdi.discovery.candidates import list_fitted_parameters
-from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
+from fdi.discovery.fingerprints import find_marks
 from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation.final_rounds import descend_valley, guess_covariance, linearise_across
 from fdi.estimation.fit import Fit
@@ -101,13 +101,10 @@ def make_joint_problem(model: Model, trace: Trace, floor: Mapping[str, float], w
 def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
                 ) -> tuple[dict[str, dict[str, Estimate]], dict[str, float]]:
     """Effects that are read off without noise, and the floors with the rounding of the position among them."""
-    tooth = find_quantisation(trace) if "quantisation" not in model.effects else None
-    prints = [*([tooth] if tooth else []), *find_firmware_marks(model, [trace])[1][:1]]
-    floor = dict(floor)
-    if tooth:
-        step = tooth.parameters["quantisation.lsb"][0]
-        floor["xj"] = max(floor["xj"], float(np.hypot(model["sensors.position_noise"], step / np.sqrt(12.0))))
-    return {p.effect: {name: Estimate(*of) for name, of in p.parameters.items()} for p in prints}, floor
+    marks, floor = find_marks(model, [trace]), dict(floor)
+    if marks.step and "quantisation" not in model.effects:
+        floor["xj"] = max(floor["xj"], float(np.hypot(model["sensors.position_noise"], marks.rounding)))
+    return {p.effect: {name: Estimate(*of) for name, of in p.parameters.items()} for p in marks.prints}, floor
 
 
 def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:

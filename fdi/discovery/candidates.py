@@ -10,7 +10,7 @@ import numpy as np
 
 from fdi.discovery.detectable import Detectable
 from fdi.discovery.explain import Explanation, measure_gain
-from fdi.discovery.fingerprints import Fingerprint, measure_firmware_resolution
+from fdi.discovery.fingerprints import Fingerprint
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.significance import compute_p_value
 from fdi.estimation.fit import Fit
@@ -123,8 +123,8 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
     hand = _list_firmware_marks(e)
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
-        unit = measure_firmware_resolution(e.search.problem.model)
-        baseline["error"]["cor"], baseline["floor"]["cor"] = e.controller * unit, unit
+        unit = e.marks.resolution
+        baseline["error"]["cor"], baseline["floor"]["cor"] = e.marks.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
     blind = tuple(_describe_blind(d) for d in e.hidden)
@@ -160,7 +160,7 @@ def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
 
 def _list_candidates(e: Explanation, seed: int) -> list[Candidate]:
     """Each effect once, in the order of the explanations it is part of."""
-    found = {p.effect: _describe_mark(e, p) for p in e.prints}
+    found = {p.effect: _describe_mark(e, p) for p in e.marks.prints}
     for rank, h in enumerate(e.ranked):
         for effect in h.effects if rank == 0 else h.effects[-1:]:
             if effect not in found:
@@ -197,7 +197,7 @@ def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
 
 
 def _list_firmware_marks(e: Explanation) -> list[Fingerprint]:
-    return [p for p in e.prints if CATALOGUE[p.effect].firmware]
+    return [p for p in e.marks.prints if CATALOGUE[p.effect].firmware]
 
 
 def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
@@ -205,7 +205,7 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
     error, ratios = dict(e.base.errors), dict(e.base.ratio)
     if CATALOGUE[p.effect].firmware:
-        error["cor"] = p.after * measure_firmware_resolution(e.search.problem.model)
+        error["cor"] = p.after * e.marks.resolution
         ratios = {"cor": p.after}
     n = len(e.search.problem.trace)
     won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
@@ -223,11 +223,11 @@ def _describe_blind(d: Detectable) -> Blind:
 
 def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]
             ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
-    unit = measure_firmware_resolution(e.search.problem.model)
-    cor = {"cor": e.controller * unit} if hand else {}
+    unit = e.marks.resolution
+    cor = {"cor": e.marks.controller * unit} if hand else {}
     rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
         (None, e.base.errors | cor, e.holdout.get((), {}))]
-    for p in e.prints:
+    for p in e.marks.prints:
         if p.effect in e.effects:
             cor = {"cor": p.after * unit} if p in hand else cor
             rows.append((p.effect, e.base.errors | cor, e.holdout.get((), {})))

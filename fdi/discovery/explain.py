@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.detectable import Detectable, find_hidden_effects
-from fdi.discovery.fingerprints import Fingerprint, find_firmware_marks, find_quantisation
+from fdi.discovery.fingerprints import Marks, find_marks
 from fdi.discovery.search import Hypothesis, Search, WholeRuns
 from fdi.discovery.significance import Sensitivity, compute_sensitivity
 from fdi.estimation.likelihood import Problem, compute_typical_rms
@@ -58,8 +58,7 @@ class Explanation:
     ledger: tuple[Hypothesis, ...]  # base, then one more effect each
     floor: Mapping[str, float]
     holdout: Mapping[tuple[str, ...], Mapping[str, float]]
-    prints: tuple[Fingerprint, ...]
-    controller: float  # error of the firmware's answer, in units of its resolution
+    marks: Marks
     blind: Sensitivity
     search: Search = field(repr=False)
     unseen: Mapping[tuple[str, ...], HeldOut] = field(default_factory=dict)  # of the best hypotheses
@@ -81,22 +80,20 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         workers: threads; default one a core.
         whole: the recordings that `est` and `repeats` were cut from, where they were: what is found is judged on them.
     """
-    controller, prints = find_firmware_marks(model, [whole.est, *whole.repeats] if whole else [est, *repeats])
-    tooth = find_quantisation(whole.est if whole else est)
-    found = ([tooth] if tooth and "quantisation" not in model.effects else []) + prints[:1]
+    marks = find_marks(model, [whole.est, *whole.repeats] if whole else [est, *repeats])
     candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
     search = Search(model, est, repeats, candidates, workers)
     search.whole = whole
-    if tooth:
-        search.coarse = {"xj": tooth.parameters["quantisation.lsb"][0] / np.sqrt(12.0)}
+    if marks.step:
+        search.coarse = {"xj": marks.rounding}
     progress("fitting the tolerances", 0.03)
     base = search.fit_base()
     if base.is_at_floor:
         search.learn_noise(base)
         base = search.refit_hypothesis(base)
     levels = _search_levels(search, base, holdout, progress)
-    return _conclude(search, levels, found, controller, holdout, progress)
+    return _conclude(search, levels, marks, holdout, progress)
 
 
 def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress
@@ -171,8 +168,8 @@ def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN)
     return measure_gain(parent, h) > least
 
 
-def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fingerprint], controller: float,
-              holdout: Trace | None, progress: Progress) -> Explanation:
+def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, holdout: Trace | None, progress: Progress
+              ) -> Explanation:
     firsts = [level[0] for level in levels]
     depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
@@ -206,9 +203,9 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
     unseen = {h.effects: _judge_unseen_run(search, h, holdout, floor) for h in close} if holdout else {}
     holding = [h for h in close if not holdout or unseen[h.effects].holds]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
-    verdict, named = _decide_verdict(base, close, holding, part, found, controller, floor)
+    verdict, named = _decide_verdict(base, close, holding, part, marks, floor)
     if verdict == "PARTLY" and close and _is_named_for_a_period(search, base, close[0]):
-        named = tuple(f.effect for f in found)
+        named = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
@@ -217,7 +214,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], found: Sequence[Fi
         progress("what this test cannot see", 0.94)
         hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
         hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
-    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, tuple(found), controller,
+    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks,
                        blind, search, unseen, hidden)
 
 
@@ -237,13 +234,13 @@ def _find_parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> H
 
 
 def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
-                    found: Sequence[Fingerprint], controller: float, floor: Mapping[str, float]
+                    marks: Marks, floor: Mapping[str, float]
              ) -> tuple[str, tuple[str, ...]]:
     """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run,
     `part` says that the best one leaves less of it than the base does.
     """
-    prints = tuple(f.effect for f in found)
-    firmware_left = controller > 3.0 and not any(CATALOGUE[f.effect].firmware for f in found)
+    prints = tuple(f.effect for f in marks.prints)
+    firmware_left = marks.is_firmware_different and not any(CATALOGUE[effect].firmware for effect in prints)
     if not close:
         if not base.is_at_floor:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints

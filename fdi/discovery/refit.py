@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.explain import measure_gain, measure_holdout
-from fdi.discovery.fingerprints import find_firmware_marks, find_quantisation
+from fdi.discovery.fingerprints import find_marks
 from fdi.discovery.scan import Prospect, scan_effects
 from fdi.discovery.search import Hypothesis, Search, WholeRuns, choose_search_excerpt
 from fdi.estimation.final_rounds import finish_fit
@@ -241,8 +241,8 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
     for name in effects:
         if CATALOGUE[name].port not in UNREPLAYED:
             continue
-        tooth = find_quantisation(traces[0]) if name == "quantisation" else None
-        prints = [tooth] if tooth else [p for p in find_firmware_marks(model, traces)[1] if p.effect == name]
+        marks = find_marks(model, traces)
+        prints = [p for p in (*marks.prints, *marks.rivals) if p.effect == name]
         if not prints:
             where = "steps in the measured positions" if CATALOGUE[name].port == "reading" else \
                 "a difference between Cor and the model's firmware that it explains"

@@ -61,7 +61,7 @@ def build_explanation_report(a: Answer, title: str, model: str, sources: Sequenc
         Section("What this test cannot detect", [_tabulate_blind(a)] if a.blind else [], medium=Medium.PAGE),
         Section("Provenance", [Listing(command, medium=Medium.PAGE)] if command else [])]
     facts = [("model", model), *list_sources(sources, bool(a.baseline["holdout"]))]
-    notes = [*notes, *([a.explanation.excerpt] if a.explanation.excerpt else [])]
+    notes = [*notes, *([a.explanation.excerpt] if a.explanation.excerpt else []), *_describe_rounding(a)]
     return Report("explain", title, a.verdict, MOODS[a.verdict], describe_verdict(a), facts, notes, sections,
                   next_command, files, collect_data(a, notes))
 
@@ -186,6 +186,15 @@ def _describe_undecided(a: Answer) -> list[str]:
     worst = max(held.decided[s] / floor[s] for s in held.decided)
     return [f"{held.undecided:.0%} of it is not judged, because stops of the ram or the spool there depend on a "
             f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor"]
+
+
+def _describe_rounding(a: Answer) -> list[str]:
+    """A note where the recorder has rounded the position."""
+    marks = a.explanation.marks
+    if not marks.is_recorder:
+        return []
+    return [f"XJ is recorded in steps of {format_amount(marks.step, 'm')}, but Cor shows that the controller reads it "
+            "finer: the rounding is noise of the recording and no effect"]
 
 
 def describe_suspicious(found: Sequence[Suspicious]) -> str:
@@ -320,7 +329,7 @@ def collect_data(a: Answer, notes: Sequence[str] = ()) -> dict[str, Any]:
                       "usual": b.usual, "revealed_by": b.revealed_by} for b in a.blind],
         "seen_without_noise": list(a.noiseless), "suspicious": [s._asdict() for s in a.suspicious],
         "separate": dict(a.separate), "pattern": a.pattern,
-        "controller": {"error": e.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor},
+        "controller": {"error": e.marks.controller, "unit": "counts"}, "signals": {s: SIGNAL_NAMES[s] for s in e.floor},
         "notes": list(notes)}
     held = e.unseen.get(a.best.effects)
     if held is not None and held.decided:

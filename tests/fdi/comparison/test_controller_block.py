@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import record_healthy
 
-from fdi.comparison.blocks import compare_controller, find_lags, measure_resolution
+from fdi.comparison.blocks import compare_controller, find_lags
 from fdi.estimation.preparation import read_cycles
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
 from fdi.trace.trace import Trace, shift_rows
@@ -65,13 +65,13 @@ def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     assert find_lags(c, 8e-3)[:2] == (0, 0)
 
 
-def test_resolution_of_a_column() -> None:
-    rng = np.random.default_rng(0)
-    assert measure_resolution(np.round(rng.standard_normal(1000), 3)) == pytest.approx(1e-3, rel=0.01)
-    assert measure_resolution(np.round(rng.standard_normal(1000) * 1e5) * 1e-8) == pytest.approx(1e-8, rel=0.01)
-    six = np.array([float(f"{x:.5e}") for x in rng.uniform(1, 9, 1000)])
-    assert measure_resolution(six) == pytest.approx(1e-5, rel=0.01)
-    assert measure_resolution(rng.standard_normal(1000)) < 1e-10
+def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace) -> None:
+    step = 7.3e-6
+    rounded = replace(c, xj=step * np.round(c.xj / step))
+    found = compare_controller(rounded, MODEL)
+    assert 0.5 < found.ratio < CONTROLLER_ERROR_RATIO
+    other = MODEL.replace({"controller.proportional_gain": 1.1 * MODEL["controller.proportional_gain"]})
+    assert compare_controller(rounded, other).ratio > CONTROLLER_ERROR_RATIO
 
 
 def test_missing_samples_are_not_judged(c: Trace) -> None:

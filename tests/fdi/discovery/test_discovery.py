@@ -1,6 +1,7 @@
 """The statistics behind `rig explain`: noise and its whitening, the block-wise likelihood, nulls, marks, shapes."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from effect_files import restored_catalogue
 from noisy_traces import SHORT, record_plant
 from scipy.signal import lfilter
 
-from fdi.discovery.fingerprints import compute_firmware_residual, find_firmware_marks, find_quantisation
+from fdi.discovery.explain import explain
+from fdi.discovery.fingerprints import compute_firmware_residual, find_marks
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
 from fdi.discovery.scan import find_tones
 from fdi.discovery.search import Search, measure_repeating
@@ -114,19 +116,31 @@ def test_the_firmware_leaves_its_mark_without_noise() -> None:
     model = Model()
     healthy, limited = hold_inputs(_recorded({})), hold_inputs(_recorded({"command_rate_limit.rate": 0.12}))
     assert np.nanmax(np.abs(compute_firmware_residual(model, healthy))) == 0.0
-    assert find_firmware_marks(model, [healthy]) == (0.0, [])
-    error, found = find_firmware_marks(model, [limited])
-    assert error > 100.0
+    plain = find_marks(model, [healthy])
+    assert (plain.controller, plain.prints, plain.step) == (0.0, (), 0.0)
+    marks = find_marks(model, [limited])
+    assert marks.controller > 100.0 and marks.is_firmware_different
+    found = marks.prints
     assert [f.effect for f in found] == ["command_rate_limit"]
     value, low, high = found[0].parameters["command_rate_limit.rate"]
     assert low <= 0.12 <= high or value == pytest.approx(0.12, rel=1e-6)
 
 
 def test_a_converter_with_few_bits_leaves_a_comb() -> None:
-    assert find_quantisation(hold_inputs(_recorded({}))) is None
-    tooth = find_quantisation(hold_inputs(_recorded({"quantisation.lsb": 7.3e-6})))
-    assert tooth is not None
-    assert tooth.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4)
+    marks = find_marks(Model(), [hold_inputs(_recorded({"quantisation.lsb": 7.3e-6}))])
+    assert [p.effect for p in marks.prints] == ["quantisation"] and not marks.is_recorder
+    assert marks.prints[0].parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4)
+
+
+def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
+    def record_rounded(changes: dict[str, float], seed: int) -> Trace:
+        trace = record_plant(changes, SHORT, seed)
+        return hold_inputs(replace(trace, xj=2e-6 * np.round(trace.xj / 2e-6)))
+
+    healthy = find_marks(Model(), [record_rounded({}, 3)])
+    assert healthy.is_recorder and healthy.controller < 2.0 and not healthy.prints
+    found = explain(Model(), record_rounded({"sensor_lag.time": 1e-3}, 1), [record_rounded({"sensor_lag.time": 1e-3}, 2)])
+    assert (found.verdict, found.effects) == ("EXPLAINED", ("sensor_lag",)) and found.marks.is_recorder
 
 
 def test_a_wave_over_the_position_is_found() -> None:
