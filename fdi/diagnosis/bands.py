@@ -14,15 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Level
-from fdi.diagnosis.simulated_units import DYNAMIC
-from fdi.progress import Progress, ignore_progress
+from fdi.diagnosis.faults import CLOGGING, DYNAMIC, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Level
 from fdi.thresholds import (
     BAND_EVENT_SAMPLES,
     BAND_FAULT_CLEARANCE_SD,
     BAND_LARGEST_LOAD,
     BAND_NEAREST_LIMIT_SD,
-    BAND_UNITS_QUICK,
     FAST_SLIP_RATIO,
     FRICTION_HIDES_CLOGGING_RATIO,
     SAME_COMMAND_POSITION,
@@ -33,7 +30,7 @@ from fdi.thresholds import (
 from fdi.trace.sections import Section, describe_section, find_sections
 from fdi.trace.trace import Trace, hold_last
 from plant.errors import InputError
-from plant.model import Model, load_model
+from plant.model import Model
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -288,20 +285,6 @@ def describe_other_model(bands: Bands, model: Model) -> str:
     return f"the model {name} with {design or 'all parameters nominal'}"
 
 
-def choose_bands(com: Floats, load: Floats, period: float, model: Model | None = None,
-                 progress: Progress = ignore_progress) -> Bands:
-    """The preflight's own bands if they are of this command, load and model; else bands made for them."""
-    from fdi.diagnosis.bands_file import load_default_bands
-    from fdi.diagnosis.learn_bands import make_bands_by_simulation
-
-    if (model is None or is_nominal_plant(model)) and not is_loaded(load):
-        own = load_default_bands()
-        if matches_command(own, com, period):
-            return own
-    return make_bands_by_simulation(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK,
-                                    progress=progress)
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # The verdict
 # ---------------------------------------------------------------------------------------------------------------------
@@ -328,19 +311,14 @@ class BandVerdict(NamedTuple):
     notes: tuple[str, ...]
 
 
-def judge_trace(source: Trace, bands: Bands | None = None, model: Model | None = None,
-                progress: Progress = ignore_progress, where: object = "trace") -> BandVerdict:
+def judge_trace(source: Trace, bands: Bands, where: object = "trace") -> BandVerdict:
     """Judge a trace; rows that its preparation found unusable are left out.
-
-    Without `bands` the preflight's own are taken if they are of this command, load and model. Otherwise bands are
-    made by simulating units of the `model` (default: the nominal one) on this command, which takes some seconds.
 
     Raises:
         InputError: no position, or bands of another command or load.
     """
     com, xj, load, period, t0 = read_columns(source)
-    chosen = bands or choose_bands(com, load, period, model, progress)
-    return judge_position(com, xj, period, chosen, load, t0, where)
+    return judge_position(com, xj, period, bands, load, t0, where)
 
 
 def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:

@@ -120,7 +120,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
                          + (f" with {design}" if design else "") + "; rig fdi --learn-bands makes them")
     band_verdict = None
     if bands is not None:
-        band_verdict = judge_trace(trace, bands, model)
+        band_verdict = judge_trace(trace, bands)
         notes += band_verdict.notes
     precursors = measure_precursors(trace, bands)
     progress("grid", 0.05)

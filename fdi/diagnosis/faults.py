@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from fdi.thresholds import ACCEPTABLE_INTERVAL_FACTOR
 
+DYNAMIC = "spool.dynamic_friction"  # FDS, which goes with FSS
 STATIC_OVER_DYNAMIC = 1.5  # FSS over FDS of the nominal spool (plant/models/nominal.toml)
 
 

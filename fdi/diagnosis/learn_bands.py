@@ -17,19 +17,20 @@ from fdi.diagnosis.bands import (
     RampBand,
     StepBand,
     Width,
-    choose_bands,
     compute_half_range,
     compute_speed,
     find_excursions,
     find_lasting_peak,
     format_design,
     is_loaded,
+    is_nominal_plant,
     judge_position,
+    matches_command,
     read_columns,
     require_same_command,
     select_ramp_rows,
 )
-from fdi.diagnosis.bands_file import KNOT_CYCLES, save_bands
+from fdi.diagnosis.bands_file import KNOT_CYCLES, load_default_bands, save_bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Level
 from fdi.diagnosis.precursors import compute_features, is_slow_ramp
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
@@ -40,6 +41,7 @@ from fdi.thresholds import (
     BAND_FAULT_CLEARANCE_SD,
     BAND_NEAREST_LIMIT_SD,
     BAND_UNITS,
+    BAND_UNITS_QUICK,
     FLEET_FEWEST_TRACES,
     FLEET_PRIOR_TRACES,
     POSITION_MISSING_SHARE,
@@ -86,6 +88,27 @@ def make_bands_file(sources: Sequence[str | Path], out: str | Path, model: Model
 # ---------------------------------------------------------------------------------------------------------------------
 # By simulation
 # ---------------------------------------------------------------------------------------------------------------------
+
+def choose_bands(com: Floats, load: Floats, period: float, model: Model | None = None,
+                 progress: Progress = ignore_progress) -> Bands:
+    """The preflight's own bands if they are of this command, load and model; else bands made for them.
+
+    That takes some seconds: units of the `model` (default: the nominal one) are simulated on this command.
+
+    Args:
+        com: demand, (n,) m, without holes.
+        load: known load, (n,) N.
+        period: of a row, s.
+        model: of the healthy unit.
+        progress: called with each stage and the share done, 0 to 1.
+    """
+    if (model is None or is_nominal_plant(model)) and not is_loaded(load):
+        own = load_default_bands()
+        if matches_command(own, com, period):
+            return own
+    return make_bands_by_simulation(model or load_model(), com, np.nan_to_num(load), period, *BAND_UNITS_QUICK,
+                                    progress=progress)
+
 
 def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: float, count: int = BAND_UNITS,
                              faulty: int = BAND_UNITS, seed: int = 0, steps: int = 20,

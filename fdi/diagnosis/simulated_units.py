@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
+from fdi.diagnosis.faults import CLOGGING, DYNAMIC, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.likelihood import limit_dynamic_friction
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
@@ -22,7 +22,6 @@ from plant.threads import count_threads
 
 Floats = NDArray[np.float64]
 
-DYNAMIC = "spool.dynamic_friction"
 
 
 class UnitKind(NamedTuple):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi.diagnosis import bands as judging
+from fdi.diagnosis import learn_bands
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
@@ -21,7 +21,7 @@ from fdi.diagnosis.bands import (
 )
 from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands, parse_bands, save_bands
 from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import make_bands_by_simulation
+from fdi.diagnosis.learn_bands import choose_bands, make_bands_by_simulation
 from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
@@ -197,14 +197,15 @@ def test_any_command() -> None:
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A healthy unit under 5 kN is not blamed: without bands of its own they are made with the load."""
+    """A healthy unit under 5 kN is not blamed: where no bands fit, they are made with the load."""
     com = profile(SHORT).command
     force = np.full(len(com), 5e3)
     run = simulate(load_model(), com, force, seed=3)
-    monkeypatch.setattr(judging, "choose_bands", lambda *a, **k: short_bands(5e3))
-    j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}))
+    monkeypatch.setattr(learn_bands, "make_bands_by_simulation", lambda *a, **k: short_bands(5e3))
+    bands = choose_bands(com, force, 1e-3)
+    j = judge_trace(Trace.from_columns(run._asdict(), 1e-3, {}), bands)
     assert (j.ruling, j.events) == (None, ())
-    assert "5000 N" in short_bands(5e3).provenance["load"]
+    assert "5000 N" in bands.provenance["load"]
 
 
 def test_a_command_that_shows_nothing() -> None:
