@@ -37,20 +37,20 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     `slopes`: the same problem with coarser steps, for the differences; default `problem` itself. `stage` takes a step
     with each round.
     """
-    now = relax_fit(problem, fit)
-    if now is fit:  # its residuals may be those of other steps, another noise or another place
-        now = replay_fit(problem, fit)
-    _, flat = find_tangents(slopes or problem, now.free, now.x)
+    slopes = slopes or problem
+    now = replay_fit(problem, fit)  # its residuals may be those of other steps, another noise or another place
+    now = relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0])
+    _, flat = find_tangents(slopes, now.free, now.x)
     idle = 0
     for _ in range(rounds):
-        here = linearise_along(problem, now, slopes or problem, flat)
+        here = linearise_along(problem, now, slopes, flat)
         there = take_best_step(problem, here)
         idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
         now = there
         stage.finish_step()
         if idle >= PATIENCE:
             break
-    return replace(relax_fit(problem, now), converged=True)
+    return replace(relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0]), converged=True)
 
 
 def replay_fit(problem: Problem, fit: Fit) -> Fit:

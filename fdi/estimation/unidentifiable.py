@@ -188,10 +188,9 @@ def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
     return left
 
 
-def relax_fit(problem: Problem, found: Fit) -> Fit:
-    """The fit moved along the flat directions to where the priors want it, if that leaves no more than before."""
+def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> Fit:
+    """The fit moved along these flat directions to where the priors want it, if that leaves no more than before."""
     free, x = found.free, found.x
-    directions, _ = find_tangents(problem, free, x)
     if not directions:
         return found
     prior = np.array([f.prior**-2 for f in free])

@@ -146,7 +146,7 @@ def list_shapes(term: Term, states: Mapping[str, Floats], y: Floats) -> list[dic
 
 
 def find_lines(y: Floats, t: Floats, span: float, highest: float = 120.0, most: int = 4) -> list[float]:
-    """The strongest frequencies of `y` (n,) at the times `t` (n,), Hz, of which some may be missing from a regular grid.
+    """The strongest frequencies of `y` (n,) at the times `t` (n,), Hz: a regular grid, from which some may be missing.
 
     A periodogram with zeros where a time is missing: its lines are where those of Lomb and Scargle are, 1000 times as
     fast.
