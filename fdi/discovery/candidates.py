@@ -13,7 +13,7 @@ from fdi.discovery.explain import Explanation, measure_gain
 from fdi.discovery.fingerprints import Fingerprint
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.significance import compute_p_value
-from fdi.estimation.fit import Fit
+from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import limit_friction_values
 from fdi.estimation.unknowns import UNREPLAYED
 from fdi.thresholds import (
@@ -30,15 +30,6 @@ from plant.model import Model, find_quantity, list_searched_effects
 
 if TYPE_CHECKING:
     from fdi.discovery.laws.find_law import LawSearch
-
-
-class Value(NamedTuple):
-    """A parameter with its 95 % interval, SI."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
 
 
 class Candidate(NamedTuple):

@@ -55,7 +55,7 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
     progress("writing the answer", 0.97)
     holding = law.law if law is not None and law.law is not None and law.law.holds else None
     file = effect_file or law_file
-    names = write_law_file(holding, file) if holding is not None and file else {}
+    names = write_law_file(file, holding.terms, holding.values, holding.reason) if holding is not None and file else {}
     shape = look_for_pattern(explanation, None if holding else effect_file)
     is_pattern_reported = shape is not None and explanation.verdict in PATTERN_VERDICTS
     pattern = str(shape) if is_pattern_reported else ""

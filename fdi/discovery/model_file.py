@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.discovery.candidates import Value
 from fdi.discovery.runs import Source
+from fdi.estimation.fit import Value
 from fdi.estimation.likelihood import limit_friction_values
 from plant.effects import CATALOGUE
 from plant.errors import InputError

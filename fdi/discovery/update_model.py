@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import Suspicious, Value, list_fitted_parameters, list_suspicious
+from fdi.discovery.candidates import Suspicious, list_fitted_parameters, list_suspicious
 from fdi.discovery.explain_runs import prepare_effects
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.refit import Refit, build_fitted_model, check_addable, refit_effects
 from fdi.discovery.runs import Runs, read_runs, read_source
+from fdi.estimation.fit import Value
 from fdi.estimation.likelihood import limit_friction_values
 from fdi.output import replace_text
 from fdi.progress import Progress, ignore_progress

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,15 @@ class Fit:
         """Standard deviation of a parameter, SI units."""
         i = [f.name for f in self.free].index(name)
         return float(np.sqrt(self.covariance[i, i])) * self.free[i].scale
+
+
+class Value(NamedTuple):
+    """A parameter with its 95 % interval, SI."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
 
 
 def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = None, rounds: int = FIT_ROUNDS) -> Fit:

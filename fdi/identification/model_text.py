@@ -4,8 +4,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from fdi.discovery.candidates import Value
 from fdi.discovery.model_file import Provenance, format_model_file
+from fdi.estimation.fit import Value
 from fdi.identification.identify import Identification
 from fdi.output import replace_text
 from fdi.sources import name_software

@@ -7,9 +7,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from fdi.discovery.balance import find_smooth_rows
-from fdi.discovery.candidates import Answer, Candidate, Suspicious, Value
+from fdi.discovery.candidates import Answer, Candidate, Suspicious
 from fdi.discovery.model_file import Row
 from fdi.discovery.runs import Source
+from fdi.estimation.fit import Value
 from fdi.report import explain_figures
 from fdi.report.law_report import collect_law_data, describe_law, list_law_sections
 from fdi.report.numbers import (

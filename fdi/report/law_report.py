@@ -62,7 +62,7 @@ def _tabulate_terms(law: Law) -> Table:
             rows.append([Cell(name, is_strong=name == term.name), words,
                          format_interval(v.value, v.low, v.high, unit)])
     return Table([Column("parameter"), Column("meaning"), Column("value and 95 % interval")], rows,
-                 f"The law: {describe_formula(law)}.", is_list=True)
+                 f"The law: {describe_formula(law.terms)}.", is_list=True)
 
 
 def _tabulate_errors(found: LawSearch, law: Law) -> Table:
@@ -127,9 +127,9 @@ def collect_law_data(found: LawSearch, effects: Sequence[str]) -> dict[str, Any]
     from fdi.discovery.laws.effect_source import describe_formula
 
     terms = [{"term": t.name, "place": t.place, "meaning": t.words,
-              "parameters": {f: vars(law.values[f]) for f in t.fields}} for t in law.terms]
+              "parameters": {f: law.values[f]._asdict() for f in t.fields}} for t in law.terms]
     data["law"] = {
-        "holds": law.holds, "reason": law.reason, "formula": describe_formula(law), "terms": terms,
+        "holds": law.holds, "reason": law.reason, "formula": describe_formula(law.terms), "terms": terms,
         "beside": list(found.base.effects), "equal_terms": list(law.equals), "effects": list(effects),
         "errors": [{"model": name, "error": dict(errors), "holdout": dict(held)}
                    for name, errors, held in list_errors(found, law)]}

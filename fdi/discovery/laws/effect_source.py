@@ -5,16 +5,13 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fdi.discovery.laws.terms import PARTS, STATES, Term, find_states
+from fdi.estimation.fit import Value
 from fdi.output import write_text
 from plant.effects import CATALOGUE
-
-if TYPE_CHECKING:
-    from fdi.discovery.laws.find_law import Law
 
 PORTS = {"force": "jack_drag", "flow": "valve", "current": "current"}
 """Where the terms of a balance act; a law of forces alone acts at `load`."""
@@ -30,27 +27,33 @@ from plant.state import Drag, Line
 """
 
 
-def write_law_file(law: Law, path: str | Path) -> dict[str, str]:
+def write_law_file(path: str | Path, terms: Sequence[Term], found: Mapping[str, Value], reason: str) -> dict[str, str]:
     """Write a law as an effect file; the names of its effects, by balance.
+
+    Args:
+        path: the file.
+        terms: of the law.
+        found: its parameters, by field.
+        reason: why it holds.
 
     Raises:
         InputError: a place that cannot be written.
     """
-    names = _name_effects(law)
-    lines = [f"Found by rig explain: {describe_formula(law)}.", ""]
-    for term in law.terms:
-        v = law.values[term.name]
+    names = _name_effects(terms)
+    lines = [f"Found by rig explain: {describe_formula(terms)}.", ""]
+    for term in terms:
+        v = found[term.name]
         lines.append(f"{term.name}: {term.words}, {v.value:.4g} {v.unit} (95 %: {v.low:.4g} to {v.high:.4g}).")
-    text = "\n".join([*lines, "", f"{law.reason[0].upper()}{law.reason[1:]}."]) + "\n"
-    values = {name: v.value for name, v in law.values.items()}
-    write_text(path, write_effects(names, law.terms, values, text), "--write-effect")
+    text = "\n".join([*lines, "", f"{reason[0].upper()}{reason[1:]}."]) + "\n"
+    values = {name: v.value for name, v in found.items()}
+    write_text(path, write_effects(names, terms, values, text), "--write-effect")
     return names
 
 
-def _name_effects(law: Law) -> dict[str, str]:
-    """Names of the law's effects, by balance, that no other effect has."""
+def _name_effects(terms: Sequence[Term]) -> dict[str, str]:
+    """Names of a law's effects, by balance, that no other effect has."""
     known, names = CATALOGUE.list_all(), {}
-    for place in dict.fromkeys(term.place for term in law.terms):
+    for place in dict.fromkeys(term.place for term in terms):
         free = [name for number in range(1, 100)
                 if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in known]
         names[place] = free[0]
@@ -144,10 +147,10 @@ def format_formula(terms: Sequence[Term]) -> str:
     return f"{terms[0].place}{sign}" + sign.join(_strip_brackets(part) for part in simple)
 
 
-def describe_formula(law: Law) -> str:
-    """The law in symbols, one balance after the other."""
-    places = dict.fromkeys(term.place for term in law.terms)
-    return "; ".join(format_formula([t for t in law.terms if t.place == place]) for place in places)
+def describe_formula(terms: Sequence[Term]) -> str:
+    """A law in symbols, one balance after the other."""
+    places = dict.fromkeys(term.place for term in terms)
+    return "; ".join(format_formula([t for t in terms if t.place == place]) for place in places)
 
 
 def _strip_brackets(part: str) -> str:

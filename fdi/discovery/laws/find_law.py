@@ -23,7 +23,7 @@ from fdi.discovery.laws.regression import THINNED, Proposal, evaluate_columns, p
 from fdi.discovery.laws.terms import Term, find_states
 from fdi.discovery.scan import absorb_shift, prepare_slope
 from fdi.discovery.search import Hypothesis, Search
-from fdi.estimation.fit import Fit, continue_fit, form_normal_equations, linearise, step_within_bounds
+from fdi.estimation.fit import Fit, Value, continue_fit, form_normal_equations, linearise, step_within_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
 from fdi.estimation.unknowns import silence_readings
 from fdi.progress import Progress, ignore_progress
@@ -70,22 +70,12 @@ class Trial:
         return sum(len(t.fields) for t in self.terms)
 
 
-@dataclass(frozen=True)
-class LawValue:
-    """A parameter of a law with its 95 % interval, SI."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
-
-
 @dataclass(frozen=True, eq=False)
 class Law:
     """A law and how it does: RMS errors in SI units, by signal."""
 
     terms: tuple[Term, ...]
-    values: Mapping[str, LawValue]  # by field
+    values: Mapping[str, Value]  # by field
     holds: bool
     reason: str  # why it holds, or why not
     hypothesis: Hypothesis
@@ -431,10 +421,10 @@ def _make_unknowns(p: Proposal, factor: float) -> list[Free]:
     return free
 
 
-def _read_value(fit: Fit, name: str, unit: str) -> LawValue:
+def _read_value(fit: Fit, name: str, unit: str) -> Value:
     value = fit.values[name]
     half = INTERVAL_95_SD * float(np.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(name), EFFECT_SYSTEMATIC_SD * value))
-    return LawValue(value, value - half, value + half, unit)
+    return Value(value, value - half, value + half, unit)
 
 
 def remove_law(law: Law, effects: tuple[str, ...]) -> Hypothesis:

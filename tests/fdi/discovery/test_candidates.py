@@ -5,8 +5,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from fdi.discovery.candidates import Answer, Candidate, Value, list_fitted_parameters
-from fdi.estimation.fit import Fit
+from fdi.discovery.candidates import Answer, Candidate, list_fitted_parameters
+from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import Free
 from plant import Model
 

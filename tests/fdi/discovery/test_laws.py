@@ -210,7 +210,7 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
     value = found.law.values[outside.term]
     assert value.low < outside.size < value.high
     with restored_catalogue():
-        names = write_law_file(found.law, tmp_path / "law.py")
+        names = write_law_file(tmp_path / "law.py", found.law.terms, found.law.values, found.law.reason)
         assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{found.law.terms[0].place}"]
         assert CATALOGUE[names[found.law.terms[0].place]].starts
 

@@ -8,10 +8,11 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious, Value
+from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate
+from fdi.estimation.fit import Value
 from fdi.report.explain_report import (
     MOODS,
     build_explanation_report,

@@ -11,7 +11,7 @@ from rig_command import Said, rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
 from fdi.discovery import model_file
-from fdi.discovery.candidates import Value
+from fdi.estimation.fit import Value
 from plant import Model, load_model
 
 SHARED = SHARED / "practice"
