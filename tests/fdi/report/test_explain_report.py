@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious
+from fdi.discovery.fingerprints import Marks
 from fdi.discovery.model_file import Provenance, Row
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate
@@ -42,7 +43,7 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            **fields: Any) -> Answer:
     base = SimpleNamespace(is_at_floor=is_at_floor, effects=(), ratio={"xj": 22.5, "p12": 15.0})
-    explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, controller=1.0,
+    explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, excerpt="",
                                   search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
