@@ -38,8 +38,9 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     with each round.
     """
     slopes = slopes or problem
-    now = replay_fit(problem, fit)  # its residuals may be those of other steps, another noise or another place
-    now = relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0])
+    now = relax_fit(problem, fit, find_tangents(slopes, fit.free, fit.x)[0])
+    if now is fit:  # its residuals may be those of other steps, another noise or another place
+        now = replay_fit(problem, fit)
     _, flat = find_tangents(slopes, now.free, now.x)
     idle = 0
     for _ in range(rounds):
