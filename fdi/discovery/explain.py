@@ -1,7 +1,7 @@
 """Which physical effect is missing from a model: the verdict, with its evidence and its doubt."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -182,7 +182,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
     rounds = 2 if depth or levels[0][0].is_at_floor else LONG
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
     base = search.finish_hypothesis(levels[0][0], rounds)
-    close = sorted(search.map_parallel(search.finish_hypothesis, close), key=lambda h: h.cost + h.repeat_cost)
+    close = _sort_by_cost(search.map_parallel(search.finish_hypothesis, close))
+    close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
     if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
         base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
         if depth == 1 and not _is_significant(base, close[0]):
@@ -216,6 +217,10 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
         hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks,
                        blind, search, unseen, hidden)
+
+
+def _sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+    return sorted(hypotheses, key=lambda h: h.cost + h.repeat_cost)
 
 
 def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> int:

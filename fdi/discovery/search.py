@@ -18,7 +18,13 @@ from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, j
 from fdi.estimation.noise import Noise
 from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, ignore_progress
-from fdi.thresholds import GAIN_WORTH_A_FIT, RESIDUAL_IS_NOISE, WHITE_SQUARE_POOR
+from fdi.thresholds import (
+    GAIN_DOUBTFUL,
+    GAIN_WORTH_A_FIT,
+    RESIDUAL_IS_NOISE,
+    TOLERANCE_SQUARE_FAR,
+    WHITE_SQUARE_POOR,
+)
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
@@ -55,6 +61,12 @@ class Hypothesis:
     def is_poor(self) -> bool:
         """True when the fit leaves more than the noise that it was made with: it may have ended in a wrong valley."""
         return bool(self.fit.misfit > WHITE_SQUARE_POOR * np.count_nonzero(self.fit.white))
+
+    @property
+    def is_far(self) -> bool:
+        """True when few healthy units have such tolerances: it may have ended far off in a valley."""
+        known = np.isfinite([f.prior for f in self.fit.free]).sum()
+        return bool(self.fit.cost - self.fit.misfit > TOLERANCE_SQUARE_FAR * known)
 
     @property
     def cost(self) -> float:
@@ -284,6 +296,22 @@ class Search:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
         near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
+
+    def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:
+        """A last fit that may have ended in a wrong valley, or the same effects from a healthy unit if that ends lower.
+
+        Such a fit leaves more than noise, or only noise but far from a healthy unit. The other one is taken to the end
+        only if it is not clearly higher after so many rounds.
+        """
+        if not h.is_poor and not h.is_far:
+            return h
+        free, prior = h.fit.free, np.array([f.prior**-2 for f in h.fit.free])
+        here = float(compute_misfit(self.problem.compute_white_residuals(free, h.fit.x[None]))[0] + h.fit.x**2 @ prior)
+        other = fit_unknowns(self.problem, free, np.where(prior > 0.0, 0.0, h.fit.x), rounds)
+        if other.cost > here + GAIN_DOUBTFUL:
+            return h
+        again = self.finish_hypothesis(self.judge_fit(h.effects, other))
+        return min(h, again, key=lambda each: each.cost)
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""

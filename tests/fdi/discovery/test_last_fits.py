@@ -1,0 +1,48 @@
+"""Last fits of a search: which are begun again, from where."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from noisy_traces import record_plant
+
+from fdi.discovery.search import Search
+from fdi.estimation.fit import linearise
+from fdi.estimation.likelihood import Free
+from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.unknowns import list_all_unknowns
+from plant import load_model
+
+T = 1e-3 * np.arange(1000)
+COMMAND = 5e-4 * np.sin(2.0 * np.pi * 2.0 * T) * (1.0 - np.exp(-5.0 * T))  # m
+BIAS = {"null_bias.current": 1e-4}
+
+
+@pytest.fixture(scope="module")
+def search() -> Search:
+    """A run with a null bias, whose unknowns are the tolerances and this bias."""
+    found = Search(load_model().replace(BIAS), hold_inputs(record_plant(BIAS, COMMAND)), [], [], 1)
+    found.problem = replace(found.problem, bare=None)
+    return found
+
+
+def start_off(free: tuple[Free, ...], tolerances: float) -> np.ndarray:
+    """The true bias, with the jack's mass and damping so many tolerances from nominal, (p,)."""
+    return np.array([tolerances if f.name in ("jack.mass", "jack.damping") else 0.0 for f in free])
+
+
+def test_a_fit_far_from_a_healthy_unit_is_begun_again(search: Search) -> None:
+    free = list_all_unknowns(search.model)
+    far = search.judge_fit(("null_bias",), linearise(search.problem, free, start_off(free, 4.9)))
+    assert far.is_far
+    again = search.begin_again(far)
+    assert again.cost < far.cost and not again.is_far
+    assert again.fit.values["null_bias.current"] == pytest.approx(1e-4, rel=0.05)
+
+
+def test_a_fit_that_leaves_noise_near_a_healthy_unit_stays(search: Search) -> None:
+    free = list_all_unknowns(search.model)
+    near = search.judge_fit(("null_bias",), linearise(search.problem, free, start_off(free, 0.0)))
+    assert not near.is_far and not near.is_poor
+    assert search.begin_again(near) is near
