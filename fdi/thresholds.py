@@ -480,3 +480,15 @@ the others had at most 1.1 (docs/identify.md)."""
 
 IDENTIFIABLE_SHARE = 0.2
 """Half the interval over half the range of the data sheet, up to which a parameter is identifiable from the runs."""
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The guess of an import map
+# ---------------------------------------------------------------------------------------------------------------------
+
+LEAST_SCALING_CORRELATION = 0.5
+"""Correlation of Com and XJ from which the guess computes the scale of one in counts from the other. A slow ram, or a
+command beyond its stroke, lowers it to 0.66 in a test; columns that are not Com and XJ are usually below."""
+
+LEAST_QUANTUM_NOISE = 0.1
+"""Noise of a reading's step over the noise of the nominal sensor, from which the guess writes the step into the map:
+a smaller one changes the noise floor by less than 0.5 %."""

@@ -1,6 +1,7 @@
 """What `rig import` did with each signal, and what `rig import --guess` takes each column for."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,6 +11,11 @@ from fdi.trace.importing.conversion import Imported, ImportedSignal
 from fdi.trace.importing.guess import GuessedMap
 from fdi.trace.importing.measurement import Measurement
 from fdi.trace.signals import SIGNALS
+
+MISSING = {"p12": "the forces on the ram are not judged by themselves",
+           "xs": "the servovalve is not judged by itself",
+           "load": "it is taken as 0; a load that did act is then a force that the model lacks"}
+"""Signals that a trace may lack, and what this means for the answers."""
 
 
 def build_import_report(imported: Imported, measurement: Measurement, out: Path) -> Report:
@@ -23,10 +29,11 @@ def build_import_report(imported: Imported, measurement: Measurement, out: Path)
     lines = [Line(SIGNAL_NAMES[s.name], s.how) for s in imported.signals]
     sentence = (f"{out}: {count_nouns(len(trace), 'row')} of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
                 f"({measurement.format})")
+    notes = _list_notes(imported, measurement)
     data = {"trace": str(out), "cycles": len(trace), "period": trace.period, "format": measurement.format,
             "provenance": dict(trace.provenance), "signals": {s.name: asdict(s) for s in imported.signals},
             "sensors": {name: asdict(sensor) for name, sensor in trace.sensors.items()}}
-    return Report("import", str(measurement.path), sentence=sentence, data=data,
+    return Report("import", str(measurement.path), sentence=sentence, data=data, notes=notes,
                   sections=[Section("Signals", [table, *lines])], next_command=f"rig compare {out}")
 
 
@@ -38,6 +45,8 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path)
         rows.append([SIGNAL_NAMES.get(name, name), source, Cell(confidence, moods[confidence])])  # type: ignore[arg-type]
     missing = [SIGNAL_NAMES[name] for name in ("com", "xj", "cor") if name not in guessed.chosen]
     notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
+    if guessed.left:
+        notes.append(f"columns left out: {_shorten([f'{name} ({why})' for name, why in guessed.left.items()])}")
     table = Table([Column("signal"), Column("source"), Column("confidence")], rows,
                   "The map says why in comments. Check what is not sure.")
     return Report("import", str(measurement.path), notes=notes, sections=[Section("Guess", [table])],
@@ -45,6 +54,22 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path)
                   next_command=f"rig import {measurement.path} --map {out}",
                   data={"map": str(out), "signals": {name: {"source": source, "confidence": confidence}
                                                      for name, (source, confidence) in guessed.chosen.items()}})
+
+
+def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
+    """Signals that the trace does not have, and columns of the recording that no signal uses."""
+    missing = [name for name in MISSING if name not in {s.name for s in imported.signals}]
+    notes = [f"no {SIGNAL_NAMES[name]}: {MISSING[name]}" for name in missing]
+    unused = [name for name in measurement.units if name not in imported.used]
+    if unused:
+        notes.append(f"not in the map, not imported: {_shorten(unused)}")
+    return notes
+
+
+def _shorten(names: Sequence[str], most: int = 12) -> str:
+    """A list in words; of a recording of hundreds of channels the first few."""
+    rest = len(names) - most
+    return ", ".join([*names[:most], *([f"and {rest} more"] if rest > 0 else [])])
 
 
 def _format_range(s: ImportedSignal) -> str:

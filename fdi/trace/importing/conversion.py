@@ -48,6 +48,7 @@ class Imported:
     trace: Trace
     signals: tuple[ImportedSignal, ...]
     samples: int  # of the recording's fastest signal
+    used: frozenset[str]  # columns of the recording that the map names
 
 
 def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float) -> Imported:
@@ -81,7 +82,7 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
     origin = {**describe_origin(measurement, chosen), "imported.start": repr(float(rows[0]))}
     trace = replace(Trace.from_columns(columns, period, origin),
                     sensors={name: sensor for name, sensor in sensors.items() if not sensor.is_ideal})
-    return Imported(trace, tuple(done), max(len(s.t) for s in samples.values()))
+    return Imported(trace, tuple(done), max(len(s.t) for s in samples.values()), frozenset(channels))
 
 
 def describe_origin(measurement: Measurement, chosen: ImportMap) -> dict[str, str]:

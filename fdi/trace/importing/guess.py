@@ -12,12 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
 from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES
 from fdi.trace.importing.measurement import Channel, Measurement
 from fdi.trace.importing.text_table import TextTable, split_unit
 from fdi.trace.importing.units import UNITS, convert_to_si, find_unit
-from fdi.trace.signals import SIGNALS
+from fdi.trace.resolution import find_comb
+from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
+from plant.parameters import load_nominal_values
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +58,9 @@ class Guess:
     sign: int = 1
     reasons: list[str] = field(default_factory=list)
     minus: str = ""  # a column that is subtracted
+    scale: float | None = None  # of raw values, in `unit`: value = sign * (scale * raw + offset); None: unknown, or 1
+    offset: float = 0.0
+    quantum: float = 0.0  # step of the readings, in `unit`
 
     @property
     def confidence(self) -> str:
@@ -65,10 +71,11 @@ class Guess:
 
 
 class GuessedMap(NamedTuple):
-    """A map as text, and what was chosen: signal (and "time") to column and confidence."""
+    """A map as text, and what was chosen."""
 
     text: str
-    chosen: Mapping[str, tuple[str, str]]
+    chosen: Mapping[str, tuple[str, str]]  # signal (and "time") to column and confidence
+    left: Mapping[str, str]  # columns that are no signal: their range, or why they are none
 
 
 def guess_map(measurement: Measurement) -> GuessedMap:
@@ -77,7 +84,9 @@ def guess_map(measurement: Measurement) -> GuessedMap:
     time_lines, time_source, time_confidence = _guess_time(measurement, data)
     free = {name: x for name, x in data.items() if name != time_source}
     found = _assign(measurement, free)
+    _scale_position(found, measurement, free)
     _find_signs(found, free)
+    _find_steps(found, measurement, free)
     chosen = {"time": (time_source or "its own times", time_confidence)}
     chosen |= {name: (guess.source, guess.confidence) for name, guess in found.items()}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
@@ -86,11 +95,10 @@ def guess_map(measurement: Measurement) -> GuessedMap:
     for name in SIGNAL_NAMES:
         lines += _list_signal_lines(name, found.get(name), measurement)
     used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
-    left = [f"{name}{_describe_range(data[name])}" if name in data else f"{name} (no numbers)"
-            for name in measurement.units if name not in used]
+    left = {name: _describe_left(measurement, name, data, found) for name in measurement.units if name not in used}
     if left:
-        lines += ["# Columns that were left out:", *(f"#   {name}" for name in left)]
-    return GuessedMap("\n".join(lines) + "\n", chosen)
+        lines += ["# Columns that were left out:", *(f"#   {name} ({why})" for name, why in left.items())]
+    return GuessedMap("\n".join(lines) + "\n", chosen, left)
 
 
 def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
@@ -167,10 +175,8 @@ def _guess_time(measurement: Measurement, data: Mapping[str, Floats]) -> tuple[l
     head = f"[time]  # {confidence}: {', '.join(why)}"
     bits = _find_bits(data[name])
     if bits:
-        step = float(np.median(np.diff(data[name])[np.diff(data[name]) > 0]))
-        return [head, f"source = {_quote(name)}", f"bits = {bits}",
-                f"rate = {1000.0 * step:g}  # counts a second: put in the true one (rows every 1 ms were assumed)"
-                ], name, "unsure"
+        rate, is_known = _guess_count_rate(measurement.units[name], data[name])
+        return [head, f"source = {_quote(name)}", f"bits = {bits}", rate], name, confidence if is_known else "unsure"
     unit_name, reason = _guess_time_unit(measurement.units[name], data[name])
     return [head, f"source = {_quote(name)}", f'unit = "{unit_name}"  # {reason}'], name, confidence
 
@@ -185,6 +191,18 @@ def _find_bits(x: Floats) -> int | None:
     back = steps[steps < 0] + 2.0**bits
     is_wrap = usual > 0 and bool((np.abs(back - usual) < 0.1 * 2.0**bits).all()) and (steps < 0).mean() < 0.2
     return bits if is_wrap else None
+
+
+def _guess_count_rate(said: str, x: Floats) -> tuple[str, bool]:
+    """The line of a counter's rate, and whether the header gives it."""
+    steps = np.diff(x)
+    step = float(np.median(steps[steps > 0]))
+    unit = find_unit(said)
+    if unit is not None and unit.si == "s":
+        counts = float(1 / unit.factor)
+        line = f"rate = {counts:.15g}  # counts a second, as the header says ({said}): {counts / step:g} rows a second"
+        return line, True
+    return f"rate = {1000.0 * step:.15g}  # counts a second: put in the true one (rows every 1 ms were assumed)", False
 
 
 def _guess_time_unit(said: str, x: Floats) -> tuple[str, str]:
@@ -337,11 +355,76 @@ def measure_lead(a: Floats, b: Floats) -> float:
     return abs(correlate(a[:n - shift], b[shift:n])) - abs(correlate(a[shift:n], b[:n - shift]))
 
 
+def _has_raw_unit(measurement: Measurement, guess: Guess) -> bool:
+    """Whether the recording names a unit that scale and offset must convert."""
+    said = measurement.units[guess.source] or split_unit(guess.source)[1]
+    return bool(said) and find_unit(said) is None
+
+
+def _scale_position(found: Mapping[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
+    """Scale and offset of a position in counts or volts, roughly, from the other position and Cor."""
+    for name, other in (("xj", "com"), ("com", "xj")):
+        if not {name, other} <= found.keys() or not _has_raw_unit(measurement, found[name]):
+            continue
+        if _has_raw_unit(measurement, found[other]):
+            return
+        guess, base = found[name], found[other]
+        raw, x = data[guess.source], data[base.source]
+        r = correlate(raw, x) if len(raw) == len(x) else 0.0
+        if abs(r) < LEAST_SCALING_CORRELATION:
+            continue
+        cor = data[found["cor"].source] if "cor" in found else np.zeros(0)
+        slope, shift = fit_scale(raw, x, cor if len(cor) == len(x) else np.zeros(len(x)))
+        guess.sign, guess.unit, guess.scale = int(np.sign(slope)), base.unit, float(f"{abs(slope):.4g}")
+        guess.offset = float(f"{guess.sign * shift:.4g}")
+        guess.reasons.append(f"scale and offset are rough, from {base.source}: put in the true ones")
+
+
+def fit_scale(raw: Floats, x: Floats, cor: Floats) -> tuple[float, float]:
+    """Slope and offset of `raw` (n,) to the position `x` (n,) that it follows.
+
+    A position loop makes Cor (n,) of Com - XJ: x = slope * raw + offset + a constant times Cor, where Cor is below its
+    limit. Neither a lag nor a command beyond an end stop changes this. Where it gives no sensible slope, the slope is
+    the ratio of the standard deviations.
+    """
+    middle, size = float(raw.mean()), float(raw.std())
+    usual = math.copysign(float(x.std()) / size, correlate(raw, x))
+    top = float(np.abs(cor).max())
+    free = np.abs(cor) < 0.9 * top
+    if free.any():
+        basis = np.column_stack([(raw - middle) / size, np.ones(len(raw)), cor / top])[free]
+        slope, shift = (float(v) for v in np.linalg.lstsq(basis, x[free], rcond=None)[0][:2])
+        if 1.0 / 3.0 < slope / size / usual < 3.0:
+            return slope / size, shift - slope * middle / size
+    return usual, float(x.mean()) - usual * middle
+
+
+def _find_steps(found: Mapping[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
+    """The step of readings that are whole multiples of it, where its noise counts beside that of the sensor."""
+    nominal = load_nominal_values()
+    for name in OUTPUTS:
+        guess = found.get(name)
+        if guess is None or guess.minus or (guess.scale is None and _has_raw_unit(measurement, guess)):
+            continue
+        comb = find_comb(data[guess.source])
+        if comb is None:
+            continue
+        quantum = float(f"{comb.step * (guess.scale or 1.0):.6g}")
+        noise = float(convert_to_si(np.array([quantum]), UNITS[guess.unit])[0]) / math.sqrt(12.0)
+        if noise >= LEAST_QUANTUM_NOISE * nominal[SIGNALS[name].noise]:
+            guess.quantum = quantum
+
+
+def _scale_column(guess: Guess, data: Mapping[str, Floats]) -> Floats:
+    """A column in the unit of its guess; its sign is that of the recording."""
+    return data[guess.source] if guess.scale is None else guess.scale * data[guess.source] + guess.offset
+
+
 def _find_signs(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
     """Signs by what a position loop does: XJ follows Com, and Cor is positive while Com is above XJ."""
     if not {"com", "xj"} <= found.keys():
         return
-    com, xj = data[found["com"].source], data[found["xj"].source]
+    com, xj = _scale_column(found["com"], data), _scale_column(found["xj"], data)
     r = correlate(com, xj)
     if r < -0.8:
         found["xj"].sign = -1
@@ -392,11 +475,27 @@ def _list_signal_lines(name: str, guess: Guess | None, measurement: Measurement)
     if guess.sign < 0:
         lines.append("sign = -1")
     said = measurement.units[guess.source]
-    if said and find_unit(said) is None:
+    if guess.scale is not None:
+        lines.append(f"scale = {guess.scale:g}  # {guess.unit} for each {said}: put in the true one")
+        lines.append(f"offset = {guess.offset:g}  # {guess.unit}")
+    elif said and find_unit(said) is None:
         lines.append(f"scale = 1.0  # {guess.unit} for each {said}: put in the true one")
         lines.append(f"offset = 0.0  # {guess.unit}")
+    if guess.quantum:
+        step = f"sensor = {{quantum = {guess.quantum:g}}}"
+        lines.append(f"{step}  # {guess.unit}: all readings are multiples of this step")
     return [*lines, ""]
 
 
-def _describe_range(x: Floats) -> str:
-    return f" ({x.min():.4g} .. {x.max():.4g})"
+def _describe_left(measurement: Measurement, column: str, data: Mapping[str, Floats], found: Mapping[str, Guess]
+                   ) -> str:
+    """The range of a column that is no signal, or why it is none."""
+    if column not in data:
+        return "no numbers"
+    x = data[column]
+    if float(np.ptp(x)) > 0.0:
+        return f"{x.min():.4g} .. {x.max():.4g}"
+    rated = [(guess.points, name) for name in SIGNAL_NAMES if name not in found
+             and (guess := _rate_column(measurement, name, column, x)) is not None]
+    meant = f"; by its name it would be {SIGNALS[max(rated)[1]].symbol}" if rated else ""
+    return f"always {x[0]:.4g}{meant}"

@@ -139,6 +139,39 @@ def test_guess_finds_a_counter(tmp_path: Path) -> None:
     assert 'source = "cnt"\nbits = 8' in text and "sign = -1" in text
 
 
+def test_guess_takes_the_rate_of_a_counter_from_its_unit(tmp_path: Path) -> None:
+    """A counter of microseconds that wraps counts 1e6 a second: 500 counts a row are 2000 rows a second."""
+    lines = ["cnt [us];Soll [mm];Ist [mm];i [mA]"]
+    lines += [f"{500 * k % 65536};{math.sin(k / 90):.5f};{math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(500)]
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    assert "bits = 16\nrate = 1000000  # counts a second, as the header says (us): 2000 rows" in guessed.text
+    assert guessed.chosen["time"][1] != "unsure"
+
+
+def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
+    """Counts of 5 um, offset 1000, of a ram that lags and meets an end stop: scale from Com and Cor; Cor not reversed.
+
+    A column that does not change is no signal; the map says which one its name means.
+    """
+    com = np.repeat([0.0, 6.0, -2.0, 12.0, 0.0], 300)
+    xj = np.zeros(1500)
+    for k in range(1, 1500):
+        xj[k] = min(xj[k - 1] + 0.02 * float(np.clip(com[k] - xj[k - 1], -3.0, 3.0)), 7.0)
+    cor = np.clip(3.8 * (com - xj), -8.0, 8.0)
+    rows = zip(com, np.rint(xj / 0.005) + 1000, cor, strict=True)
+    lines = ["t [s];Soll [mm];Ist [counts];i [mA];Kraft [kN]"]
+    lines += [f"{k / 1000};{c:g};{x:.0f};{i:.5f};0" for k, (c, x, i) in enumerate(rows)]
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    signals = parse_map(guessed.text, tmp_path / "x.map.toml").signals
+    scaling = signals["xj"].term.scaling
+    assert scaling.scale == pytest.approx(0.005, rel=0.01) and scaling.offset == pytest.approx(-5.0, rel=0.02)
+    assert signals["xj"].sensor.quantum == pytest.approx(5e-6, rel=0.01)
+    assert signals["cor"].term.scaling.sign == 1.0 and guessed.chosen["xj"] == ("Ist [counts]", "unsure")
+    assert guessed.left == {"Kraft [kN]": "always 0; by its name it would be load"}
+
+
 def test_guess_pairs_two_chambers(tmp_path: Path) -> None:
     lines = ["time [s];target [mm];stroke [mm];p B [bar];p A [bar]"]
     lines += [f"{k / 1000};{math.sin(k / 90)};{math.sin(k / 90 - 0.1)};{50 + k % 7};{60 + k % 5}" for k in range(500)]
