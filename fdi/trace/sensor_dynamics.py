@@ -51,7 +51,7 @@ class SensorDynamics:
         if self.delay:
             parts.append(f"delay {1e3 * self.delay:.3g} ms")
         if self.quantum:
-            parts.append(f"steps of {self.quantum:.4g} {unit}".rstrip())
+            parts.append(f"steps of {self.quantum:.4g} {unit}".rstrip() + " (in its noise floor alone)")
         return ", ".join(parts)
 
     def apply(self, x: Floats, period: float) -> Floats:
