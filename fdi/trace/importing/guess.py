@@ -424,7 +424,7 @@ def _find_signs(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
     """Signs by what a position loop does: XJ follows Com, and Cor is positive while Com is above XJ."""
     if not {"com", "xj"} <= found.keys():
         return
-    com, xj = _scale_column(found["com"], data), _scale_column(found["xj"], data)
+    com, xj = found["com"].sign * _scale_column(found["com"], data), _scale_column(found["xj"], data)
     r = correlate(com, xj)
     if r < -0.8:
         found["xj"].sign = -1
