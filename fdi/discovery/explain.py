@@ -118,7 +118,8 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
         if tried[0].is_poor or not tried[0].is_at_floor:
-            tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
+            # stops that a poor fit makes by luck, its repeat misses
+            tried = _sort_by_cost(_drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)]))
         levels.append(tried)
         if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
             break

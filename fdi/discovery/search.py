@@ -189,16 +189,16 @@ class Search:
         begun = fit_unknowns(loud, start.fit.free, own, 4)
         prospects = scan_effects(loud, begun, effects, self.workers)
         known = {h.effects[-1] for h in tried[:2]}
-        worth = [p for p in prospects if p.cost < begun.cost - GAIN_WORTH_A_FIT]
-        chosen = dict.fromkeys([p.effect for p in worth[:fitted]] + [p.effect for p in worth if p.effect in known])
+        least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
+        chosen = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
+                  if rank < fitted or p.effect in known]
 
         def fit_eased(p: Prospect) -> Hypothesis:
             has_prior = np.array([np.isfinite(f.prior) for f in p.free])
             x = self.find_eased_start(p.free, np.where(has_prior, 0.0, p.x))
             return self.judge_fit((*start.effects, p.effect), fit_unknowns(self.problem, p.free, x))
 
-        eased = [p for p in worth if p.effect in chosen]
-        return sorted(self.map_parallel(fit_eased, eased), key=lambda h: h.cost)
+        return sorted(self.map_parallel(fit_eased, chosen), key=lambda h: h.cost)
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
