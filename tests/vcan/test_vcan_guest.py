@@ -17,7 +17,7 @@ from pathlib import Path
 import dissect
 import numpy as np
 import pytest
-from log_rows import read_row_bytes
+from log_rows import describe_first_difference
 from plugin_bus_summary import GUEST_TESTS, LEFT_TO_GUEST, NOTE
 from vcan_host import FOLDER, guest_missing, in_guest, kernel_has_vcan0, skip_or_fail
 
@@ -82,15 +82,17 @@ def test_preflight_passes_with_three_processes(
     assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
     counts = Counter(cob_id for cob_id, _ in frames)
     assert counts[0x080] >= answer["timing"]["cycles"] > 1000
-    record_property(NOTE, f"vcan0: preflight by three processes, {counts[0x080]} cycles in {facts['seconds']:.0f} s")
+    words = f"{counts[0x080]} cycles in {facts['seconds']:.0f} s"
+    if facts["attempt"] > 1:
+        words += f"; attempt {facts['attempt']}, because the bench could not judge the one before"
+    record_property(NOTE, f"vcan0: preflight by three processes, {words}")
 
 
 def test_preflight_rows_are_byte_for_byte_those_of_the_builtin_controller(
     out: Path, frames: list[tuple[int, bytes]], preflight: Path
 ) -> None:
     """The firmware in C and the compiled plant on vcan0, beside all that is in Python on the embedded bus."""
-    rows = [read_row_bytes(folder) for folder in (out / "run", preflight)]
-    assert rows[0] == rows[1] and len(rows[0]) == 14_500
+    assert describe_first_difference(out / "run", preflight) == "none in 14500 rows"
 
 
 def test_cyclic_frames_are_in_order(frames: list[tuple[int, bytes]]) -> None:
