@@ -117,8 +117,8 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
-        if tried[0].is_poor or not tried[0].is_at_floor:
-            # stops that a poor fit makes by luck, its repeat misses
+        if tried[0].is_poor or not tried[0].is_at_floor or (count == 1 and levels[0][0].is_far):
+            # stops that a poor fit makes by luck, its repeat misses; far tolerances may stand in for an effect
             tried = _sort_by_cost(_drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)]))
         levels.append(tried)
         if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
@@ -160,9 +160,13 @@ def _drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
-    """What a hypothesis gains in -2 log likelihood: on its own run, and no more than about that on the repeats."""
+    """What a hypothesis gains in -2 log likelihood: on its own run, and no more than about that on the repeats.
+
+    Tolerances nearer to a healthy unit are a gain that no repeat can show.
+    """
     own = parent.cost - h.cost
-    return min(own, 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
+    nearer = parent.tolerance_cost - h.tolerance_cost
+    return min(own, nearer + 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
 def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN) -> bool:
@@ -176,6 +180,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
         depth = 1
+    if depth == 0 and len(levels) > 1 and levels[0][0].is_far:
+        depth = 1  # a unit that is hardly healthy: only fits to all runs, taken to the end, tell what an effect gains
     depth = _prune_level(search, levels, depth)
     search.refine_steps(FINE, TRUEST)
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []

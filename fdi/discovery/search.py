@@ -66,12 +66,17 @@ class Hypothesis:
     def is_far(self) -> bool:
         """True when few healthy units have such tolerances: it may have ended far off in a valley."""
         known = np.isfinite([f.prior for f in self.fit.free]).sum()
-        return bool(self.fit.cost - self.fit.misfit > TOLERANCE_SQUARE_FAR * known)
+        return bool(self.tolerance_cost > TOLERANCE_SQUARE_FAR * known)
 
     @property
     def cost(self) -> float:
         """Robust sum of squares on the fit's run, with priors."""
         return self.fit.cost
+
+    @property
+    def tolerance_cost(self) -> float:
+        """The part of the cost that says how far the tolerances are from a healthy unit: their squares over priors."""
+        return self.fit.cost - self.fit.misfit
 
 
 class WholeRuns(NamedTuple):
