@@ -119,7 +119,10 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             levels[0] = [search.refit_base(base, tried[:1])]
         if tried[0].is_poor or not tried[0].is_at_floor or (count == 1 and levels[0][0].is_far):
             # stops that a poor fit makes by luck, its repeat misses; far tolerances may stand in for an effect
-            tried = _sort_by_cost(_drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)]))
+            tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
+        if not tried[0].is_at_floor and (count == 2 or tried[0].is_near_floor):
+            # two effects share many wrong valleys; and what is a little more than noise may be a stop that was missed
+            tried = _drop_duplicates([*search.map_parallel(search.search_widely, tried[:2]), *tried])
         levels.append(tried)
         if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
             break
@@ -153,8 +156,9 @@ def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Tr
 
 
 def _drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The best hypothesis of each set of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
-    for h in sorted(tried, key=lambda h: h.cost):
+    for h in _sort_by_cost(tried):
         best.setdefault(frozenset(h.effects), h)
     return list(best.values())
 

@@ -13,6 +13,7 @@ from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_wei
 from fdi.estimation.unidentifiable import list_powers, scale_together
 from fdi.estimation.unknowns import list_effect_unknowns
 from plant.effects import CATALOGUE
+from plant.lanes import Part
 from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
@@ -113,7 +114,7 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
     white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, at)))
-    longest = max(problem.trace.parts or (span_all_rows(problem.trace),), key=lambda part: part.stop - part.first)
+    longest = _find_longest_piece(problem)
     rows = slice(longest.first, longest.stop)  # a line has one phase within a piece alone
     answer = (white[1] - white[0])[:, rows]
     product = fit.white[:, rows] * answer
@@ -133,6 +134,34 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
                   for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
         height[np.abs(hertz - hertz[k]) < distance] = 0.0
     return found
+
+
+def list_lines_beside(problem: Problem, p: Prospect) -> list[Prospect]:
+    """The prospect of an effect and, if it has a frequency, those at a turn over the run less and more.
+
+    A line in what a fit in a wrong valley leaves stands a little beside the effect's own frequency, and no fit leaves
+    the line that it begins in. The phase in the middle of the run stays.
+    """
+    units = {CATALOGUE[p.effect].parameters[f.name].unit: k for k, f in enumerate(p.free)
+             if f.name in CATALOGUE[p.effect].fitted}
+    if not {"Hz", "rad"} <= set(units):
+        return [p]
+    tone, phase = p.free[units["Hz"]], p.free[units["rad"]]
+    longest = _find_longest_piece(problem)
+    period = problem.model.values["controller.period"]
+    turn = 1.0 / (period * (longest.stop - longest.first))  # Hz
+    middle = period * (longest.later + 0.5 * (longest.first + longest.stop))
+    out = [p]
+    for change in (-turn, turn):
+        x = p.x.copy()
+        x[units["Hz"]] += change / tone.scale
+        x[units["rad"]] -= 2.0 * np.pi * change * middle / phase.scale
+        out.append(p._replace(x=x))
+    return out
+
+
+def _find_longest_piece(problem: Problem) -> Part:
+    return max(problem.trace.parts or (span_all_rows(problem.trace),), key=lambda part: part.stop - part.first)
 
 
 def _measure_prominence(spectra: Floats, width: int) -> Floats:

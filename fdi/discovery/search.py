@@ -9,18 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.scan import Prospect, scan_effects
+from fdi.discovery.scan import Prospect, list_lines_beside, scan_effects
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, scale_noise
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, judge_on_all
 from fdi.estimation.noise import Noise
-from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
+from fdi.estimation.population import follow_population
+from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings, turn_amplitudes_positive
 from fdi.progress import NO_STAGE, Progress, ignore_progress
 from fdi.thresholds import (
     GAIN_DOUBTFUL,
     GAIN_WORTH_A_FIT,
+    RESIDUAL_IS_NEAR_NOISE,
     RESIDUAL_IS_NOISE,
     TOLERANCE_SQUARE_FAR,
     WHITE_SQUARE_POOR,
@@ -37,6 +39,7 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 BEAM = 3  # hypotheses from which the next missing effect is looked for
 EASED = (30.0, 6.0)  # times the noise, stage by stage
+POPULATION_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,11 @@ class Hypothesis:
     def is_at_floor(self) -> bool:
         """True when nothing but noise is left."""
         return max(self.ratio.values()) <= RESIDUAL_IS_NOISE
+
+    @property
+    def is_near_floor(self) -> bool:
+        """True when little more than noise is left, or noise alone."""
+        return max(self.ratio.values()) <= RESIDUAL_IS_NEAR_NOISE
 
     @property
     def is_poor(self) -> bool:
@@ -197,13 +205,32 @@ class Search:
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
         chosen = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
                   if rank < fitted or p.effect in known]
+        starts = [beside for p in chosen for beside in list_lines_beside(self.problem, p)]
 
         def fit_eased(p: Prospect) -> Hypothesis:
             has_prior = np.array([np.isfinite(f.prior) for f in p.free])
             x = self.find_eased_start(p.free, np.where(has_prior, 0.0, p.x))
             return self.judge_fit((*start.effects, p.effect), fit_unknowns(self.problem, p.free, x))
 
-        return sorted(self.map_parallel(fit_eased, chosen), key=lambda h: h.cost)
+        return sorted(self.map_parallel(fit_eased, starts), key=lambda h: h.cost)
+
+    def search_widely(self, h: Hypothesis, seed: int = 0) -> Hypothesis:
+        """A hypothesis, or where a population ends that begins at a unit with its effects and no other deviation.
+
+        Stick-slip makes the cost rough, and two effects share many wrong valleys (`fdi.estimation.population`).
+        """
+        free = h.fit.free
+        has_prior = np.isfinite([f.prior for f in free])
+        home = np.where(has_prior, 0.0, h.fit.x)
+
+        def descend(problem: Problem, fit: Fit, rounds: int, factor: float) -> Fit:
+            return fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds)
+
+        begun = fit_unknowns(scale_noise(self.problem, 100.0), free, home, 4)
+        width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
+        end = follow_population(self.problem, begun, np.diag(width**2), POPULATION_STAGES, seed, descend)
+        other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
+        return min(h, other, key=lambda each: each.cost + each.repeat_cost)
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
@@ -299,7 +326,8 @@ class Search:
 
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
-        near = fit_unknowns(self.problem, h.fit.free, h.fit.x, 2)
+        begin = turn_amplitudes_positive(h.fit.free, h.fit.x)
+        near = fit_unknowns(self.problem, h.fit.free, begin, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
 
     def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:

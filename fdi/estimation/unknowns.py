@@ -1,7 +1,7 @@
 """What a fit may change: the tolerances of a unit, the parameters of effects, and what is known of them beforehand."""
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,23 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
         step = turning / scale if q.unit == "Hz" else 0.05
         free.append(Free(name, off, scale, np.inf, max(q.low, q.above), min(q.high, q.below), step))
     return tuple(free)
+
+
+def turn_amplitudes_positive(free: Sequence[Free], x: Floats) -> Floats:
+    """Scaled unknowns, (p,), of the same sines with amplitudes that are not negative and phases within half a turn."""
+    x, place = x.copy(), {f.name: k for k, f in enumerate(free)}
+    for effect in CATALOGUE.values():
+        units = {name: effect.parameters[name].unit for name in effect.fitted}
+        sizes = [name for name, unit in units.items() if unit not in ("Hz", "rad")]
+        if not {"Hz", "rad"} <= set(units.values()) or len(sizes) != 1 or sizes[0] not in place:
+            continue
+        size = place[sizes[0]]
+        angle = place[next(name for name, unit in units.items() if unit == "rad")]
+        amplitude, phase = (free[k].centre + free[k].scale * x[k] for k in (size, angle))
+        phase += np.pi * (amplitude < 0.0)
+        x[size] = (abs(amplitude) - free[size].centre) / free[size].scale
+        x[angle] = ((phase + np.pi) % (2.0 * np.pi) - np.pi - free[angle].centre) / free[angle].scale
+    return x
 
 
 def list_active_effects(model: Model) -> tuple[str, ...]:

@@ -10,16 +10,17 @@ from effect_files import restored_catalogue
 from noisy_traces import SHORT, record_plant
 from scipy.signal import lfilter
 
-from fdi.discovery.explain import explain
+from fdi.discovery.explain import explain, measure_gain
 from fdi.discovery.fingerprints import compute_firmware_residual, find_marks
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
-from fdi.discovery.scan import find_tones
-from fdi.discovery.search import Search, measure_repeating
+from fdi.discovery.scan import find_tones, list_lines_beside, scan_effects
+from fdi.discovery.search import Hypothesis, Search, measure_repeating
 from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
-from fdi.estimation.fit import linearise
+from fdi.estimation.fit import Fit, linearise
 from fdi.estimation.likelihood import BLOCK, compute_misfit, compute_weights
 from fdi.estimation.noise import fit_noise, measure_level
 from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, turn_amplitudes_positive
 from fdi.thresholds import BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
 from plant import InputError, Model, simulate
@@ -197,6 +198,54 @@ def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None
     starts = find_tones(search.problem, search.fit_base().fit, "supply_ripple")
     assert min(abs(start["supply_ripple.frequency"] - hertz) for start in starts) < 0.25 / 13.5
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10
+
+
+def test_a_search_tries_the_lines_beside_a_tone() -> None:
+    """A turn over the test less and more, with the same sine in the middle of it; other effects stay alone."""
+    search = Search(Model(), hold_inputs(record_plant({})), [], ["supply_ripple"], 1)
+    found = scan_effects(search.problem, search.fit_base().fit, ["supply_ripple", "coil_lag"])
+    prospects = {p.effect: p for p in found}
+    ripple, (alone,) = prospects["supply_ripple"], list_lines_beside(search.problem, prospects["coil_lag"])
+    assert alone is prospects["coil_lag"]
+    values = [{f.name: f.centre + f.scale * x for f, x in zip(p.free, p.x, strict=True)}
+              for p in list_lines_beside(search.problem, ripple)]
+    hertz, phase = (np.array([v[f"supply_ripple.{name}"] for v in values]) for name in ("frequency", "phase"))
+    test = 1e-3 * len(search.problem.trace)
+    assert (hertz - hertz[0]) * test == pytest.approx([0.0, -1.0, 1.0])
+    middle = np.exp(1j * (2.0 * np.pi * hertz * 0.5 * test + phase))
+    assert middle == pytest.approx([middle[0]] * 3, abs=1e-6)
+
+
+def test_a_sine_has_a_positive_amplitude() -> None:
+    """Of the two descriptions of one ripple, and of phases a turn apart, one is reported; the replay is the same."""
+    search = Search(Model(), hold_inputs(record_plant({}, SHORT)), [], ["supply_ripple"], 1)
+    free = (*list_all_unknowns(Model()), *list_effect_unknowns(CATALOGUE["supply_ripple"], Model()))
+    names = [f.name for f in free]
+    x = np.zeros(len(free))
+    ripple = {"supply_ripple.amplitude": -0.03, "supply_ripple.frequency": 20.0, "supply_ripple.phase": 9.0}
+    for name, value in ripple.items():
+        k = names.index(name)
+        x[k] = (value - free[k].centre) / free[k].scale
+    turned = turn_amplitudes_positive(free, x)
+    values = {f.name: f.centre + f.scale * v for f, v in zip(free, turned, strict=True)}
+    assert values["supply_ripple.amplitude"] == pytest.approx(0.03)
+    assert abs(values["supply_ripple.phase"]) <= np.pi
+    before, after = search.problem.compute_residuals(free, np.array([x, turned]))
+    np.testing.assert_allclose(after, before, rtol=0.0, atol=1e-6 * np.abs(before).max())
+
+
+def make_hypothesis(misfit: float, tolerance_cost: float, repeat_cost: float) -> Hypothesis:
+    """A hypothesis, with a repeat, of which only the costs matter."""
+    none = np.zeros((0, 0))
+    fit = Fit((), np.zeros(0), misfit + tolerance_cost, misfit, none, none, none, none, True)
+    return Hypothesis((), fit, {}, {}, {}, repeat_cost, (none,))
+
+
+def test_tolerances_nearer_to_a_healthy_unit_are_a_gain_and_luck_is_none() -> None:
+    far = make_hypothesis(1000.0, 120.0, 1000.0)
+    assert measure_gain(far, make_hypothesis(1000.0, 2.0, 1000.0)) == pytest.approx(118.0)
+    assert measure_gain(far, make_hypothesis(900.0, 120.0, 950.0)) == pytest.approx(100.0)
+    assert measure_gain(far, make_hypothesis(500.0, 120.0, 1000.0)) == pytest.approx(0.0)  # the repeat does not show it
 
 
 def test_with_more_noise_an_effect_is_found_from_a_fit_in_a_wrong_valley() -> None:
