@@ -179,26 +179,10 @@ def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN)
 
 def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, holdout: Trace | None, progress: Progress
               ) -> Explanation:
-    firsts = [level[0] for level in levels]
-    depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
-                 and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
-        depth = 1
-    if depth == 0 and len(levels) > 1 and levels[0][0].is_far:
-        depth = 1  # a unit that is hardly healthy: only fits to all runs, taken to the end, tell what an effect gains
-    depth = _prune_level(search, levels, depth)
+    depth = _choose_depth(search, levels)
     search.refine_steps(FINE, TRUEST)
-    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
-    # where no effect helps, the base is fitted until that is beyond doubt
-    rounds = 2 if depth or levels[0][0].is_at_floor else LONG
-    search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
-    base = search.finish_hypothesis(levels[0][0], rounds)
-    close = _sort_by_cost(search.map_parallel(search.finish_hypothesis, close))
-    close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
-    if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
-        base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
-        if depth == 1 and not _is_significant(base, close[0]):
-            close, depth = [], 0
+    base, close = _finish_fits(search, levels, depth, progress)
+    depth = depth if close else 0
     tried = [] if len(levels) == 1 else levels[depth or -1]
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
     ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
@@ -228,6 +212,38 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
         hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
     return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks,
                        blind, search, unseen, hidden)
+
+
+def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
+    """How many effects the last fits have; `_prune_level` may put a better hypothesis first in that level."""
+    firsts = [level[0] for level in levels]
+    depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
+                 and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
+    if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
+        depth = 1
+    if depth == 0 and len(levels) > 1 and levels[0][0].is_far:
+        depth = 1  # a unit that is hardly healthy: only fits to all runs, taken to the end, tell what an effect gains
+    return _prune_level(search, levels, depth)
+
+
+def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: int, progress: Progress
+                 ) -> tuple[Hypothesis, list[Hypothesis]]:
+    """The base and the best hypotheses with `depth` effects, best first, with finer steps and to the end.
+
+    There are none of the latter where the base does as well when it is taken as far.
+    """
+    close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
+    # where no effect helps, the base is fitted until that is beyond doubt
+    rounds = 2 if depth or levels[0][0].is_at_floor else LONG
+    search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))
+    base = search.finish_hypothesis(levels[0][0], rounds)
+    close = _sort_by_cost(search.map_parallel(search.finish_hypothesis, close))
+    close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
+    if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
+        base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
+        if depth == 1 and not _is_significant(base, close[0]):
+            close = []
+    return base, close
 
 
 def _sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
