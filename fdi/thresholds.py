@@ -455,6 +455,10 @@ The floor itself may be off by that."""
 RESIDUAL_TEST_CONFIDENCE = 0.99
 """Probability with which white noise stays within the band of a residual's test."""
 
+FLOW_GAIN_FAR = 0.1
+"""Share by which the ram moves more or less than the flow into it predicts, from which on the model may be that of
+another actuator: tolerances of 1.5 % of area and flow gain do not add up to it."""
+
 DEPENDENCE_SHARE = 0.05
 """Share of the residual's variance that a dependence on a quantity must hold to be reported."""
 

@@ -20,7 +20,7 @@ from fdi.report.numbers import (
     join_words,
 )
 from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, Table
-from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE
+from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE, FLOW_GAIN_FAR
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 INPUTS_OF_BLOCKS = {
@@ -29,6 +29,8 @@ INPUTS_OF_BLOCKS = {
     "jack": "XS and P12 to the ram",
     "sensor": "flow of the ram to XJ",
 }
+
+OTHER_ACTUATOR = "If the model describes another actuator than the measured one, `rig identify` fits it"
 
 SHAPE_WORDS = {  # how a residual depends on a quantity
     "": "", "proportional to": " (proportional)", "steps with the sign of": " (a step where it changes sign)",
@@ -230,8 +232,9 @@ def _describe_flow_and_drift(c: Comparison, notable_share: float = 0.005, notabl
     flow, gain = c.parts["flow"], c.parts["gain"]
     if flow is not None and gain is not None and flow > BLOCK_ERROR_RATIO and abs(gain) > notable_share:
         direction = "further" if gain > 0 else "less"
+        other = f". {OTHER_ACTUATOR}" if abs(gain) > FLOW_GAIN_FAR else ""
         lines.append(Line("flow", f"the ram moves {format_percent(abs(gain))} {direction} than the flow through the "
-                                  "metering edges predicts"))
+                                  f"metering edges predicts{other}"))
     if "xj" in c.signals and abs(c.drift) > notable_drift and not c.trace.filled.any():
         lines.append(Line("drift", "a replay that is not corrected towards the measured position drifts by "
                                    f"{format_amount(c.drift, 'm/s')}"))

@@ -12,6 +12,7 @@ from fdi.discovery.model_file import Row
 from fdi.discovery.runs import Source
 from fdi.estimation.fit import Value
 from fdi.report import explain_figures
+from fdi.report.compare_report import OTHER_ACTUATOR
 from fdi.report.law_report import collect_law_data, describe_law, list_law_sections
 from fdi.report.numbers import (
     NO_NUMBER,
@@ -174,6 +175,8 @@ def describe_findings(a: Answer) -> list[Line]:
         lines += describe_law(a.law)
     if a.suspicious:
         lines.append(Line("suspicious", describe_suspicious(a.suspicious)))
+    if a.verdict in ("PARTLY", "UNEXPLAINED") and a.best.is_far:
+        lines.append(Line("another actuator?", OTHER_ACTUATOR))
     lines += [Line("held-out run", text) for text in _describe_undecided(a)]
     return [*lines, Line("not detectable", describe_blind(a))] if a.blind else lines
 

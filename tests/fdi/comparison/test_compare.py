@@ -130,6 +130,13 @@ def test_scatter_from_unit_to_unit_is_offered_as_a_reason() -> None:
     assert other.scatter is not None and not other.scatter.enough
 
 
+@pytest.mark.parametrize(("unit", "is_other"), [({"jack.area": 2e-3}, True), ({"filter.clogging": 0.3}, False)])
+def test_another_actuator_is_to_be_identified(unit: dict[str, float], is_other: bool) -> None:
+    """A third more area than the model has: the answer says which command fits the model. An effect is not that."""
+    lines = describe_findings(compare(record_plant(unit), MODEL))
+    assert any("rig identify" in line.text for line in lines) == is_other
+
+
 @pytest.mark.parametrize(("kept", "known"), [
     (("xj",), {"controller"}), (("xj", "xs"), {"controller", "servovalve", "jack", "sensor"}),
     (("xj", "p12"), {"controller", "servovalve", "jack"}), (("xs",), {"controller", "servovalve", "jack", "sensor"})])

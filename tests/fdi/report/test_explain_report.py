@@ -42,7 +42,7 @@ def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
 
 def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at_floor: bool = False,
            **fields: Any) -> Answer:
-    base = SimpleNamespace(is_at_floor=is_at_floor, effects=(), ratio={"xj": 22.5, "p12": 15.0})
+    base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, excerpt="",
                                   search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
@@ -103,6 +103,14 @@ def test_findings() -> None:
         "AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force"))}
     assert lines["to discriminate"] == "measure XS too: in simulation this discriminates between a and b"
     assert lines["residual"] == "a force"
+
+
+@pytest.mark.parametrize("verdict", ["UNEXPLAINED", "EXPLAINED"])
+def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> None:
+    """Only where no explanation is found: an explained one has its parameters listed as suspicious."""
+    far = answer(verdict, (), candidate("a", word="no"))
+    cast(Any, far.explanation.base).is_far = True
+    assert any("rig identify" in line.text for line in describe_findings(far)) == (verdict == "UNEXPLAINED")
 
 
 def test_long_lists_name_four_and_count_the_rest() -> None:
