@@ -117,7 +117,7 @@ def read_truth(case: Path) -> dict[str, Any]:
 
 def shorten_answer(answer: Mapping[str, Any], candidates: int = 5) -> dict[str, Any]:
     """The part of an answer that scoring needs: of the candidates the first ones and those it names."""
-    short = {key: answer.get(key) for key in ("verdict", "effects", "baseline", "pattern")}
+    short = {key: answer.get(key) for key in ("verdict", "effects", "baseline", "pattern", "blind_to")}
     named_effects = set(answer["effects"])
     short["candidates"] = [candidate for rank, candidate in enumerate(answer.get("candidates", []))
                            if rank < candidates or candidate["effect"] in named_effects]

@@ -55,6 +55,15 @@ def is_truth_named(record: Record) -> bool:
     return set(record["truth"]["effects"]) <= set(record["answer"]["effects"])
 
 
+def is_truth_admitted(record: Record) -> bool:
+    """Whether the answer names the hidden effect, or says that at its size it is not detectable in this test."""
+    hidden = record["truth"]["hidden"][0]
+    entry = CATALOGUE[hidden["effect"]]
+    size = abs(hidden["value"] - entry.off.get(entry.fitted[0], 0.0))
+    blind_to = record["answer"].get("blind_to") or ()
+    return is_truth_named(record) or any(each["effect"] == entry.name and size <= each["usual"] for each in blind_to)
+
+
 def is_truth_covered(record: Record) -> bool | None:
     """Whether the interval of the hidden effect's first parameter contains the truth; None without an interval."""
     hidden = record["truth"]["hidden"][0]
@@ -119,6 +128,7 @@ def count_rates(records: Sequence[Record]) -> list[Rate]:
         count_rate("nothing missing: NOTHING_MISSING", _select_kind(records, "nothing"), 0.99,
                    has_verdict("NOTHING_MISSING")),
         count_rate("one effect: the truth is named", one, 0.97, is_truth_named),
+        count_rate("  or listed as not detectable at its size", one, 0.97, is_truth_admitted),
         count_rate("  its 95 % interval holds the truth", right, 0.90, is_truth_covered),
         count_rate("  hold-out at most 1.15 floors with it", right, 0.90, is_holdout_explained),
         count_rate("outside the catalogue: UNEXPLAINED or PARTLY", outside, 0.95,

@@ -208,9 +208,18 @@ RECORDS = [
 
 def test_rates_count_what_they_say() -> None:
     found = [(rate.good, rate.of, rate.bad) for rate in trial_score.count_rates(RECORDS)]
-    assert found == [(1, 2, (1,)), (2, 3, (4,)), (1, 2, (3,)), (1, 2, (3,)), (1, 1, ()), (1, 2, (7,)), (1, 2, (9,)),
-                     (9, 10, (0,))]
+    assert found == [(1, 2, (1,)), (2, 3, (4,)), (2, 3, (4,)), (1, 2, (3,)), (1, 2, (3,)), (1, 1, ()), (1, 2, (7,)),
+                     (1, 2, (9,)), (9, 10, (0,))]
     assert trial_score.average_named_effects(RECORDS) == 1.5
+
+
+@pytest.mark.parametrize(("usual", "good"), [(25.0, 1), (15.0, 0)])
+def test_an_effect_that_is_said_to_be_hidden_at_its_size_is_admitted(usual: float, good: int) -> None:
+    blind = [{"effect": "constant_load", "parameter": "constant_load.force", "usual": usual}]
+    one = record(4, "one", ["constant_load"], "NOTHING_MISSING", [], blind_to=blind)
+    rates = {rate.name.strip(): rate.good for rate in trial_score.count_rates([one])}
+    assert rates["or listed as not detectable at its size"] == good
+    assert rates["one effect: the truth is named"] == 0
 
 
 def test_the_summary_tells_every_failure_and_is_json() -> None:
