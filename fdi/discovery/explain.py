@@ -182,16 +182,17 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
     depth = _choose_depth(search, levels)
     search.refine_steps(FINE, TRUEST)
     base, close = _finish_fits(search, levels, depth, progress)
-    depth = depth if close else 0
-    tried = [] if len(levels) == 1 else levels[depth or -1]
-    others = [h for h in tried if h.effects not in [c.effects for c in close]]
-    ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     floor = search.estimate_floor(close[0] if close else base)
     if search.measure_solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
         finest_fit_steps = 50  # a cycle: FINE is not enough, for example for a resonance of trapped oil
         search.refine_steps(finest_fit_steps, TRUEST)
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
+        base, close = _doubt_small_gain(search, base, close, depth)
+    depth = depth if close else 0
+    tried = [] if len(levels) == 1 else levels[depth or -1]
+    others = [h for h in tried if h.effects not in [c.effects for c in close]]
+    ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
     base, *close = search.judge_on_all([base, *close], FINE)
     if search.whole and close:
         ledger = [base, *ledger[1:-1], close[0]]
@@ -239,11 +240,17 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     base = search.finish_hypothesis(levels[0][0], rounds)
     close = _sort_by_cost(search.map_parallel(search.finish_hypothesis, close))
     close = _sort_by_cost([*search.map_parallel(search.begin_again, close[:2]), *close[2:]])
-    if close and base.cost - close[0].cost < GAIN_DOUBTFUL:
-        base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
-        if depth == 1 and not _is_significant(base, close[0]):
-            close = []
-    return base, close
+    return _doubt_small_gain(search, base, close, depth)
+
+
+def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis], depth: int
+                      ) -> tuple[Hypothesis, list[Hypothesis]]:
+    """The base fitted again where effects gain little, and the hypotheses that still gain then."""
+    if not close or base.cost - close[0].cost >= GAIN_DOUBTFUL:
+        return base, close
+    base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
+    base = search.leave_out_effects(base, close[0])
+    return base, [] if depth == 1 and not _is_significant(base, close[0]) else close
 
 
 def _sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:

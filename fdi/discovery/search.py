@@ -161,12 +161,25 @@ class Search:
 
         What an effect gains is then not what the base's own fit had left lying about.
         """
+        return self.retry_from(base, self._place_base(base, tried))
+
+    def leave_out_effects(self, base: Hypothesis, h: Hypothesis) -> Hypothesis:
+        """The base with its unknowns where another hypothesis has them, or as it is if that leaves more.
+
+        Near its end a fit steps over ridges by luck: what is left there without the effect is not the effect's gain.
+        """
+        (start,) = self._place_base(base, [h])
+        other = self.judge_fit((), linearise(self.fine or self.problem, base.fit.free, start))
+        return min(base, other, key=lambda each: each.cost)
+
+    def _place_base(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> list[Floats]:
+        """The base's unknowns, (p,) each, where fits with an effect have left them; at 0 those at a bound."""
         starts = []
         for h in tried:
             values = h.fit.values
-            starts.append([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
-                           for f in base.fit.free])
-        return self.retry_from(base, map(np.array, starts))
+            starts.append(np.array([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
+                                    for f in base.fit.free]))
+        return starts
 
     def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
