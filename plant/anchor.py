@@ -4,7 +4,7 @@ from __future__ import annotations
 from typing import Any
 
 from plant.compile import Function
-from plant.ports import at_position
+from plant.ports import at_position, shift_position_memory
 from plant.state import Input, Ports, State
 
 
@@ -19,6 +19,7 @@ def _make_replacer(*paths: str) -> Function:
 
 
 set_jack_position = _make_replacer("jack_position")
+set_moved_ram = _make_replacer("jack_position", "memory.position")
 set_sensed_position = _make_replacer("sensed", "memory.position")
 set_sample_memories = _make_replacer("memory.command", "memory.reading")
 
@@ -44,6 +45,12 @@ def rest_at_reading(s: State, x: float, p: Any, steps: int) -> Any:
     return s
 
 
-def compute_pull(share: float, measured: float, sensed: float) -> float:
-    """How far the ram is moved to the measured position, m: not at all where none was measured."""
-    return share * (measured - sensed) if measured == measured else 0.0
+def pull_ram(s: State, share: float, measured: float) -> State:
+    """`s` with the ram moved by this share of the way to the measured position, m; as it is where none was measured.
+
+    Positions that the transducer remembers move along. Else the noise of the measurement would push the ram through the
+    play of a rod end, and the play would seem 1 um smaller than it is.
+    """
+    moved = share * (measured - s.sensed) if measured == measured else 0.0
+    now: State = set_moved_ram(s, s.jack_position + moved, shift_position_memory(s.memory.position, moved))
+    return now

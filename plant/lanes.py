@@ -16,13 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plant.anchor import (
-    compute_pull,
-    initialise_sensed_position,
-    rest_at_reading,
-    set_jack_position,
-    set_sample_memories,
-)
+from plant.anchor import initialise_sensed_position, pull_ram, rest_at_reading, set_sample_memories
 from plant.compile import Function, compile_function, is_costly, make_record_reader, rebind_names
 from plant.controller import Loop, apply_command_effects, compute_current
 from plant.effects import CATALOGUE, Effect
@@ -389,9 +383,7 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed:
                 keep_drive(Drive(given, 0.0), a, lane)
         if len(position):
             for lane in range(WIDTH):
-                s = state_at(a, lane)
-                pulled = s.jack_position + compute_pull(anchor * period, position[k], s.sensed)
-                keep_state(set_jack_position(s, pulled), a, lane)
+                keep_state(pull_ram(state_at(a, lane), anchor * period, position[k]), a, lane)
         for i in range(steps):
             # the loop that everything is for
             for lane in range(WIDTH):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plant import flat, plants
 from plant import step as step_module
 from plant.compile import Function, compile_function, interpret_function
-from plant.effects import CATALOGUE, Effect, combine_laws
+from plant.effects import CATALOGUE, Effect, combine_laws, combine_shifts
 from plant.errors import InputError, suggest_name
 from plant.parameters import check_combinations, find_field, flatten_tables, parse_value, read_toml
 from plant.plants import Plant
@@ -270,6 +270,7 @@ def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any,
 def collect_bindings(effects: tuple[str, ...], plant: str = "eha") -> dict[str, Function]:
     """The functions that replace step, ports and state packing in the kernels of a plant with `effects`."""
     ports = {f"at_{port}": combine_laws(port, effects)[0] for port in Ports._fields}
+    ports["shift_position_memory"] = combine_shifts(effects)
     kind = plants.find_plant(plant)
     ports["step_plant"], ports["compute_coefficients"] = kind.step, kind.coefficients
     ports["pack_state"], ports["unpack_state"] = flat.make_packers(build_initial_state(effects))

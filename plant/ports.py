@@ -37,6 +37,23 @@ def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Funct
     return whole, remembered
 
 
+def keep_memory(m: Memory, moved: float) -> Memory:
+    """The memory of a port without a position of the ram in it, after the ram was moved by `moved` m: as it was."""
+    return m
+
+
+shift_position_memory = keep_memory
+
+
+def chain_shifts(shifts: Iterable[Function | None]) -> Function:
+    """What moves the memories of several effects along with the ram (None: such a memory stays), as one function."""
+    whole: Function | None = None
+    for shift in shifts:
+        one = shift or keep_memory
+        whole = one if whole is None else rebind_names(_shift_in_sequence, first=whole, second=one)
+    return whole or keep_memory
+
+
 law: Function = pass_signal
 first: Function = pass_signal
 second: Function = pass_signal  # these three are bound in each link of a chain
@@ -50,3 +67,7 @@ def _apply_in_sequence(x: Any, m: Memory, s: State, u: Input, p: Any) -> tuple[A
     x, a = first(x, m[0], s, u, p)
     x, b = second(x, m[1], s, u, p)
     return x, (a, b)
+
+
+def _shift_in_sequence(m: Memory, moved: float) -> Memory:
+    return first(m[0], moved), second(m[1], moved)

@@ -26,11 +26,11 @@ from typing import Any
 from plant.compile import Function
 from plant.errors import InputError
 from plant.parameters import GROUPS
-from plant.ports import chain_laws
+from plant.ports import chain_laws, chain_shifts
 from plant.quantity import Quantity, list_quantities
 from plant.state import Memory, Ports
 
-__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "effect", "load_effects", "register_base"]
+__all__ = ["CATALOGUE", "Effect", "Law", "combine_laws", "combine_shifts", "effect", "load_effects", "register_base"]
 
 Law = Function
 
@@ -57,6 +57,7 @@ class Effect:
     source: str = ""  # where the law is from
     plant: str = ""  # the one plant that has it; "" for any that has its port
     searched_in: tuple[str, ...] = ()  # the plants where `rig explain` tests it unasked; () for all that can have it
+    shift: Function | None = None  # (memory, m) -> memory, after an anchored replay has moved the ram by so much
 
     @property
     def file(self) -> Path | None:
@@ -117,7 +118,7 @@ def effect(port: str, group: type[Any], *, law: str, symptoms: str = "", memory:
         disturbance: noise of the bench, which nobody fits.
         fitted: fields that a fit frees; default all.
         starts: values of these, one tuple a start; without any, `plant.starts` finds some.
-        more: `excludes`, `confused_with`, `revealed_by`, `source`, `plant`, `searched_in` of `Effect`.
+        more: `shift`, `excludes`, `confused_with`, `revealed_by`, `source`, `plant`, `searched_in` of `Effect`.
 
     Raises:
         ValueError: unknown port or field, a parameter without default, or a name already taken.
@@ -188,6 +189,11 @@ def combine_laws(port: str, names: tuple[str, ...]) -> tuple[Law, Memory]:
     """All of the named effects that act at `port` as one function, with their initial memory."""
     acting = [entry for entry in (CATALOGUE[name] for name in names) if entry.port == port]
     return chain_laws((entry.function, entry.memory) for entry in acting)
+
+
+def combine_shifts(names: tuple[str, ...]) -> Function:
+    """What moves the memory of the port `position` along with the ram, for a plant with the named effects."""
+    return chain_shifts(entry.shift for entry in (CATALOGUE[name] for name in names) if entry.port == "position")
 
 
 for _family in ("reference", "controller", "current", "servovalve", "valve", "supply", "jack", "friction", "press",

@@ -60,8 +60,13 @@ class Dragged(NamedTuple):
     held: float = 0.0
 
 
+def drag_along(m: Dragged, moved: float) -> Dragged:
+    """The rod where an anchored replay has moved the ram by `moved` m."""
+    return Dragged(m.held + moved)
+
+
 @effect("position", RodBacklash, law="XJ = play(XJ, width)", symptoms="lost motion at every reversal", memory=Dragged,
-        starts=(2e-5, 6e-5, 2e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
+        shift=drag_along, starts=(2e-5, 6e-5, 2e-4), source="play operator, Krasnosel'skii and Pokrovskii 1989")
 def rod_backlash(x: float, m: Dragged, s: Any, u: Any, p: Any) -> tuple[float, Dragged]:
     """A worn rod end: on reversal the transducer waits until the ram has crossed the play."""
     held = play(x, m.held, 0.5 * p.rod_backlash.width)
@@ -81,8 +86,13 @@ class Lag(NamedTuple):
     last: float = 0.0
 
 
+def move_last_input(m: Lag, moved: float) -> Lag:
+    """The lag where an anchored replay has moved the ram by `moved` m: its output moves at once."""
+    return Lag(m.behind, m.last + moved)
+
+
 @effect("position", SensorLag, law="tau XS' + XS = XJ", symptoms="roll-off in the sensed position", memory=Lag,
-        starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "coil_lag"),
+        shift=move_last_input, starts=(0.3e-3, 1e-3, 3e-3), confused_with=("transport_delay", "coil_lag"),
         source="demodulator and filter of an LVDT")
 def sensor_lag(x: float, m: Lag, s: Any, u: Any, p: Any) -> tuple[float, Lag]:
     """Demodulator and anti-alias filter of the LVDT (trapezoidal rule on the part that lags, exact at tau = 0)."""
