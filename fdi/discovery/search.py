@@ -39,7 +39,7 @@ FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
 BEAM = 3  # hypotheses from which the next missing effect is looked for
 EASED = (30.0, 6.0)  # times the noise, stage by stage
-POPULATION_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
+VALLEY_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ class Search:
 
         begun = fit_unknowns(scale_noise(self.problem, 100.0), free, home, 4)
         width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
-        end = follow_population(self.problem, begun, np.diag(width**2), POPULATION_STAGES, seed, descend)
+        end = follow_population(self.problem, begun, np.diag(width**2), VALLEY_STAGES, seed, descend)
         other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
         return min(h, other, key=lambda each: each.cost + each.repeat_cost)
 
