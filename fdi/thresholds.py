@@ -137,9 +137,7 @@ FURTHER_EFFECT_SHARE = 0.1
 """Share of the excess cost that an effect must remove for another one to be looked for on top of it."""
 
 RESIDUAL_IS_NEAR_NOISE = 1.5
-"""RMS residual over noise up to which a fit with one effect may only have missed a stop, in a wrong valley.
-
-A rod's backlash alone left 1.17; a mount that was not there took up the rest until the fit began elsewhere."""
+"""RMS residual over noise up to which a fit with one effect may only have missed a stop, in a wrong valley."""
 
 RESIDUAL_HELD_OUT = 1.2
 """RMS residual over noise in the typical block of a held-out run, up to which an explanation holds there.

@@ -120,9 +120,8 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
         if tried[0].is_poor or not tried[0].is_at_floor or (count == 1 and levels[0][0].is_far):
             # stops that a poor fit makes by luck, its repeat misses; far tolerances may stand in for an effect
             tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
-        if not tried[0].is_at_floor and (count == 2 or tried[0].is_near_floor):
-            # two effects share many wrong valleys; and what is a little more than noise may be a stop that was missed
-            tried = _drop_duplicates([*search.map_parallel(search.search_widely, tried[:2]), *tried])
+        if count == 2 and not tried[0].is_at_floor:
+            tried = _search_other_valleys(search, levels, tried)
         levels.append(tried)
         if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
             break
@@ -130,6 +129,18 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
+
+
+def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], tried: Sequence[Hypothesis]
+                          ) -> list[Hypothesis]:
+    """Pairs of effects, best first, two of which a population has sought anew: two effects share many wrong valleys.
+
+    So is the best single effect where it leaves little: a stop that it missed is no second effect.
+    """
+    singles = [h for h in levels[1][:1] if h.is_near_floor]
+    found = search.map_parallel(search.search_widely, [*singles, *tried[:2]])
+    levels[1] = _drop_duplicates([*found[:len(singles)], *levels[1]])
+    return _drop_duplicates([*found[len(singles):], *tried])
 
 
 def _is_way_on(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace | None) -> bool:
