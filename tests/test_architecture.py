@@ -261,6 +261,15 @@ def test_no_leftovers_and_no_machine_paths() -> None:
     assert found == []
 
 
+def test_no_links_to_elsewhere() -> None:
+    """A symbolic link in the project points to a folder that only one machine has."""
+    if not (ROOT / ".git").exists() or not shutil.which("git"):
+        pytest.skip("this copy of the project has no git history")
+    listed = subprocess.run(["git", "ls-files", "--stage"], cwd=ROOT, capture_output=True, text=True).stdout
+    symbolic_link = "120000"  # mode in git's index
+    assert listed and [line for line in listed.splitlines() if line.startswith(symbolic_link)] == []
+
+
 def constants(path: Path) -> Iterator[tuple[str, ast.expr]]:
     """Names in capitals that a module gives a value, and the value."""
     for node in tree(path).body:

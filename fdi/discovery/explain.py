@@ -117,8 +117,13 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
-        if tried[0].is_poor or not tried[0].is_at_floor or (count == 1 and levels[0][0].is_far):
-            # stops that a poor fit makes by luck, its repeat misses; far tolerances may stand in for an effect
+        if count == 2 and levels[1][0].is_near_floor and not _is_significant(levels[1][0], tried[0]):
+            # no second effect is missing, but stops that the fit of the first one missed
+            levels[1] = _drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
+            levels.append(tried)
+            break
+        if not tried[0].is_at_floor or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
+            # a fit in a wrong valley leads the scan astray, and far tolerances may stand in for an effect
             tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
         if count == 2 and not tried[0].is_at_floor:
             tried = _search_other_valleys(search, levels, tried)
