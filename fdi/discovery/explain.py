@@ -117,18 +117,20 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
-        if count == 2 and levels[1][0].is_near_floor and not _is_significant(levels[1][0], tried[0]):
+        done = search.reaches_floor(tried[0], FINE, TRUEST)
+        if not done and count == 2 and levels[1][0].is_near_floor and not _is_significant(levels[1][0], tried[0]):
             # no second effect is missing, but stops that the fit of the first one missed
             levels[1] = _drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
             levels.append(tried)
             break
-        if not tried[0].is_at_floor or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
+        if not done or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
             # a fit in a wrong valley leads the scan astray, and far tolerances may stand in for an effect
             tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
-        if count == 2 and not tried[0].is_at_floor:
+        if count == 2 and not done and _takes_fair_share(search, levels[1][0], tried[0]) and not \
+                search.reaches_floor(tried[0], FINE, TRUEST):
             tried = _search_other_valleys(search, levels, tried)
         levels.append(tried)
-        if tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
+        if done or tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
             break
         if count > 1 and not _is_way_on(search, levels, holdout):  # two large effects each help little alone
             break

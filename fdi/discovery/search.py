@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -220,12 +221,15 @@ class Search:
                   if rank < fitted or p.effect in known]
         starts = [beside for p in chosen for beside in list_lines_beside(self.problem, p)]
 
-        def fit_eased(p: Prospect) -> Hypothesis:
+        def begin_eased(p: Prospect) -> tuple[str, Fit]:
             has_prior = np.array([np.isfinite(f.prior) for f in p.free])
             x = self.find_eased_start(p.free, np.where(has_prior, 0.0, p.x))
-            return self.judge_fit((*start.effects, p.effect), fit_unknowns(self.problem, p.free, x))
+            return p.effect, fit_unknowns(self.problem, p.free, x, 3)
 
-        return sorted(self.map_parallel(fit_eased, starts), key=lambda h: h.cost)
+        fits = sorted(self.map_parallel(begin_eased, starts), key=lambda each: each[1].cost)
+        fits = self.map_parallel(partial(self._continue_begun_fit, 9), fits[:3])
+        done = [self.judge_fit((*start.effects, effect), fit) for effect, fit in fits]
+        return sorted(done, key=lambda h: h.cost)
 
     def search_widely(self, h: Hypothesis, seed: int = 0) -> Hypothesis:
         """A hypothesis, or where a population ends that begins at a unit with its effects and no other deviation.
@@ -342,6 +346,18 @@ class Search:
         begin = turn_amplitudes_positive(h.fit.free, h.fit.x)
         near = fit_unknowns(self.problem, h.fit.free, begin, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
+
+    def reaches_floor(self, h: Hypothesis, steps: int, finest: int) -> bool:
+        """Whether a hypothesis leaves only noise, if need be with finer steps: a little more may be the solver's error.
+
+        The arguments are those of `refine_steps`.
+        """
+        if h.is_at_floor or not h.is_near_floor:
+            return h.is_at_floor
+        finer = copy(self)
+        finer.stage = NO_STAGE
+        finer.refine_steps(steps, finest)
+        return finer.finish_hypothesis(h, 1).is_at_floor
 
     def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:
         """A last fit that may have ended in a wrong valley, or the same effects from a healthy unit if that ends lower.
