@@ -58,7 +58,8 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     """Expected cost of each effect on top of `fit`, best first, by so many threads.
 
     Every start of an effect is simulated; the fit's own unknowns then move linearly, within their bounds and priors, to
-    take up what they can. Further passes try sizes around the best start, closer each time.
+    take up what they can. Further passes try sizes around the best start, closer each time, and the last one
+    frequencies.
     """
     effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
@@ -68,6 +69,9 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
         near = [(t.effect, start, t.along) for t in promising for start in _list_starts_around(problem, t, factors)]
         best = _pick_best([*best.values(), *_simulate_starts(problem, fit, near, workers)])
+    promising = sorted(best.values(), key=lambda t: t.cost)[:LOOKED_AT[-1]]
+    beside = [(t.effect, start, t.along) for t in promising for start in _list_lines_beside(problem, t)]
+    best = _pick_best([*best.values(), *_simulate_starts(problem, fit, beside, workers)])
     return sorted((_make_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
 
@@ -105,12 +109,11 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     that answer has a line where the effect has its frequency. The lines that stand out most from what is around, in all
     signals together, are tried, at four phases as the answer may lag, and larger as what is fast is weakened.
     """
-    entry = CATALOGUE[effect]
-    named = {entry.parameters[n].unit: n for n in entry.fitted}
-    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
-    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
+    entry, named = CATALOGUE[effect], _name_sine(effect)
+    if named is None:
         return []
-    still = {**entry.starts[0], named["Hz"]: max(1e-6, entry.parameters[named["Hz"]].low), named["rad"]: 0.5 * np.pi}
+    size, tone, phase = named
+    still = {**entry.starts[0], tone: max(1e-6, entry.parameters[tone].low), phase: 0.5 * np.pi}
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
     white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, at)))
@@ -129,35 +132,42 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     distance = 1.0  # Hz, between lines
     for _ in range(LINES):
         k = int(np.argmax(height))
-        found += [{size: still[size] * larger * float(np.abs(line[k])), named["Hz"]: float(hertz[k]),
-                   named["rad"]: float(np.angle(line[k])) + turn * np.pi - before * float(hertz[k])}
+        found += [{size: still[size] * larger * float(np.abs(line[k])), tone: float(hertz[k]),
+                   phase: float(np.angle(line[k])) + turn * np.pi - before * float(hertz[k])}
                   for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
         height[np.abs(hertz - hertz[k]) < distance] = 0.0
     return found
 
 
-def list_lines_beside(problem: Problem, p: Prospect) -> list[Prospect]:
-    """The prospect of an effect and, if it has a frequency, those at a turn over the run less and more.
+def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
+    """Starts around the frequency of a trial, if its effect has one: every half turn over the run, at eight phases.
 
-    A line in what a fit in a wrong valley leaves stands a little beside the effect's own frequency, and no fit leaves
-    the line that it begins in. The phase in the middle of the run stays.
+    A line in what a wrong fit leaves stands a little beside the effect's own frequency. A fit gets there only from
+    less than half a turn away: it does not leave the line that it begins in.
     """
-    units = {CATALOGUE[p.effect].parameters[f.name].unit: k for k, f in enumerate(p.free)
-             if f.name in CATALOGUE[p.effect].fitted}
-    if not {"Hz", "rad"} <= set(units):
-        return [p]
-    tone, phase = p.free[units["Hz"]], p.free[units["rad"]]
+    named = _name_sine(t.effect)
+    if named is None:
+        return []
+    _, tone, phase = named
     longest = _find_longest_piece(problem)
     period = problem.model.values["controller.period"]
     turn = 1.0 / (period * (longest.stop - longest.first))  # Hz
-    middle = period * (longest.later + 0.5 * (longest.first + longest.stop))
-    out = [p]
-    for change in (-turn, turn):
-        x = p.x.copy()
-        x[units["Hz"]] += change / tone.scale
-        x[units["rad"]] -= 2.0 * np.pi * change * middle / phase.scale
-        out.append(p._replace(x=x))
-    return out
+    middle = 2.0 * np.pi * period * (longest.later + 0.5 * (longest.first + longest.stop))  # where the phase stays
+    low = CATALOGUE[t.effect].parameters[tone].low
+    changes = turn * np.arange(-3.0, 3.5, 0.5)
+    return [{**t.start, tone: float(max(t.start[tone] + change, low)),
+             phase: float(t.start[phase] - middle * change + eighth * 0.25 * np.pi)}
+            for change in changes for eighth in range(8)]
+
+
+def _name_sine(effect: str) -> tuple[str, str, str] | None:
+    """Names of the amplitude, the frequency and the phase of an effect that has them."""
+    entry = CATALOGUE[effect]
+    named = {entry.parameters[n].unit: n for n in entry.fitted}
+    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
+    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
+        return None
+    return size, named["Hz"], named["rad"]
 
 
 def _find_longest_piece(problem: Problem) -> Part:

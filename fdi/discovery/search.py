@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.scan import Prospect, list_lines_beside, scan_effects
+from fdi.discovery.scan import Prospect, scan_effects
 from fdi.estimation import noise as noises
 from fdi.estimation.final_rounds import finish_fit
 from fdi.estimation.fit import Fit, continue_fit, fit_unknowns, linearise
@@ -217,9 +217,8 @@ class Search:
         prospects = scan_effects(loud, begun, effects, self.workers)
         known = {h.effects[-1] for h in tried[:2]}
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
-        chosen = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
+        starts = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
                   if rank < fitted or p.effect in known]
-        starts = [beside for p in chosen for beside in list_lines_beside(self.problem, p)]
 
         def begin_eased(p: Prospect) -> tuple[str, Fit]:
             has_prior = np.array([np.isfinite(f.prior) for f in p.free])

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from fdi.discovery.explain import explain, measure_gain
 from fdi.discovery.fingerprints import compute_firmware_residual, find_marks
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
-from fdi.discovery.scan import find_tones, list_lines_beside, scan_effects
+from fdi.discovery.scan import find_tones, scan_effects
 from fdi.discovery.search import Hypothesis, Search, measure_repeating
 from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
 from fdi.estimation.fit import Fit, linearise
@@ -200,20 +200,18 @@ def test_a_frequency_is_looked_for_where_a_line_stands_out(hertz: float) -> None
     assert 1 < len({start["supply_ripple.frequency"] for start in starts}) < 10
 
 
-def test_a_search_tries_the_lines_beside_a_tone() -> None:
-    """A turn over the test less and more, with the same sine in the middle of it; other effects stay alone."""
-    search = Search(Model(), hold_inputs(record_plant({})), [], ["supply_ripple"], 1)
-    found = scan_effects(search.problem, search.fit_base().fit, ["supply_ripple", "coil_lag"])
-    prospects = {p.effect: p for p in found}
-    ripple, (alone,) = prospects["supply_ripple"], list_lines_beside(search.problem, prospects["coil_lag"])
-    assert alone is prospects["coil_lag"]
-    values = [{f.name: f.centre + f.scale * x for f, x in zip(p.free, p.x, strict=True)}
-              for p in list_lines_beside(search.problem, ripple)]
-    hertz, phase = (np.array([v[f"supply_ripple.{name}"] for v in values]) for name in ("frequency", "phase"))
-    test = 1e-3 * len(search.problem.trace)
-    assert (hertz - hertz[0]) * test == pytest.approx([0.0, -1.0, 1.0])
-    middle = np.exp(1j * (2.0 * np.pi * hertz * 0.5 * test + phase))
-    assert middle == pytest.approx([middle[0]] * 3, abs=1e-6)
+@pytest.mark.parametrize("turns", [-2.3, 1.6])
+def test_a_scan_finds_a_frequency_from_a_line_beside_it(turns: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a supply that ripples, where the line that stands out is some turns over the test beside the ripple's."""
+    ripple = {"supply_ripple.amplitude": 0.03, "supply_ripple.frequency": 36.64, "supply_ripple.phase": 0.4}
+    search = Search(Model(), hold_inputs(record_plant(ripple)), [], ["supply_ripple"], 1)
+    turn = 1.0 / (1e-3 * len(search.problem.trace))  # Hz
+    beside = [{**ripple, "supply_ripple.frequency": 36.64 + turns * turn, "supply_ripple.phase": phase}
+              for phase in (0.0, 1.57, 3.14, 4.71)]
+    monkeypatch.setattr("fdi.discovery.scan.find_tones", lambda *_: beside)
+    (found,) = scan_effects(search.problem, search.fit_base().fit, ["supply_ripple"])
+    values = {f.name: f.centre + f.scale * x for f, x in zip(found.free, found.x, strict=True)}
+    assert values["supply_ripple.frequency"] == pytest.approx(36.64, abs=0.3 * turn)
 
 
 def test_a_sine_has_a_positive_amplitude() -> None:
