@@ -264,7 +264,11 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
 def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis], depth: int
                       ) -> tuple[Hypothesis, list[Hypothesis]]:
     """The base fitted again where effects gain little, and the hypotheses that still gain then."""
-    if not close or base.cost - close[0].cost >= GAIN_DOUBTFUL:
+    if not close:
+        return base, close
+    if base.is_at_floor:
+        base = search.leave_out_effects(base, close[0])
+    if measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
         return base, close
     base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
     base = search.leave_out_effects(base, close[0])
