@@ -137,7 +137,7 @@ FURTHER_EFFECT_SHARE = 0.1
 """Share of the excess cost that an effect must remove for another one to be looked for on top of it."""
 
 RESIDUAL_IS_NEAR_NOISE = 1.5
-"""RMS residual over noise up to which a fit with one effect may only have missed a stop, in a wrong valley."""
+"""RMS residual over noise up to which a fit with one effect may only have missed a stop, in a local minimum."""
 
 RESIDUAL_HELD_OUT = 1.2
 """RMS residual over noise in the typical block of a held-out run, up to which an explanation holds there.
@@ -479,10 +479,10 @@ Its error was 0.4, 0.5, 0.6, 0.8 and 4.0 % in the first five trials (docs/identi
 
 FITTED_RUN_WORST = 1.3
 """RMS residual over noise of a fitted run, over all its blocks, above which an identification is only a part, and a
-diagnosis beside other effects explains nothing: a search that has tried other starts ends in a wrong valley there.
+diagnosis beside other effects explains nothing: a search that has tried other starts ends in a local minimum there.
 
 The typical block hides a few stops of the ram at the wrong moment; in a run that was fitted they mean that the fit
-ended in a wrong valley. In trials with fresh seeds the two fits with 2.5 and 2.8 had frictions that were 5 to 13 % off;
+ended in a local minimum. In trials with fresh seeds the two fits with 2.5 and 2.8 had frictions that were 5 to 13 % off;
 the others had at most 1.1 (docs/identify.md)."""
 
 IDENTIFIABLE_SHARE = 0.2

@@ -216,7 +216,7 @@ class JointSearch:
         return loud.scan(loud.descend(fit, ((1.0, rounds),)), effects, np.inf)
 
     def start_afresh(self) -> Fit:
-        """A unit with the best pair of faults and no other deviation: an effect may lead fits into a wrong valley."""
+        """A unit with the best pair of faults and no other deviation: an effect may lead fits into a local minimum."""
         free = list_unknowns(self.model)
         x = choose_start(self.problem, free, COARSE_STARTS)
         flat = self.find_flat(free, x)
@@ -286,7 +286,7 @@ class JointSearch:
         return done
 
     def _leave_out(self, named: Named, effect: str) -> Named:
-        """The fit without one of its effects: the search may have needed it only to leave a wrong valley."""
+        """The fit without one of its effects: the search may have needed it only to leave a local minimum."""
         effects, fit = named
         dropped = set(CATALOGUE[effect].fitted)
         kept = [k for k, f in enumerate(fit.free) if f.name not in dropped]

@@ -124,7 +124,7 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             levels.append(tried)
             break
         if not done or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
-            # a fit in a wrong valley leads the scan astray, and far tolerances may stand in for an effect
+            # a fit in a local minimum leads the scan astray, and far tolerances may stand in for an effect
             tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
         if count == 2 and not done and _takes_fair_share(search, levels[1][0], tried[0]) and not \
                 search.reaches_floor(tried[0], FINE, TRUEST):
@@ -140,7 +140,7 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
 
 def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], tried: Sequence[Hypothesis]
                           ) -> list[Hypothesis]:
-    """Pairs of effects, best first, two of which a population has sought anew: two effects share many wrong valleys.
+    """Pairs of effects, best first, two of which a population has sought anew: two effects share many local minima.
 
     So is the best single effect where it leaves little: a stop that it missed is no second effect.
     """

@@ -68,7 +68,7 @@ class Hypothesis:
 
     @property
     def is_poor(self) -> bool:
-        """True when the fit leaves more than the noise that it was made with: it may have ended in a wrong valley."""
+        """True when the fit leaves more than the noise that it was made with: it may have ended in a local minimum."""
         return bool(self.fit.misfit > WHITE_SQUARE_POOR * np.count_nonzero(self.fit.white))
 
     @property
@@ -206,7 +206,7 @@ class Search:
                                  ) -> list[Hypothesis]:
         """`start` with one more effect each, chosen and fitted with the noise first taken for larger; best first.
 
-        Where the fit of `start` has ended in a wrong valley, a scan believes what that fit tells it, and fits begin
+        Where the fit of `start` has ended in a local minimum, a scan believes what that fit tells it, and fits begin
         there. With more noise the tolerances stay near a healthy unit, and an effect is judged by the course of the
         signals. The best two effects that have been `tried` are fitted in any case.
         """
@@ -233,7 +233,7 @@ class Search:
     def search_widely(self, h: Hypothesis, seed: int = 0) -> Hypothesis:
         """A hypothesis, or where a population ends that begins at a unit with its effects and no other deviation.
 
-        Stick-slip makes the cost rough, and two effects share many wrong valleys (`fdi.estimation.population`).
+        Stick-slip makes the cost rough, and two effects share many local minima (`fdi.estimation.population`).
         """
         free = h.fit.free
         has_prior = np.isfinite([f.prior for f in free])
@@ -359,7 +359,7 @@ class Search:
         return finer.finish_hypothesis(h, 1).is_at_floor
 
     def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:
-        """A last fit that may have ended in a wrong valley, or the same effects from a healthy unit if that ends lower.
+        """A last fit that may have ended in a local minimum, or the same effects from a healthy unit if that ends lower.
 
         Such a fit leaves more than noise, or only noise but far from a healthy unit. The other one is taken to the end
         only if it is not clearly higher after so many rounds.

@@ -1,6 +1,6 @@
 """A search by a population of trials whose spread follows the valley, for a misfit that is too rough for slopes.
 
-Stick-slip makes the misfit rough: each stop of ram or spool that is made or missed is a ridge, and a wrong valley is
+Stick-slip makes the misfit rough: each stop of ram or spool that is made or missed is a ridge, and a local minimum is
 left only if several frictions move at once. Evolution with an adapted covariance (CMA-ES: N. Hansen, "The CMA Evolution
 Strategy: A Tutorial", arXiv:1604.00772) needs no slopes, only the order of the trials, which run side by side in lanes.
 """

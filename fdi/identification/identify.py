@@ -285,7 +285,7 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
            ) -> tuple[LogProblem, Fit]:
     """The last rounds, with finer steps; then with the noise that is left, where only noise is left.
 
-    `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a wrong valley.
+    `begin`: the unknowns (p,) where regressions put them, at which a search begins if the fit ended in a local minimum.
     """
     fine = replace(problem, steps=LAST_STEPS, _lanes={})
     fit = descend(fine, fit, 8)
