@@ -482,8 +482,8 @@ FITTED_RUN_WORST = 1.3
 diagnosis beside other effects explains nothing: a search that has tried other starts ends in a local minimum there.
 
 The typical block hides a few stops of the ram at the wrong moment; in a run that was fitted they mean that the fit
-ended in a local minimum. In trials with fresh seeds the two fits with 2.5 and 2.8 had frictions that were 5 to 13 % off;
-the others had at most 1.1 (docs/identify.md)."""
+ended in a local minimum. In trials with fresh seeds the two fits with 2.5 and 2.8 had frictions that were 5 to 13 %
+off; the others had at most 1.1 (docs/identify.md)."""
 
 IDENTIFIABLE_SHARE = 0.2
 """Half the interval over half the range of the data sheet, up to which a parameter is identifiable from the runs."""

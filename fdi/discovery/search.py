@@ -359,7 +359,7 @@ class Search:
         return finer.finish_hypothesis(h, 1).is_at_floor
 
     def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:
-        """A last fit that may have ended in a local minimum, or the same effects from a healthy unit if that ends lower.
+        """A last fit that may be in a local minimum, or the same effects from a healthy unit if that ends lower.
 
         Such a fit leaves more than noise, or only noise but far from a healthy unit. The other one is taken to the end
         only if it is not clearly higher after so many rounds.
