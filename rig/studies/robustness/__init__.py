@@ -1,1 +1,1 @@
-"""Robustness, counted: fuzz frames, killed and stopped processes, full disks, long operation."""
+"""Robustness: fuzz frames, killed and stopped processes, full disks, long operation."""
