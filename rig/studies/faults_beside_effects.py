@@ -145,7 +145,7 @@ def name_valve(valve: Mapping[str, float]) -> str:
 def format_table(rows: Iterable[Row]) -> str:
     """Counts in Markdown: a line for each state of the valve, and one for all."""
     rows = [row for row in rows if row["verdict"] != "CRASHED"]
-    lines = ["| valve | cases | level right | healthy valve blamed | SOMETHING_ELSE | Kintas inside | FSS inside |",
+    lines = ["| valve | cases | level right | absent fault reported | SOMETHING_ELSE | Kintas inside | FSS inside |",
              "|---|---|---|---|---|---|---|"]
     groups = [(name_valve(valve), [row for row in rows if row["valve"] == dict(valve)]) for valve in VALVES]
     for name, own in [*groups, ("all", rows)]:
