@@ -71,7 +71,7 @@ NOT_PLAYED = {
     "rig campaign --fault healthy --fault filter_clogging=0.1,0.25,0.35 --seeds 50 --out mine": _HOURS,
     "rig trend --score --units 20": _HOURS,
 }
-NOT_PLAYED_SECTIONS = {("docs/commands.md", "Find the numbers"): _MINUTES,
+NOT_PLAYED_SECTIONS = {("docs/commands.md", "Find the parameters"): _MINUTES,
                        ("docs/commands.md", "Measure the software"): "measures for minutes to hours"}
 NOT_PLAYED_PAGES = {
     "docs/bands.md": "TRACE stands for a file; tests/fdi/diagnosis runs these options",
