@@ -249,8 +249,9 @@ def _describe_scatter(c: Comparison) -> str:
         which = f" (in tolerances: {', '.join(changed)})" if changed else ""
         return f"tolerances of the parameters could explain all of the error{which}"
     worst = max(s.ratio, key=lambda name: s.ratio[name])
-    return (f"tolerances do not explain it: refitted within them, the model leaves {SIGNAL_NAMES[worst]} error "
-            f"{format_signal(s.error[worst], worst)}, {format_ratio(s.ratio[worst])} times the floor")
+    return (f"scatter between units does not explain it: with all parameters refitted within their tolerances the "
+            f"{SIGNAL_NAMES[worst]} error is still {format_signal(s.error[worst], worst)}, "
+            f"{format_ratio(s.ratio[worst])} times the floor")
 
 
 def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_memory: float = 3.0) -> list[str]:

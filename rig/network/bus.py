@@ -84,7 +84,7 @@ def choose_bus(spec: str = "auto") -> tuple[str, str]:
     if spec == "auto" and configured in ("", "auto"):
         live = list_can_interfaces()
         unasked = f"; {', '.join(live)} up, but not taken unasked" if live else ""
-        return "embedded", f"embedded bus: no --bus and no {BUS_VARIABLE}{unasked}"
+        return "embedded", f"embedded bus (neither --bus nor {BUS_VARIABLE} is set){unasked}"
     where, taken = (BUS_VARIABLE, configured) if spec == "auto" else ("--bus", spec)
     kind, channel = parse_spec(taken, where)
     if kind == "socketcan":
