@@ -55,7 +55,7 @@ def test_words_of_a_model_that_does_not(fault: Said, folder: Path) -> None:
                     r"[\d.]+ um; the servovalve disagrees; controller, jack and sensor fit.", first)
     text = "\n".join(rest)
     for words in ("from the command alone", "servovalve", "equal to the last digit", "halving the step",
-                  "floor     the model's sensor noise", "where     motion within 3 mm", "scatter   scatter between units does not",
+                  "floor     the model's sensor noise", "where     motion within 3 mm", "scatter   scatter",
                   f"page      {folder / 'fault.html'}", f"next      rig explain {folder / 'fault.csv'}"):
         assert words in text, words
     assert "nan" not in fault.out and not re.search(r"\d[eE][-+]\d", fault.out)
