@@ -24,6 +24,7 @@ from fdi.thresholds import (
     GAIN_SEEN,
     GAIN_TIE,
     HELD_OUT_UNDECIDED_SHARE,
+    INTERVAL_95_SD,
     RESIDUAL_HELD_OUT,
     SOLVER_ERROR_SHARE,
 )
@@ -268,11 +269,23 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
         return base, close
     if base.is_at_floor:
         base = search.leave_out_effects(base, close[0])
-    if measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
+        close = [h for h in close if shows_effect(search.model, h)]
+    if not close or measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
         return base, close
     base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
     base = search.leave_out_effects(base, close[0])
     return base, [] if depth == 1 and not _is_significant(base, close[0]) else close
+
+
+def shows_effect(model: Model, h: Hypothesis) -> bool:
+    """Whether the 95 % interval of a parameter of the last effect leaves out its off value.
+
+    If none does, the fit is better only by a stop that it met by chance.
+    """
+    entry = CATALOGUE[h.effects[-1]]
+    values = h.fit.values
+    return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0)))
+               > INTERVAL_95_SD * h.fit.spread(name) for name in entry.fitted)
 
 
 def _sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:

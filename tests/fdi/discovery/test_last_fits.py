@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from noisy_traces import record_plant
 
-from fdi.discovery.search import Search
+from fdi.discovery.explain import shows_effect
+from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import linearise
 from fdi.estimation.likelihood import Free
 from fdi.estimation.preparation import hold_inputs
@@ -46,3 +47,17 @@ def test_a_fit_that_leaves_noise_near_a_healthy_unit_stays(search: Search) -> No
     near = search.judge_fit(("null_bias",), linearise(search.problem, free, start_off(free, 0.0)))
     assert not near.is_far and not near.is_poor
     assert search.begin_again(near) is near
+
+
+def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: Search) -> None:
+    """Of a null bias of 100 uA: its own size does, a hundredth of its standard deviation does not."""
+    free = list_all_unknowns(search.model)
+    place = [f.name for f in free].index("null_bias.current")
+    found = linearise(search.problem, free, np.zeros(len(free)))
+
+    def move_bias(current: float) -> Hypothesis:
+        x = np.where(np.arange(len(free)) == place, (current - free[place].centre) / free[place].scale, found.x)
+        return search.judge_fit(("null_bias",), replace(found, x=x))
+
+    small = 0.01 * found.spread("null_bias.current")
+    assert [shows_effect(load_model(), move_bias(current)) for current in (1e-4, small)] == [True, False]
