@@ -53,7 +53,7 @@ from plant.threads import R, T, map_in_threads
 
 Floats = NDArray[np.float64]
 
-# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT_BY_RATIO`: pressures, spool
+# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT`: pressures, spool
 # forces, torques, and all that goes with the jack's area
 EFFECT_POWERS: tuple[Mapping[str, float], ...] = (
     {"supply_droop.slope": -1.0},

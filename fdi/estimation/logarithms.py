@@ -31,6 +31,11 @@ class LogFrictionRatio(LogFree):
 
     __slots__ = ()
 
+    @property
+    def dynamic_name(self) -> str:
+        """The dynamic friction's name."""
+        return self.name.replace("static", "dynamic")
+
 
 class LogOpenFilter(Free):
     """Kintas by the logarithm of what the filter lets through, 1 - Kintas: gains go with powers of it."""
@@ -55,7 +60,7 @@ def compute_values(free: Sequence[Free], x: Floats) -> Floats:
     names = [f.name for f in free]
     for k, f in enumerate(free):
         if isinstance(f, LogFrictionRatio):
-            found[k] *= found[names.index(f.name.replace("static", "dynamic"))]
+            found[k] *= found[names.index(f.dynamic_name)]
     return limit_dynamic_friction(names, found)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit, cut_at_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, scaled_bounds
+from fdi.estimation.logarithms import LogFrictionRatio
 from fdi.thresholds import FLAT_DIRECTION_MISFIT, PRIORS_KNOW_MORE_MISFIT
 
 Floats = NDArray[np.float64]
@@ -37,9 +38,6 @@ FLAT: tuple[Mapping[str, float], ...] = (
     {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.mass": 1.0, "jack.damping": 1.0, "jack.static_friction": 1.0,
      "jack.dynamic_friction": 1.0, "jack.leakage": 1.0},
 )
-# static friction of the jack is known here by its ratio to the dynamic one, which stays
-FLAT_BY_RATIO = tuple({name: power for name, power in flat.items() if name != "jack.static_friction"}
-                      for flat in FLAT)
 
 # In a run in which the flapper meets neither of its stops nothing shows how far it moves, only what its way does.
 FLAPPER: Mapping[str, float] = {"pilot.flow_gain": 1.0, "pilot.pressure_gain": 1.0, "flapper.stiffness": 1.0,
@@ -220,21 +218,21 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
                          others: Sequence[Mapping[str, float]] = (),
                          scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {}),
                          allowed: float = FLAT_DIRECTION_MISFIT) -> Floats:
-    """Directions of `FLAT_BY_RATIO` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k).
+    """Directions of `FLAT` and `others` that hold at `x` (p,) of scaled logarithms, as columns (p, k).
 
     A direction holds if one of the trial replays along it, of four lengths, changes no more than its share of
     `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. `scaled` are parameters that are not logarithms,
-    with their powers in each of `FLAT_BY_RATIO`.
+    with their powers in each of `FLAT`.
     """
     law = problem.model["filter.law"]
     load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
     at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
     said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
-            {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT_BY_RATIO]
-    said = [flat | {name: power * at[name] for name, power in more.items() if name in at}
+            {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT]
+    said = [{**flat, **{name: power * at[name] for name, power in more.items() if name in at}}
             for flat, more in zip(said, scaled, strict=True)]
     every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
-    ways = np.array([[flat.get(f.name, 0.0) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
+    ways = np.array([[_get_power(flat, f) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
     if not len(ways):
         return ways.T
     shares = np.array(TRIED_SHARES)
@@ -245,6 +243,12 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full, limits)]
     found: Floats = flat_ways[_find_independent(flat_ways)].T
     return found
+
+
+def _get_power(powers: Mapping[str, float], f: Free) -> float:
+    """The power with which an unknown moves; a ratio of frictions only moves where its frictions move apart."""
+    power = powers.get(f.name, 0.0)
+    return power - powers.get(f.dynamic_name, 0.0) if isinstance(f, LogFrictionRatio) else power
 
 
 def _find_independent(ways: Floats) -> list[int]:
@@ -260,9 +264,9 @@ def _find_independent(ways: Floats) -> list[int]:
 def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
     """Places of the unknowns that, with the flat directions (p, k), span all: one of each direction is left out.
 
-    It is the first that the direction names in `FLAT_BY_RATIO`, else the one that moves furthest.
+    It is the first that the direction names in `FLAT`, else the one that moves furthest.
     """
-    leading = np.array([f.name in [next(iter(v)) for v in FLAT_BY_RATIO] for f in free])
+    leading = np.array([f.name in [next(iter(v)) for v in FLAT] for f in free])
     left = flat.copy()
     left_out: list[int] = []
     for i in range(left.shape[1]):  # elimination, so that directions with the same parameters leave out different ones

@@ -179,7 +179,7 @@ def _compute_shares(free: Sequence[Free], information: Floats) -> dict[str, floa
         slope = np.zeros(len(free))
         slope[k] = f.scale
         if isinstance(f, LogFrictionRatio):
-            dynamic = names.index(f.name.replace("static", "dynamic"))
+            dynamic = names.index(f.dynamic_name)
             slope[dynamic] = free[dynamic].scale
         spread = IDENTIFIED_INTERVAL_FACTOR * float(np.sqrt(slope @ covariance @ slope))
         shares[f.name] = INTERVAL_95_SD * float(np.hypot(spread, get_systematic_sd(f.name))) / (f.scale * f.prior)

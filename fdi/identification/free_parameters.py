@@ -24,7 +24,8 @@ from plant.errors import InputError
 from plant.model import Model, find_quantity, find_shipped_model
 from plant.parameters import read_toml
 
-STATIC, DYNAMIC = "jack.static_friction", "jack.dynamic_friction"
+STATIC = "jack.static_friction"
+FRICTIONS = ((STATIC, "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
 
 
 class Range(NamedTuple):
@@ -127,14 +128,22 @@ def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
     """What the fit may change: the free parameters, and the tolerances of the others."""
     free = {r.name: _make_free(r) for r in ranges}
     free |= {f.name: take_logarithm(f) for f in list_tolerance_unknowns(model) if f.name not in free}
-    if STATIC in free and DYNAMIC in free:
-        usual = math.log(max(model[STATIC] / model[DYNAMIC], 1.0))
-        is_free = STATIC in {r.name for r in ranges}
-        spread, highest = (0.5, math.log(20.0)) if is_free else (0.03, usual + 1.0)
-        ratio = LogFrictionRatio(STATIC, usual, spread, 1.0, 0.0, max(highest, usual), 0.3)
-        del free[STATIC]
-        free[STATIC] = ratio
+    for static, dynamic in FRICTIONS:
+        if static in free and isinstance(free.get(dynamic), LogFree):
+            del free[static]  # to come after the dynamic one
+            free[static] = _make_friction_ratio(model, static, dynamic, static in {r.name for r in ranges})
     return tuple(free.values())
+
+
+def _make_friction_ratio(model: Model, static: str, dynamic: str, is_free: bool) -> LogFrictionRatio:
+    """Static over dynamic friction, at least 1.
+
+    As two separate unknowns the dynamic friction could go above the static one, where no signal depends on it any more:
+    a fit that got there would stay.
+    """
+    usual = math.log(max(model[static] / model[dynamic], 1.0))
+    spread, highest = (0.5, math.log(20.0)) if is_free else (0.03, usual + 1.0)
+    return LogFrictionRatio(static, usual, spread, 1.0, 0.0, max(highest, usual), 0.3)
 
 
 def _make_free(r: Range) -> Free:

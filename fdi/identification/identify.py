@@ -7,6 +7,7 @@ sheet's value, and `experiments` says which run would show it. Held-out runs jud
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -237,11 +238,17 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
     found = {}
     for i, (k, r) in enumerate(places):
         f = fit.free[k]
-        below, above = (costs[1 + 2 * i + side] - costs[0] < OPEN_MISFIT for side in (0, 1))
+        below, above = (abs(costs[1 + 2 * i + side] - costs[0]) < OPEN_MISFIT for side in (0, 1))
         if below or above:
             low = r.low if below else _find_edge(problem, fit, k, f.low)
             high = r.high if above else _find_edge(problem, fit, k, f.high)
             found[f.name] = (min(max(r.centre, low), high), low, high)
+    for k, f in enumerate(fit.free):
+        if isinstance(f, LogFrictionRatio) and f.dynamic_name in found:  # it moved as well, and no signal changed
+            ratio = f.value(float(fit.x[k]))
+            least, most = (ranges[f.name].low, ranges[f.name].high) if f.name in ranges else (0.0, math.inf)
+            value, low, high = (min(max(ratio * each, least), most) for each in found[f.dynamic_name])
+            found[f.name] = value, low, high
     return found
 
 
@@ -332,8 +339,8 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
         if r.name in names:
             k = names.index(r.name)
             slopes[i, k] = free[k].scale
-            if isinstance(free[k], LogFrictionRatio):
-                dynamic = names.index(r.name.replace("static", "dynamic"))
+            if isinstance(f := free[k], LogFrictionRatio):
+                dynamic = names.index(f.dynamic_name)
                 slopes[i, dynamic] = free[dynamic].scale
     covariance = slopes @ fit.covariance @ slopes.T
     spread = np.sqrt(np.diag(covariance))
@@ -349,7 +356,7 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
             systematic *= abs(value)
         half = INTERVAL_95_SD * float(np.hypot(factor, systematic))
         low, high = (value * np.exp(-half), value * np.exp(half)) if r.is_relative else (value - half, value + half)
-        low, high = max(float(low), r.low), min(float(high), r.high)
+        low, high = (min(max(float(end), r.low), r.high) for end in (low, high))
         share = half / r.half_width
         seen = share <= IDENTIFIABLE_SHARE
         found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, seen, min(share, 1.0)))

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from fdi.discovery.model_file import read_provenance
+from fdi.estimation.likelihood import scaled_bounds
+from fdi.estimation.logarithms import compute_values
 from fdi.identification import global_fit
 from fdi.identification.closed_form import estimate_by_regressions
 from fdi.identification.controller import read_controller
-from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
+from fdi.identification.free_parameters import list_unknowns, parse_free_parameters, read_free_parameters
 from fdi.identification.identify import Identification, decide_verdict, identify_model
 from fdi.identification.model_text import write_identified_model
 from fdi.identification.runs import collect_identification_runs
@@ -222,6 +224,26 @@ def test_ranges_of_a_model_file(tmp_path: Path) -> None:
     assert (area.centre, area.low, area.high) == pytest.approx((3e-3, 2e-3, 4.5e-3))
     assert (leakage.low, leakage.high) == (1e-13, 1e-11)
     assert len(read_free_parameters(load_model(), None)) > 10
+
+
+def test_every_unknown_changes_the_model_wherever_a_fit_may_be() -> None:
+    """Where dynamic friction could go above static friction, no signal depended on it, and a fit stayed there."""
+    model = load_model()
+    free = list_unknowns(model, read_free_parameters(model, None))
+    low, high = scaled_bounds(free)
+    for seed in range(20):
+        x = np.random.default_rng(seed).uniform(np.maximum(low, -2.0), np.minimum(high, 2.0))
+        for k in range(len(free)):
+            moved = x.copy()
+            moved[k] += 0.1 if x[k] + 0.1 < high[k] else -0.1
+            assert (compute_values(free, moved) != compute_values(free, x)).any(), free[k].name
+
+
+def test_dynamic_friction_that_no_run_shows_takes_the_static_one_with_it(runs: tuple[Trace, Trace, Trace]) -> None:
+    table = {"spool": {"static_friction": [1e-6, 2e-5], "dynamic_friction": [1e-6, 1e-5]}, **FREE}
+    found = identify([runs[1]], [], table)
+    for friction in ("spool.static_friction", "spool.dynamic_friction"):
+        assert not next(e for e in found.estimates if e.name == friction).is_identifiable
 
 
 def test_design_survives_the_model_file(tmp_path: Path) -> None:
