@@ -162,11 +162,21 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     plain = rebind_names(linked.py_func)
     settings: Any = numba.config
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
-        before, settings.CACHE_DIR = settings.CACHE_DIR, str(find_cache_folder() / compute_fingerprint(root))
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(_find_folder_of_code(root))
         try:
             return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
         finally:
             settings.CACHE_DIR = before
+
+
+def is_function_stored(function: Function, ports: Mapping[str, Function] | None = None) -> bool:
+    """Whether machine code of what `compile_function` would compile is on the disk, be it for this CPU or another."""
+    return any(_find_folder_of_code(_link_calls(function, ports or {}, lambda f: f)).rglob("*.nbc"))
+
+
+def _find_folder_of_code(root: Function) -> Path:
+    """The folder of the machine code of a linked function."""
+    return find_cache_folder() / compute_fingerprint(root)
 
 
 @contextlib.contextmanager

@@ -17,11 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.anchor import initialise_sensed_position, pull_ram, rest_at_reading, set_sample_memories
-from plant.compile import Function, compile_function, is_costly, make_record_reader, rebind_names
+from plant.compile import (
+    Function,
+    compile_function,
+    is_costly,
+    is_function_stored,
+    make_record_reader,
+    rebind_names,
+)
 from plant.controller import Loop, apply_command_effects, compute_current
 from plant.effects import CATALOGUE, Effect
 from plant.errors import InputError
 from plant.flat import list_state_values, make_lane_packers
+from plant.kernel_use import KernelUse
 from plant.model import Model, build_bare_model, build_initial_state, collect_bindings
 from plant.plants import MeasuredPressures, find_plant
 from plant.ports import at_reading
@@ -32,10 +40,13 @@ from plant.threads import count_threads, map_in_threads
 Array = NDArray[np.float64]
 STEPS = 20  # steps a cycle: 50 us
 FEW = 6  # effects that a model may have and still get one kernel for all its runs
+FEW_COSTLY = 2  # costly effects that a kernel of their own may have
+ALL_OVER_FEW = 4.0  # time of a step with all effects over that of one with few costly ones
 WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
 # two of the widest registers, so that one computes while the other waits; for many runs of a short step, four
 NARROW, WIDE = 16, 32
 TURN = 20_000  # samples that a kernel makes in one call
+KERNEL_USE = KernelUse()  # of this process
 
 
 class Part(NamedTuple):
@@ -68,6 +79,7 @@ class Lanes:
             if name not in known or name == "controller.period":
                 raise InputError("lanes", name, f"a parameter of the model {model.name} other than the period")
         self._rungs = list_kernel_variants(model)
+        self._own: dict[tuple[str, ...], KernelVariant] = {}
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
                anchor: float = 0.0, parts: Sequence[Part] = (), chambers: Array | None = None) -> Array:
@@ -133,7 +145,7 @@ class Lanes:
         """
         where = np.empty(0) if position is None else position
         values, driven, load, where = self._check(values, current, load, where)
-        work = self._make_blocks(values)
+        work = self._make_blocks(values, len(driven))
         inputs = driven, load, where, float(anchor), False, float(self.model["controller.period"]), self.steps
         for first in range(0, len(driven), rows):
             stop = min(first + rows, len(driven))
@@ -166,7 +178,8 @@ class Lanes:
         values, driven, load, position = self._check(values, driven, load, position)
         out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
         inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
-        work = [(block, part) for block in self._make_blocks(values) for part in parts or (Part(0, len(driven), 0),)]
+        pieces = parts or (Part(0, len(driven), 0),)
+        work = [(block, part) for block in self._make_blocks(values, len(driven)) for part in pieces]
 
         def do(task: tuple[Block, Part]) -> None:
             block, part = task
@@ -192,12 +205,15 @@ class Lanes:
                              f"{driven.shape}, {load.shape} and {position.shape}")
         return values, driven, load, position
 
-    def _make_blocks(self, values: Array) -> list[Block]:
-        return [block for rung, members in self._assign_runs(values)
+    def _make_blocks(self, values: Array, samples: int) -> list[Block]:
+        return [block for rung, members in self._assign_runs(values, samples)
                 for block in rung.build_blocks(self.names, values, members)]
 
-    def _assign_runs(self, values: Array) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
-        """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones."""
+    def _assign_runs(self, values: Array, samples: int) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
+        """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones.
+
+        `samples` is the length of a run.
+        """
         effects = self.model.effects
         if len(self._rungs) == 1:
             return [(self._rungs[0], np.arange(len(values)))]
@@ -209,7 +225,46 @@ class Lanes:
             left &= ~fits
             if fits.any():
                 shared.append((rung, np.flatnonzero(fits)))
+        if shared and shared[-1][0] is self._rungs[-1]:
+            _, members = shared.pop()
+            shared += self._share_costly_runs(members, at_work, samples)
         return shared
+
+    def _share_costly_runs(self, members: NDArray[np.int64], at_work: NDArray[np.bool_], samples: int
+                           ) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
+        """The runs `members`, which have costly effects at work: many with the same ones get a kernel of their own.
+
+        Args:
+            members: numbers of these runs.
+            at_work: (m, effects) of all runs.
+            samples: of a run.
+        """
+        cheap = self._rungs[-2].model.effects
+        costly = [name for name in self.model.effects if name not in cheap]
+        columns = [self.model.effects.index(name) for name in costly]
+        kinds, kind_of, sizes = np.unique(at_work[members][:, columns], axis=0, return_inverse=True,
+                                          return_counts=True)
+        shared, is_left = [], np.ones(len(members), bool)
+        for kind in np.argsort(-sizes):
+            chosen = kind_of.reshape(-1) == kind
+            fewer = _count_blocks(is_left.sum()) - _count_blocks((is_left & ~chosen).sum())
+            is_few = kinds[kind].sum() <= min(FEW_COSTLY, len(costly) - 1)
+            if not is_few or ALL_OVER_FEW * fewer <= _count_blocks(sizes[kind]):
+                continue
+            own = self._find_own_kernel((*cheap, *(costly[i] for i in np.flatnonzero(kinds[kind]))))
+            if own.is_ready(NARROW * _count_blocks(sizes[kind]) * samples * self.steps):
+                shared.append((own, members[chosen]))
+                is_left &= ~chosen
+        if is_left.any():
+            shared.append((self._rungs[-1], members[is_left]))
+        return shared
+
+    def _find_own_kernel(self, effects: tuple[str, ...]) -> KernelVariant:
+        """The kernel of the model with these effects, in the model's order."""
+        effects = tuple(name for name in self.model.effects if name in effects)
+        if effects not in self._own:
+            self._own[effects] = KernelVariant(self.model, effects)
+        return self._own[effects]
 
     def _find_active_runs(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
         """The runs in which the effect is active: one of its parameters differs from its off value."""
@@ -229,6 +284,22 @@ class KernelVariant:
         self._names, self._laws = self.model.list_names(), list_laws(effects)
         self._state: Array | None = None
         self._parameters = self.model.build_record().view(np.float64)[:, None]
+
+    def is_ready(self, steps: float) -> bool:
+        """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
+        key = self.model.plant, self.model.effects, self._laws
+
+        def is_stored() -> bool:
+            plan = plan_layout(self.model.effects, self.model.plant, NARROW)
+            return is_function_stored(bind_block_loop(plan), plan.names)
+
+        return KERNEL_USE.is_ready(key, steps, is_stored, self.prepare)
+
+    def prepare(self) -> None:
+        """Load or compile the kernel by a run of no samples."""
+        none = np.empty(0)
+        for run, buffer, rows in self.build_blocks((), np.zeros((1, 0)), np.arange(1)):
+            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, np.empty((2, 3, 0)))
 
     def build_blocks(self, names: Sequence[str], values: Array, members: NDArray[np.int64]) -> Iterator[Block]:
         """The runs `members` in blocks.
@@ -254,12 +325,17 @@ class KernelVariant:
             yield Block(run, buffer.reshape(-1), rows.astype(np.uint64))  # unsigned: no test for counting from the end
 
 
+def _count_blocks(runs: int) -> int:
+    return -(-int(runs) // NARROW)
+
+
 def list_kernel_variants(model: Model) -> list[KernelVariant]:
     """Kernels for the runs of a model, from few effects to all of them.
 
     An effect at its off value changes no bit, so a run can be made without it. A model with many effects has three
     kernels: without effects, with those whose laws are cheap, with all. They make 400, 200 and 70 million steps per
-    second. More kernels would save less time than they take to compile.
+    second. Kernels with one or two costly effects follow where they save more time than they take to compile
+    (`plant.kernel_use`).
     """
     if len(model.effects) <= FEW:
         return [KernelVariant(model, model.effects)]
@@ -276,9 +352,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     rungs = list_kernel_variants(model)
     for done, rung in enumerate(rungs):
         progress(f"compiling the plant with {len(rung.model.effects)} effects, once", done / len(rungs))
-        for run, buffer, rows in rung.build_blocks((), np.zeros((1, 0)), np.arange(1)):
-            none = np.empty(0)
-            run(buffer, none, none, none, 0.0, False, 1.0, 1, 0, 0, 0, 0, True, rows, np.empty((2, 3, 0)))
+        rung.prepare()
     progress("", 1.0)
 
 
@@ -340,7 +414,12 @@ def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> La
 
 def compile_block_kernel(plan: Layout) -> Function:
     """`run_block` as machine code."""
-    return compile_function(rebind_names(run_block, WIDTH=plan.width), plan.names)
+    return compile_function(bind_block_loop(plan), plan.names)
+
+
+def bind_block_loop(plan: Layout) -> Function:
+    """`run_block` for the lanes of a layout."""
+    return rebind_names(run_block, WIDTH=plan.width)
 
 
 def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,

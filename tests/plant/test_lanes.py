@@ -11,7 +11,7 @@ from effect_files import COGGING, MEMORY, restored_catalogue
 from noisy_traces import record_plant
 from other_cpus import compiles_for
 
-from plant import Actuator, InputError, Model, simulate
+from plant import Actuator, InputError, Model, kernel_use, simulate
 from plant import lanes as lanes_module
 from plant.anchor import (
     initialise_sensed_position,
@@ -21,6 +21,7 @@ from plant.anchor import (
 )
 from plant.compile import interpret_function
 from plant.effects import CATALOGUE, load_effects
+from plant.kernel_use import KernelUse
 from plant.lanes import Lanes, Part, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
 from plant.solve import read_sensors, step_cycle
@@ -127,6 +128,34 @@ def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeyp
     monkeypatch.setattr(lanes_module, "FEW", 99)
     whole = Lanes(catalogue.model, catalogue.names, catalogue.steps)
     assert (shared == whole.replay(values, CURRENT, FORCE)).all()
+
+
+def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth_while(
+        catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And get the bits that the kernel with all effects would give them."""
+    kinds = [("coil_lag",), ("coil_lag", "rod_backlash"), ("coil_lag", "viscosity_drift")]
+    values = np.vstack([with_effects(catalogue, {n: v for name in kind for n, v in start(name, which).items()})
+                        for kind in kinds for which in (0, -1)] * 4)
+    monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
+    without = catalogue.replay(values, CURRENT, FORCE)
+    assert {len(rung.model.effects) for rung, _ in catalogue._assign_runs(values, 1)} == {len(EFFECTS)}
+    monkeypatch.setattr(kernel_use, "WORTH_LOADING", 0.0)
+    monkeypatch.setattr(kernel_use, "WORTH_COMPILING", 0.0)
+    monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
+    shared = catalogue._assign_runs(values, 1)
+    costly = {frozenset(rung.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"} for rung, _ in shared}
+    assert costly == {frozenset({"coil_lag"}), frozenset({"coil_lag", "viscosity_drift"})}
+    assert sorted(np.concatenate([members for _, members in shared])) == list(range(len(values)))
+    assert (catalogue.replay(values, CURRENT, FORCE) == without).all()
+
+
+def test_runs_that_would_not_fill_a_block_stay_together(catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A block takes as long for one run as for sixteen."""
+    monkeypatch.setattr(kernel_use, "WORTH_LOADING", 0.0)
+    monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
+    values = np.vstack([with_effects(catalogue, start(name, -1)) for name in ("coil_lag", "stribeck", "supply_ripple",
+                                                                              "sensor_lag", "orifice_root")])
+    assert len(catalogue._assign_runs(values, 1)) == 1
 
 
 def test_all_effects_at_once(catalogue: Lanes) -> None:
