@@ -276,9 +276,18 @@ def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
 def _find_globals(function: Function) -> dict[str, Any]:
     """The module-level names `function` reads, with their values."""
     function = getattr(function, "py_func", function)
-    names = {i.argval for i in dis.get_instructions(function) if i.opname == "LOAD_GLOBAL"}
     there = function.__globals__
-    return {name: there[name] for name in sorted(names) if name in there}
+    return {name: there[name] for name in _list_global_names(function.__code__) if name in there}
+
+
+@cache
+def _list_global_names(code: CodeType) -> tuple[str, ...]:
+    return tuple(sorted({i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}))
+
+
+@cache
+def _divides(code: CodeType) -> bool:
+    return any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(code))
 
 
 def _find_calls(function: Function) -> dict[str, Function]:
@@ -296,10 +305,9 @@ def list_called_names(function: Function) -> set[str]:
 def is_costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
     plain: Any = getattr(function, "py_func", function)
-    divides = any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(plain))
     elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
     calls_elementary = not elementary.isdisjoint(plain.__code__.co_names)
-    return divides or calls_elementary or any(is_costly(f) for f in _find_calls(plain).values())
+    return _divides(plain.__code__) or calls_elementary or any(is_costly(f) for f in _find_calls(plain).values())
 
 
 def _find_own_version(value: Any) -> Any:

@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 from fdi.estimation.likelihood import Free
 from fdi.estimation.logarithms import LogFree, LogFrictionRatio, take_logarithm
 from fdi.estimation.unknowns import list_tolerance_unknowns
-from fdi.thresholds import IDENTIFIED_SYSTEMATIC_SD, STATIC_FRICTION_SYSTEMATIC_SD
+from fdi.thresholds import IDENTIFIED_SYSTEMATIC_SD, PILOT_FLOW_SYSTEMATIC_SD, STATIC_FRICTION_SYSTEMATIC_SD
 from plant.errors import InputError
 from plant.model import Model, find_quantity, find_shipped_model
 from plant.parameters import read_toml
 
-STATIC = "jack.static_friction"
-FRICTIONS = ((STATIC, "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
+FRICTIONS = (("jack.static_friction", "jack.dynamic_friction"), ("spool.static_friction", "spool.dynamic_friction"))
+SYSTEMATIC_SD = {"jack.static_friction": STATIC_FRICTION_SYSTEMATIC_SD, "pilot.flow_gain": PILOT_FLOW_SYSTEMATIC_SD}
 
 
 class Range(NamedTuple):
@@ -121,7 +121,7 @@ def _is_number(x: object) -> bool:
 
 def get_systematic_sd(name: str) -> float:
     """The relative standard deviation that solver and stick-slip add to a parameter beside that of the fit."""
-    return STATIC_FRICTION_SYSTEMATIC_SD if name == STATIC else IDENTIFIED_SYSTEMATIC_SD
+    return SYSTEMATIC_SD.get(name, IDENTIFIED_SYSTEMATIC_SD)
 
 
 def list_unknowns(model: Model, ranges: tuple[Range, ...]) -> tuple[Free, ...]:
