@@ -161,7 +161,8 @@ def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
 def remove_mains(residuals: Floats, period: float) -> Floats:
     """Residuals (.., n) without the steady lines of the mains."""
     lines = mains_waves(residuals.shape[-1], period)
-    left: Floats = residuals - (np.nan_to_num(residuals) @ lines) @ lines.T
+    complete = residuals if np.isfinite(residuals).all() else np.nan_to_num(residuals)
+    left: Floats = residuals - (complete @ lines) @ lines.T
     return left
 
 
