@@ -72,7 +72,7 @@ ONLY_IN = {
     "jax": ("rig/studies/benchmarks/",),
     "progpy": ("rig/studies/benchmarks/",),
     "socket": ("rig/",),
-    "threading": ("rig/", "plant/threads.py"),
+    "threading": ("rig/", "plant/threads.py", "plant/kernel_use.py"),
     "asyncio": (),
     "random": (),
     "tests": (),
