@@ -219,7 +219,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
     unseen = {h.effects: _judge_unseen_run(search, h, holdout, floor) for h in close} if holdout else {}
     holding = [h for h in close if not holdout or unseen[h.effects].holds]
     part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
-    verdict, named = _decide_verdict(base, close, holding, part, marks, floor)
+    verdict, named = decide_verdict(base, close, holding, part, marks, floor)
     if verdict == "PARTLY" and close and _is_named_for_a_period(search, base, close[0]):
         named = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if named else "UNEXPLAINED"
@@ -307,11 +307,17 @@ def _find_parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> H
     return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
 
 
-def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
-                    marks: Marks, floor: Mapping[str, float]
-             ) -> tuple[str, tuple[str, ...]]:
-    """The verdict and the effects it names; `holding` are those of the `close` ones that hold on the held-out run,
-    `part` says that the best one leaves less of it than the base does.
+def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
+                   marks: Marks, floor: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+    """The verdict and the effects it names.
+
+    Args:
+        base: the model without any further effect.
+        close: the best hypotheses, best first.
+        holding: those of them that hold on the held-out run.
+        part: whether the best one leaves less of that run than the base does.
+        marks: what the controller's output and the position show exactly.
+        floor: of each signal, SI.
     """
     prints = tuple(f.effect for f in marks.prints)
     firmware_left = marks.is_firmware_different and not any(CATALOGUE[effect].firmware for effect in prints)
@@ -326,6 +332,8 @@ def _decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequ
     if base.is_at_floor and least < GAIN_CONVINCES:
         return ("NOT_RESOLVABLE", tuple(best.effects)) if not prints else ("EXPLAINED", prints)
     there = [h for h in holding if h.is_at_floor]
+    if there and all(h.is_far for h in there):
+        return "PARTLY", (*prints, *there[0].effects)
     if best.is_at_floor and there and not firmware_left:
         equal = [h for h in there if h.cost + h.repeat_cost < there[0].cost + there[0].repeat_cost + 2.0 * GAIN_TIE]
         if len(equal) > 1:

@@ -97,9 +97,12 @@ def _describe_partly(a: Answer) -> str:
     if not named:
         return _describe_unexplained(a)
     verb = "explain" if len(named) > 1 else "explains"
-    return (f"{join_words(c.effect for c in named)} {verb} part of the residual: "
-            f"{_describe_all_sizes(named)}; {_describe_change(a, named[-1])}. "
-            "Something else is missing too.")
+    subject = f"{join_words(c.effect for c in named)} {verb}"
+    rest = f"{_describe_all_sizes(named)}; {_describe_change(a, named[-1])}."
+    if a.best.is_at_floor and a.best.is_far:
+        return (f"{subject} the residual only with tolerances that fewer than one healthy unit in 1,000 has: {rest} "
+                "Something else may be missing instead.")
+    return f"{subject} part of the residual: {rest} Something else is missing too."
 
 
 def _describe_unexplained(a: Answer) -> str:

@@ -2,12 +2,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from noisy_traces import record_plant
 
-from fdi.discovery.explain import shows_effect
+from fdi.discovery.explain import decide_verdict, shows_effect
+from fdi.discovery.fingerprints import Marks
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import linearise
 from fdi.estimation.likelihood import Free
@@ -61,3 +64,15 @@ def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: 
 
     small = 0.01 * found.spread("null_bias.current")
     assert [shows_effect(load_model(), move_bias(current)) for current in (1e-4, small)] == [True, False]
+
+
+@pytest.mark.parametrize(("is_far", "verdict"), [(False, "EXPLAINED"), (True, "PARTLY")])
+def test_an_explanation_that_needs_tolerances_of_no_healthy_unit_is_doubted(is_far: bool, verdict: str) -> None:
+    """A lag of the pilot pressure, which is not in the catalogue, was called a coil lag with clogging, EXPLAINED."""
+    def make(effects: tuple[str, ...], cost: float, is_far: bool) -> Hypothesis:
+        return cast(Any, SimpleNamespace(effects=effects, cost=cost, repeat_cost=cost, tolerance_cost=10.0, others=(),
+                                         is_at_floor=bool(effects), is_far=is_far))
+
+    base, best = make((), 9000.0, False), make(("coil_lag", "filter_clogging"), 1000.0, is_far)
+    found = decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6})
+    assert found == (verdict, ("coil_lag", "filter_clogging"))

@@ -105,6 +105,14 @@ def test_findings() -> None:
     assert lines["residual"] == "a force"
 
 
+def test_an_explanation_by_an_unlikely_unit_says_so() -> None:
+    given = answer("PARTLY", ("a",), candidate("a", word="part"))
+    best = SimpleNamespace(effects=("a",), is_at_floor=True, is_far=True)
+    cast(Any, given.explanation).ledger = [given.explanation.base, best]
+    assert "a explains the residual only with tolerances that fewer than one healthy unit in 1,000 has: current 150 uA" \
+        in describe_verdict(given)
+
+
 @pytest.mark.parametrize("verdict", ["UNEXPLAINED", "EXPLAINED"])
 def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> None:
     """Only where no explanation is found: an explained one has its parameters listed as suspicious."""
