@@ -83,13 +83,14 @@ def _require_time(job: Job) -> None:
 
 
 def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, rival_time: float = 0.25,
-                         boot_time: float = 0.7) -> None:
+                         boot_time: float = 0.7, external_boot_time: float = 2.0) -> None:
     """Start the nodes of this job that do not answer on the bus.
 
     Args:
         job, master, processes: what is to be there, how to ask for it, and where to start it.
         rival_time: s; another rig at work is heard within this.
         boot_time: s; a node that is there boots within this.
+        external_boot_time: s; a node that must be there, perhaps on a busy machine, boots within this.
 
     Raises:
         BusError: another rig, or a node that does not answer.
@@ -97,14 +98,18 @@ def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, riv
     if master.hears_rival(rival_time):  # before sending anything: a reset would end the other rig's test
         raise BusError(f"another rig is active on {job.bus}: received a SYNC or heartbeat of node 1")
     for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
-        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, boot_time)
+        limit = external_boot_time if wanted == "external" else boot_time
+        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, limit)
         if wanted == "external" and not there:
             raise BusError(f"node {node} ({NAMES[node]}) does not answer on {job.bus}")
         if node == CONTROLLER and wanted != "external" and there:
             raise BusError(f"a node {node} is on {job.bus} already: say --controller external, or stop it")
         if not there:
-            processes.start(node, _make_command(job, node))
-            _wait_for_node(master, node, processes)
+            is_c_firmware = node == CONTROLLER and job.controller == "c"
+            processes.start(node, _make_command(job, node), announces=not is_c_firmware)
+            if is_replaced(master, node, processes) and wanted != "auto":
+                raise BusError(f"a node {node} ({NAMES[node]}) is on {job.bus} already: stop it, or say "
+                               f"--{NAMES[node]} external")
 
 
 def require_firmware_bus(bus: str) -> None:
@@ -132,15 +137,24 @@ def _make_command(job: Job, node: int) -> list[str]:
     return words
 
 
-def _wait_for_node(master: Master, node: int, processes: NodeProcesses, seconds: int = 180) -> None:
-    """Until a node of our own answers; it may have to compile its loop and the plant.
+def is_replaced(master: Master, node: int, processes: NodeProcesses, seconds: int = 180) -> bool:
+    """Wait until a node of our own answers, which may have to compile its loop and the plant; False.
+
+    True if somebody else's node came first. Ours has then found it on the bus and ended, see `rig node`. That is why
+    an answer alone is not enough: it may be the answer of the other one.
 
     Raises:
-        BusError: it does not answer.
+        BusError: no node answers.
     """
     for _ in range(seconds):
-        if master.is_present(node, 1.0):
-            return
+        is_present = master.is_present(node, 1.0)
         if node in processes.find_ended():
-            break
+            if not is_present:
+                break
+            processes.forget(node)
+            return True
+        if is_present and processes.is_ready(node):
+            return False
+        if is_present:  # another one; ours is about to notice
+            processes.wait([node])
     raise BusError(f"our own node {node} ({NAMES[node]}) did not start")

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import signal
 import subprocess
 from collections.abc import Iterable, Sequence
@@ -16,11 +17,30 @@ class NodeProcesses:
 
     def __init__(self) -> None:
         self._children: dict[int, Child] = {}
+        self._silent: set[int] = set()  # nodes that are to say when they are on the bus, and have not yet
 
-    def start(self, node: int, command: Sequence[str]) -> None:
-        """Start a node as a new process."""
-        self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    def start(self, node: int, command: Sequence[str], *, announces: bool = False) -> None:
+        """Start a node as a new process. `announces`: it writes a line as soon as it is on the bus, see `is_ready`."""
+        output = subprocess.PIPE if announces else subprocess.DEVNULL
+        self._children[node] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output,
                                                 start_new_session=True)
+        if announces:
+            self._silent.add(node)
+
+    def is_ready(self, node: int) -> bool:
+        """Whether the node has said that it is on the bus, if it is one that says so."""
+        if node in self._silent:
+            output = self._children[node].stdout
+            assert output is not None
+            if select.select([output], [], [], 0)[0] and output.readline():
+                self._silent.discard(node)
+        return node not in self._silent
+
+    def forget(self, node: int) -> None:
+        """Leave out a node whose process has ended: another one has taken its place on the bus."""
+        child = self._children.pop(node)
+        if child.stdout is not None:
+            child.stdout.close()
 
     def find_ended(self) -> dict[int, int]:
         """Nodes whose process has ended, with its exit status; negative: the signal that ended it."""
@@ -47,6 +67,8 @@ class NodeProcesses:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
+            if child.stdout is not None:
+                child.stdout.close()
 
 
 def describe_exit(status: int) -> str:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rig.network.link import Link
     from rig.nodes.scenario import Scenario
 
+LISTENING_TIME = 0.25  # s; two heartbeats of a node of ours
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `rig node`."""
@@ -36,7 +38,7 @@ def run_command(args: argparse.Namespace) -> int:
 
     Raises:
         InputError: no bus between programs, a model that the bench cannot drive, or a place that cannot be written.
-        RigError: the bus cannot be opened.
+        RigError: the bus cannot be opened, or a node with this number is on it.
     """
     import json
     import signal
@@ -64,6 +66,7 @@ def run_command(args: argparse.Namespace) -> int:
     ended: list[int] = []
     with contextlib.ExitStack() as stack:
         link = Link(open_can(bus), clock.now)
+        opened_ns = clock.now()
         stack.callback(link.close)
         if is_compiled:
             node = open_compiled_plant(args, bus, link, stack, stack.enter_context(lock_memory()))
@@ -71,7 +74,8 @@ def run_command(args: argparse.Namespace) -> int:
             node = choose_node(args)(link.send)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda got, frame: ended.append(got))
-        if not (args.quiet or args.json):
+        require_free_number(args.node, link, bus, LISTENING_TIME - (clock.now() - opened_ns) * 1e-9)
+        if args.parent or not (args.quiet or args.json):  # the rig that has started it waits for this line
             kind = "compiled loop" if is_compiled else "Python loop, soft real time"
             print(f"{args.node} on {bus}, {kind}; Ctrl-C ends it", flush=True)
         stack.enter_context(raise_priority(1 if is_compiled else LOOP_PRIORITY))
@@ -83,6 +87,31 @@ def run_command(args: argparse.Namespace) -> int:
     sentence = f"incoming frames lost {link.overflows}, not sent {link.unsent}, error frames {link.error_frames}"
     show_answer(Report("node", args.node, sentence=sentence, data=counts), args)
     return 0
+
+
+def require_free_number(name: str, link: Link, bus: str, seconds: float) -> None:
+    """Refuse to join a bus on which a node with our number has been heard since `link` was opened.
+
+    Two nodes with one number would both answer, and the bench would see a node that leaves OPERATIONAL at random.
+
+    Args:
+        name: of our node, plant or controller.
+        link, bus: what it is about to join.
+        seconds: how long to listen still; most nodes need more time than enough to load.
+
+    Raises:
+        RigError: such a node.
+    """
+    import time
+
+    from plant.errors import RigError
+    from rig.network import heartbeat
+    from rig.network.node_objects import NAMES
+
+    number = next(node for node, known in NAMES.items() if known == name)
+    time.sleep(max(0.0, seconds))
+    if any(frame.cob_id == heartbeat.COB_ID + number for frame in link.poll()):
+        raise RigError(f"{bus}: a node {number} ({name}) is on this bus already; stop it before you start another one")
 
 
 def open_compiled_plant(args: argparse.Namespace, bus: str, link: Link, stack: contextlib.ExitStack,
