@@ -111,6 +111,8 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             tried = _drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
             if tried and tried[0].is_at_floor:
                 break  # the other ways would have to get there as well, from further off
+        if not tried and count == 1 and not base.is_at_floor:  # the fit of the base hides the way to any effect
+            tried = search.add_each_with_more_noise(base, [])
         if not tried:
             break
         if count == 1 and not base.is_at_floor:
@@ -241,8 +243,8 @@ def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
     if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
         depth = 1
-    if depth == 0 and len(levels) > 1 and levels[0][0].is_far:
-        depth = 1  # a unit that is hardly healthy: only fits to all runs, taken to the end, tell what an effect gains
+    if depth == 0 and len(levels) > 1 and (levels[0][0].is_far or not levels[0][0].is_at_floor):
+        depth = 1  # a unit that is hardly healthy, or more than noise left: only fits taken to the end tell what helps
     return _prune_level(search, levels, depth)
 
 
@@ -253,6 +255,9 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
     There are none of the latter where the base does as well when it is taken as far.
     """
     close = [h for h in levels[depth] if h.cost < levels[depth][0].cost + 60.0 * GAIN_TIE][:4] if depth else []
+    if close and not levels[0][0].is_at_floor:  # one that leaves little of what repeats may only have missed a stop
+        clearest = min(levels[depth], key=lambda h: max(h.ratio.values()))
+        close = close if clearest in close else [*close[:3], clearest]
     # where no effect helps, the base is fitted until that is beyond doubt
     rounds = 2 if depth or levels[0][0].is_at_floor else LONG
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.93, rounds + 6 * len(close))

@@ -1,8 +1,7 @@
-"""How easily noise alone looks like an effect, and how large an effect must be to be seen."""
+"""How easily noise alone looks like an effect."""
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from itertools import pairwise
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.special import chdtrc
 
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem
-from fdi.thresholds import GAIN_SEEN, NULL_DRAWS
+from fdi.thresholds import NULL_DRAWS
 from plant.effects import CATALOGUE
 
 Floats = NDArray[np.float64]
@@ -64,21 +63,3 @@ def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int 
     simulated = float(np.mean(best >= gain))
     bound = len(set(s.names)) * float(chdtrc(parameters, max(gain, 0.0)))
     return simulated if simulated > 10.0 / NULL_DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / NULL_DRAWS))
-
-
-def find_smallest_visible(s: Sensitivity, seen: float = GAIN_SEEN) -> Mapping[str, float]:
-    """Size of each effect's first parameter, from its off value, at which it would be seen; inf: at none tried.
-
-    Between the sizes tried, log gain is linear in log size; below the smallest, the gain falls with its square.
-    """
-    found: dict[str, float] = {}
-    for name in dict.fromkeys(s.names):
-        pairs = sorted((size, gain) for e, size, gain in zip(s.names, s.sizes, s.gains, strict=True) if e == name)
-        visible = np.inf
-        for (a, ga), (b, gb) in pairwise(pairs):
-            if ga < seen <= gb and b > a:
-                visible = min(visible, a * (b / a) ** (np.log(seen / max(ga, 1e-12)) / np.log(gb / max(ga, 1e-12))))
-        if pairs[0][1] >= seen:
-            visible = min(visible, pairs[0][0] * np.sqrt(seen / pairs[0][1]))
-        found[name] = float(visible)
-    return found

@@ -19,7 +19,6 @@ from typing import Any
 from fdi.discovery.detectable import find_detectable_sizes
 from fdi.discovery.runs import read_runs
 from fdi.discovery.search import Search
-from fdi.discovery.significance import compute_sensitivity, find_smallest_visible
 from fdi.sources import hash_sources
 from plant.effects import CATALOGUE
 from plant.model import Model
@@ -31,8 +30,10 @@ from rig.studies.trial.hidden import Hidden
 from rig.studies.trial.truth import nominal_symbols
 
 EFFECTS = tuple(name for name in hidden.CATALOGUE
-                if name not in ("orifice_root", "supply_ripple", "quantisation", "command_rate_limit"))
-"""Effects with a size that both simulators give in the same unit, and that a replay passes."""
+                if name not in ("orifice_root", "supply_ripple", "quantisation", "command_rate_limit", "presliding"))
+"""Effects with a size that both simulators give in the same unit, and that a replay passes.
+
+Presliding over less than 0.1 um is too stiff for the trial's simulator."""
 FACTORS = (1.5, 0.5)
 """Times the claimed size."""
 COLUMNS = ["xj", "p12", "xs"]
@@ -73,7 +74,7 @@ def judge_size(job: tuple[int, str, float], folder: Path, sources: str) -> Row:
     """Claim a size for a healthy unit, hide the effect in it at a multiple of that, and explain the runs."""
     number, effect, factor = job
     target = folder / f"{number:04d}"
-    first_seed = 7200
+    first_seed = 7700
     healthy = sample_healthy_case(first_seed + number, effect)
     claimed = claim_size(healthy, effect, target / "healthy")
     row: Row = {"case": number, "effect": effect, "factor": factor, "sources": sources,
@@ -102,8 +103,7 @@ def claim_size(case: cases.Case, effect: str, folder: Path) -> float:
     base = search.fit_base()
     search.learn_noise(base)
     base = search.refit_hypothesis(base)
-    linear = find_smallest_visible(compute_sensitivity(search.problem, base.fit, [effect]))
-    return find_detectable_sizes(search.problem, base.fit, [effect], linear)[0].size
+    return find_detectable_sizes(search.problem, base.fit, [effect])[0].size
 
 
 def hide_effect(case: cases.Case, effect: str, size: float) -> cases.Case:

@@ -15,7 +15,7 @@ from fdi.discovery.fingerprints import compute_firmware_residual, find_marks
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
 from fdi.discovery.scan import find_tones, scan_effects
 from fdi.discovery.search import Hypothesis, Search, measure_repeating
-from fdi.discovery.significance import Sensitivity, compute_p_value, find_smallest_visible
+from fdi.discovery.significance import Sensitivity, compute_p_value
 from fdi.estimation.fit import Fit, linearise
 from fdi.estimation.likelihood import BLOCK, compute_misfit, compute_weights
 from fdi.estimation.noise import fit_noise, measure_level
@@ -97,13 +97,6 @@ def test_the_p_value_is_that_of_the_best_of_all_candidates() -> None:
         exact = 1.0 - (1.0 - 0.5 * chi2.sf(gain, 1)) ** 10  # each on its own side only
         assert compute_p_value(s, gain) == pytest.approx(exact, rel=0.3)
     assert compute_p_value(s, 60.0) < 1e-3
-
-
-def test_the_smallest_visible_size_is_where_the_gain_reaches_the_threshold() -> None:
-    s = Sensitivity(("a", "a", "b"), (1.0, 10.0, 5.0), np.array([0.3, 30.0 * 100, 30.0 / 4]), np.eye(3))
-    seen = find_smallest_visible(s)
-    assert 1.0 < seen["a"] < 10.0
-    assert np.isinf(seen["b"])
 
 
 def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
