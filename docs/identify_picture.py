@@ -6,7 +6,7 @@ from pathlib import Path
 from fdi import identify
 from fdi.report.drawing import shorten_svg
 from fdi.report.identify_figures import draw_estimates
-from rig.studies.identification.actuators import simulate_unit
+from studies.identification import simulate_unit
 
 
 def main() -> None:

@@ -38,7 +38,7 @@ def import_function(name: str, field: str, expected: str) -> Callable[..., Any]:
 
 @cache
 def hash_sources(*places: str) -> str:
-    """A hash, 16 hexadecimal digits, of all code and data in packages and files: "plant", "rig/studies/trial"."""
+    """A hash, 16 hexadecimal digits, of all code and data in packages and files: "plant", "studies/hidden_effects"."""
     known = hashlib.sha256()
     for place in places:
         package, *rest = place.split("/")

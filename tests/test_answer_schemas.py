@@ -59,7 +59,7 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
 
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
     words = [[command] for command in HELP_OF_COMMAND] + [["bench", kind] for kind in KINDS_OF_BENCH]
-    more = {"common.json", "fdi_learn_bands.json", "trend_score.json", "suite.json"}
+    more = {"common.json", "fdi_learn_bands.json", "suite.json"}
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
     assert name_schema(["bench", "--json"]) == "bench.json"
     assert name_schema(["fdi", "--learn-bands", "a.csv"]) == "fdi_learn_bands.json"
@@ -148,12 +148,11 @@ def test_the_answer_of_a_diagnosis(preflight: Path) -> None:
     answer = rig("fdi", preflight, "--json").json
     assert answer["events"] == []
     event = {"band": "most", "signal": "speed", "section": "step", "t_in": 0.0, "t_out": 0.1, "excess": 1e-3}
-    row = dict.fromkeys(("kintas", "fss", "left", "error_kintas", "error_fss")) | {"method": "genetic algorithm"}
     explanation = {"effects": ["null_bias"], "probability": 1.0, "parameters": {}, "ratio": {"xj": 1.0},
                    "level": answer["level"], **{key: answer["refined"][key] for key in ("kintas", "fss")}}
     beside = {"effects": [], "explained": True, "ambiguous": False, "disputed": [], "marks": {},
               "explanations": [explanation]}  # of --with-effects, whose search takes a minute
-    assert_all_seen("fdi", answer, {**answer, "events": [event], "methods": [row], "with_effects": beside})
+    assert_all_seen("fdi", answer, {**answer, "events": [event], "with_effects": beside})
 
 
 def test_the_answer_of_a_comparison(short_runs_with_a_null_bias: dict[str, Path]) -> None:

@@ -13,76 +13,79 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("plant", "fdi", "rig", "dbc")
+PACKAGES = ("plant", "fdi", "rig", "dbc", "studies")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
-# The project's packages that each package may import. dbc is data only.
-MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"}}
-# Inside fdi and rig: the folders, and single modules, that each folder may import beside itself. All may import SHARED.
+# The order of the packages; dbc is data only.
+MAY_IMPORT = {"dbc": set(), "plant": {"plant"}, "fdi": {"plant", "fdi"}, "rig": {"plant", "fdi", "rig", "dbc"},
+              "studies": {"plant", "fdi", "rig", "dbc", "studies"}}
+# Single modules of fdi and rig, and what each may import; the folders stand in the table of ARCHITECTURE.md.
 SHARED = {"fdi.output", "fdi.progress", "fdi.sources", "fdi.thresholds"}
-BENCH = {f"rig.{part}" for part in ("network", "device", "nodes", "firmware", "run", "sequences", "recorder", "view",
-                                    "live", "doctor")}
-ESTIMATOR = {"fdi.trace", "fdi.estimation", "fdi.comparison"}
-FOLDER_MAY_IMPORT = {
+SINGLE_MAY_IMPORT = {
     **{module: set() for module in SHARED},
-    "fdi.trace": set(),
-    "fdi.estimation": {"fdi.trace"},
-    "fdi.comparison": {"fdi.trace", "fdi.estimation"},
-    "fdi.discovery": ESTIMATOR,
-    "fdi.identification": {*ESTIMATOR, "fdi.discovery"},
-    "fdi.diagnosis": {*ESTIMATOR, "fdi.discovery"},
-    "fdi.prognosis": {*ESTIMATOR, "fdi.discovery", "fdi.diagnosis"},
-    "fdi.report": {*ESTIMATOR, "fdi.discovery", "fdi.identification", "fdi.diagnosis", "fdi.prognosis"},
     "fdi.foreign_code": set(),
-    "fdi.analysis": {"fdi.foreign_code", *ESTIMATOR, "fdi.discovery", "fdi.identification", "fdi.diagnosis",
-                     "fdi.prognosis", "fdi.report"},
+    "fdi.analysis": {"fdi.foreign_code", "fdi.trace", "fdi.estimation", "fdi.comparison", "fdi.discovery",
+                     "fdi.identification", "fdi.diagnosis", "fdi.prognosis", "fdi.report"},
     "rig.interrupts": set(),
     "rig.junit": set(),
-    "rig.network": set(),
-    "rig.device": {"rig.network"},
-    "rig.firmware": {"rig.device"},
-    "rig.sequences": {"rig.network", "rig.device"},
-    "rig.nodes": {"rig.network", "rig.device", "rig.sequences"},
-    "rig.recorder": {"rig.network"},
-    "rig.run": BENCH - {"rig.run", "rig.view", "rig.live", "rig.doctor"},
-    "rig.view": {"rig.network", "rig.sequences"},
-    "rig.live": {"rig.network", "rig.sequences", "rig.recorder", "rig.view", "rig.interrupts"},
     "rig.doctor": {"rig.network", "rig.run"},
-    "rig.conformance": {"rig.network", "rig.junit"},  # independent of rig.device, which it tests
-    "rig.studies": {*BENCH, "rig.interrupts", "rig.junit"},
-    "rig.testing": BENCH,
-    "rig.cli": {*BENCH, "rig.conformance", "rig.junit", "rig.studies"},
 }
+
+
+class Folder(NamedTuple):
+    """A row of the table of folders."""
+
+    path: str
+    may_import: set[str]
+    most: int  # statements
+
+
+def read_folders() -> dict[str, Folder]:
+    """The table of ARCHITECTURE.md by module name: `rig/network/` -> rig.network."""
+    row = r"^\| `([a-z/]+)/` \| .+? \| (.*?) \| ([\d,]+) \| [\d,]+ \|$"
+    rows = re.findall(row, (ROOT / "ARCHITECTURE.md").read_text(), re.MULTILINE)
+    folders = {}
+    for path, names, most in rows:
+        modules = {name.removesuffix(".py").replace("/", ".") for name in re.findall(r"`([a-z_/.]+)`", names)}
+        folders[path.replace("/", ".")] = Folder(path, modules, int(most.replace(",", "")))
+    return folders
+
+
+FOLDERS = read_folders()
 # Modules of others that only some files may import (prefixes of paths).
 ONLY_IN = {
     "numba": ("plant/compile.py",),
     "llvmlite": ("plant/machine_code.py", "plant/compile.py"),
-    "can": ("rig/",),
+    "can": ("rig/", "studies/"),
     "canopen": ("rig/",),
     "cantools": ("rig/",),
     "rerun": ("rig/",),
     "rich": ("rig/", "fdi/report/"),
     "mcap": ("rig/", "fdi/"),
     "matplotlib": ("fdi/", "rig/"),
-    "jax": ("rig/studies/benchmarks/",),
-    "progpy": ("rig/studies/benchmarks/",),
-    "socket": ("rig/",),
-    "threading": ("rig/", "plant/threads.py", "plant/kernel_use.py"),
+    "jax": ("studies/",),
+    "progpy": ("studies/",),
+    "sklearn": ("studies/",),
+    "pygad": ("studies/",),
+    "socket": ("rig/", "studies/"),
+    "threading": ("rig/", "studies/", "plant/threads.py", "plant/kernel_use.py"),
     "asyncio": (),
-    "random": (),
+    "random": ("studies/",),
     "tests": (),
     "pytest": (),
-    "scipy": ("fdi/",),
+    "scipy": ("fdi/", "studies/"),
 }
 # The edge, where the wall clock may be seen; everything else is told the time.
 CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
-    "rig/studies/benchmarks/responders.py",  # waits for a node to boot
+    "studies/",
+    "rig/bench/responders.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/lateness.py", "rig/cli/commands/",
     "rig/live/",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time
@@ -139,7 +142,7 @@ def tracked() -> list[Path]:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_imports_point_one_way(package: str) -> None:
-    """plant <- fdi <- rig."""
+    """plant <- fdi <- rig <- studies."""
     for path in MODULES:
         if name(path).startswith(f"{package}/"):
             ours = {module.partition(".")[0] for module in imported(path)} & set(PACKAGES)
@@ -153,16 +156,34 @@ def folder(module: str) -> str:
 
 @pytest.mark.parametrize("path", [p for p in MODULES if name(p).startswith(("fdi/", "rig/"))], ids=name)
 def test_folders_import_only_lower_ones(path: Path) -> None:
-    """In fdi: trace, estimation, comparison, then discovery, diagnosis, prognosis,
-    report. In rig: network, device, sequences, nodes, recorder, run, then studies, command line.
-    """
+    """What a folder may import stands in ARCHITECTURE.md."""
     own = folder(name(path).removesuffix(".py").replace("/", "."))
     if own.endswith(".__init__"):
         return  # a package's face hands on what its folders have
-    assert own in FOLDER_MAY_IMPORT, f"{own} has no place in the order of folders"
+    assert own in FOLDERS or own in SINGLE_MAY_IMPORT, f"{own} has no place in the order of folders"
     package = own.partition(".")[0]
     others = {folder(module) for module in imported(path) if module.startswith(f"{package}.")} - {own}
-    assert others <= FOLDER_MAY_IMPORT[own] | (SHARED if package == "fdi" and own not in SHARED else set()), name(path)
+    if own == "rig.cli":
+        return
+    allowed = FOLDERS[own].may_import if own in FOLDERS else SINGLE_MAY_IMPORT[own]
+    assert others <= allowed | (SHARED if package == "fdi" and own not in SHARED else set()), name(path)
+
+
+def count_statements(path: Path) -> int:
+    """Statements of a file's syntax tree, docstrings not counted."""
+    return sum(isinstance(node, ast.stmt) and not is_docstring(node) for node in ast.walk(tree(path)))
+
+
+def is_docstring(node: ast.stmt) -> bool:
+    """Whether a statement is a text and nothing else."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+@pytest.mark.parametrize("folder", FOLDERS.values(), ids=lambda folder: folder.path)
+def test_each_folder_keeps_its_budget(folder: Folder) -> None:
+    """The whole is as large as one person can hold: a folder that grows past its budget makes another part smaller."""
+    files = (ROOT / folder.path).rglob("*.py")
+    assert 0 < sum(map(count_statements, files)) <= folder.most
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name)
@@ -356,6 +377,8 @@ def test_each_import_is_declared() -> None:
                      "rerun": "rerun-sdk", "llvmlite": "numba", "sklearn": "scikit-learn"}  # numba pins llvmlite itself
     named = {re.split("[<>=]", line)[0] for line in requirements()}
     for path in MODULES:
+        if name(path).startswith("studies/"):
+            continue  # a study says itself what it compares with
         for module in {module.partition(".")[0] for module in imported(path)}:
             known = module in sys.stdlib_module_names or module in PACKAGES
             assert known or distributions.get(module, module) in named, f"{name(path)} imports {module}"
@@ -374,7 +397,7 @@ def test_each_dependency_is_used() -> None:
 def test_every_package_and_data_file_is_installed() -> None:
     """pyproject.toml lists each package, and a pattern for each file in it that is not Python."""
     tools = PROJECT["tool"]["setuptools"]
-    folders = {path.parent for path in MODULES if path.name == "__init__.py"}
+    folders = {path.parent for path in MODULES if path.name == "__init__.py" and not name(path).startswith("studies/")}
     assert sorted(tools["packages"]) == sorted(name(folder).replace("/", ".") for folder in folders)
     for folder in folders:
         patterns = tools["package-data"].get(name(folder).replace("/", "."), [])

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rig.run.job_choice import JobChoice
-    from rig.studies.suite.case import CaseResult
-    from rig.studies.suite.suite_file import Suite
+    from rig.suite.suite import CaseResult, Suite
 
 
 def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable[[], Path]) -> int:
@@ -29,10 +28,8 @@ def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable
     from rig.cli.answer import choose_file, show_answer
     from rig.cli.interruption import catch_signals
     from rig.network.clock import WallClock
-    from rig.studies.suite.case import find_status
-    from rig.studies.suite.run_suite import run_cases
-    from rig.studies.suite.suite_junit import write_junit
-    from rig.studies.suite.suite_report import build_suite_report
+    from rig.suite.report import build_suite_report, write_junit
+    from rig.suite.suite import find_status, run_cases
 
     tried = read_suite(args, base)
     processes = choose_processes(args, base, len(tried.cases))
@@ -63,7 +60,7 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
         InputError: what cannot be used, or an option that a suite file has to say.
     """
     from plant.errors import InputError
-    from rig.studies.suite.suite_file import Variant, build_suite, is_suite_file, read_suite_file
+    from rig.suite.suite import Variant, build_suite, is_suite_file, read_suite_file
 
     variants: list[Variant] = []
     titles: list[str] = []
@@ -125,7 +122,7 @@ def announce_suite(suite: Suite, processes: int, *, is_silent: bool) -> Callable
     from fdi.report.report import Cell
     from fdi.report.terminal import style_of
     from rig.cli.terminal import open_console
-    from rig.studies.suite.suite_report import MOODS
+    from rig.suite.report import MOODS
 
     console = open_console()
     ended = 0

@@ -67,9 +67,7 @@ NOT_PLAYED = {
     "rig run --controller external --bus socketcan:vcan0": _VCAN,
     "rig explain run.csv --repeat run2.csv --write-effect found.py": _IN_TUTORIAL,
     "rig explain run.csv --repeat run2.csv --effects found.py": _IN_TUTORIAL,
-    "rig fdi run.csv --optimisers --comparators": _MINUTES,
     "rig campaign --fault healthy --fault filter_clogging=0.1,0.25,0.35 --seeds 50 --out mine": _HOURS,
-    "rig trend --score --units 20": _HOURS,
 }
 NOT_PLAYED_SECTIONS = {("docs/commands.md", "Find the parameters"): _MINUTES,
                        ("docs/commands.md", "Measure the software"): "measures for minutes to hours"}
@@ -85,7 +83,7 @@ NOT_PLAYED_PAGES = {
     "docs/pytest.md": "tests/rig/testing runs the example of the page",
     "docs/real_data.md": "needs recordings of others",
     "docs/robustness.md": _HOURS,
-    "docs/suite.md": "tests/rig/studies runs the suite of the page",
+    "docs/suite.md": "tests/rig/suite runs the suite of the page",
     "docs/trial.md": _HOURS,
 }
 

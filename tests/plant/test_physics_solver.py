@@ -13,8 +13,8 @@ from places import ROOT
 
 from plant import Model, simulate
 from plant.segments import Chirp, Hold, Ramp, Sine
+from rig.bench.plant import measure_accuracy
 from rig.cli import main
-from rig.studies.benchmarks.plant_step import measure_accuracy
 
 GENTLE = build_profile((Hold(time=0.05), Ramp(to=1e-3, time=1.0), Sine(amplitude=3e-3, frequency=1.0, time=1.0),
                 Chirp(amplitude=0.5e-3, f0=1.0, f1=20.0, fade=20.0, time=2.0))).command  # nothing saturates

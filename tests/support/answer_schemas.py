@@ -20,7 +20,7 @@ except ImportError:  # test_answer_schemas.py fails then; other tests need not
     Draft202012Validator = None  # type: ignore[assignment,misc]
 
 FOLDER = ROOT / "docs" / "schema"
-KINDS_OF_BENCH = ("realtime", "live", "recordings", "robustness", "faults", "explain")
+KINDS_OF_BENCH = ("realtime", "live", "recordings")
 
 
 def load_schemas() -> dict[str, dict[str, Any]]:

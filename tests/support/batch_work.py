@@ -94,7 +94,7 @@ class Unpicklable:
 
 
 if __name__ == "__main__":  # a user's process, to be interrupted: batch_work.py WORK FOLDER
-    from rig.studies.resumable.batch import Workers, run_jobs
+    from rig.campaign.batch import Workers, run_jobs
 
     def name_failure(job: str, reason: str) -> None:
         raise AssertionError(reason)

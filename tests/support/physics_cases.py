@@ -3,8 +3,8 @@ from __future__ import annotations
 
 from plant import Model
 from plant.profile import build_profile
+from rig.bench.plant import FRICTIONLESS, QUIET
 from rig.sequences.sequence import load_sequence
-from rig.studies.benchmarks.plant_step import FRICTIONLESS, QUIET
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 SILENT = Model().replace(QUIET)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from rig.cli import options
 
 if TYPE_CHECKING:
-    from rig.studies.campaign.matrix import Matrix
-    from rig.studies.resumable.batch import BatchProgress
+    from rig.campaign.batch import BatchProgress
+    from rig.campaign.matrix import Matrix
 
 
 
@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seeds", type=options.parse_whole_number, metavar="N", help="runs of each size (default 20)")
     add("--seed", type=options.parse_whole_number, metavar="N", help="seed of the first run (default 0)")
     add("--tolerance", metavar="X,..", help="standard deviation of the base parameters, relative (default 0.015)")
-    add("--simulator", choices=("plant", "independent"), help="the plant model (default), or the blind trial's "
-                                                               "simulator in C, which shares no physics with it")
+    add("--simulator", metavar="MODULE:FUNCTION",
+        help="function that simulates a unit (rig.campaign.units.Unit) instead of the plant model")
     add("--signals", metavar="xj,p12,xs", help="what is measured (default: all three)")
     add("--model", metavar="FILE|NAME", help="the healthy plant (default eha)")
     add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(args: argparse.Namespace) -> int:
     """results.parquet, summary.json and detection.svg go to the folder --out (default: campaigns/NAME)."""
-    from rig.studies.campaign.folder import read_campaign_rows
-    from rig.studies.campaign.run_campaign import run_campaign
-    from rig.studies.resumable.batch import Workers
+    from rig.campaign.batch import Workers
+    from rig.campaign.folder import read_campaign_rows
+    from rig.campaign.judge import run_campaign
 
     if args.summary:
         folder = Path(args.out or args.what or "")
@@ -67,10 +67,10 @@ def run_command(args: argparse.Namespace) -> int:
 
 def _report(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Namespace) -> int:
     """Write and show the statistics; exit status 1 if a case failed or a required rate is not reached."""
+    from rig.campaign.folder import read_matrix_of_folder
+    from rig.campaign.report import build_campaign_report
+    from rig.campaign.summary import summarise_campaign
     from rig.cli.answer import show_answer
-    from rig.studies.campaign.campaign_report import build_campaign_report
-    from rig.studies.campaign.campaign_summary import summarise_campaign
-    from rig.studies.campaign.folder import read_matrix_of_folder
 
     figures = summarise_campaign(rows)
     report = build_campaign_report(figures, str(folder))
@@ -88,8 +88,8 @@ def _report(rows: Sequence[dict[str, Any]], folder: Path, args: argparse.Namespa
 
 
 def _write_statistics(figures: dict[str, Any], folder: Path) -> None:
-    from rig.studies.campaign.detection_figure import draw_detection_curves
-    from rig.studies.campaign.folder import replace_file
+    from rig.campaign.folder import replace_file
+    from rig.campaign.report import draw_detection_curves
 
     replace_file(folder / "summary.json", (json.dumps(figures, indent=1) + "\n").encode())
     for part in figures["tolerances"]:
@@ -102,9 +102,9 @@ def _write_statistics(figures: dict[str, Any], folder: Path) -> None:
 def _choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     """The matrix that the options describe, and the folder of its results. Raises InputError."""
     from plant import InputError, load_model
-    from rig.studies.campaign import matrix
-    from rig.studies.campaign.folder import is_campaign_folder, read_matrix_of_folder
-    from rig.studies.campaign.judge import WORKS
+    from rig.campaign import matrix
+    from rig.campaign.folder import is_campaign_folder, read_matrix_of_folder
+    from rig.campaign.judge import WORKS
 
     wanted = {"seeds": args.seeds, "first": args.seed, "simulator": args.simulator, "signals": args.signals,
               "tolerance": None if args.tolerance is None else _parse_numbers(args.tolerance)}
@@ -159,9 +159,9 @@ def _count_processes(asked: int | None) -> int:
 @contextmanager
 def _show_batch_progress(silent: bool, interval: float = 30.0) -> Iterator[Callable[[BatchProgress], None]]:
     """Show progress as a bar on a terminal; elsewhere, for logs, as a line on standard error every `interval` s."""
+    from rig.campaign.report import describe_progress
     from rig.cli.progress_bar import show_progress
     from rig.network.clock import WallClock
-    from rig.studies.campaign.campaign_report import describe_progress
 
     clock, printed = WallClock(), 0.0
     with show_progress(is_silent=silent) as update:

@@ -20,8 +20,8 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.answer import choose_places, show_answer, write_answer
     from rig.cli.progress_bar import show_progress
     from rig.run.job_choice import JobChoice, build_job
-    from rig.studies.dry_run.dry_run import make_dry_run
-    from rig.studies.dry_run.dry_run_report import build_dry_run_report
+    from rig.suite.dry_run import make_dry_run
+    from rig.suite.dry_run_report import build_dry_run_report
 
     source = args.sequence if Path(args.sequence).is_file() else ""
     places = choose_places(args, "", source)

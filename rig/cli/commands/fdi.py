@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +11,6 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.diagnosis.bands import Bands
     from fdi.diagnosis.diagnosis import Diagnosis
-    from fdi.progress import Progress
-    from fdi.report.report import Report
-    from rig.studies.fault_size_methods import Row
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,11 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--with-effects", action="store_true",
         help="search the catalogue for what else is wrong, and size both faults beside it "
              "(half a minute of computing more, two minutes where the search is hard)")
-    add("--optimisers", action="store_true",
-        help="compare with differential evolution, simulated annealing and a genetic algorithm: error, simulations, "
-             "time")
-    add("--comparators", action="store_true",
-        help="compare with a neural network and a logistic regression trained on simulated faults ('eha-rig[learn]')")
     add("--learn-bands", nargs="*", metavar="TRACE",
         help="make bands from healthy traces of a fleet and write them to --out FILE.toml; without traces, from "
              "simulated units")
@@ -62,35 +53,10 @@ def run_command(args: argparse.Namespace) -> int:
                              with_effects=args.with_effects)
         report = replace(build_diagnosis_report(diagnosis), next_command=suggest_next_command(args, diagnosis),
                          files=places.files)
-        rows = apply_other_methods(args, diagnosis, progress)
-        if rows:
-            report = add_methods(report, rows)
         progress("writing", 0.0)
         write_answer(report, places)
     show_answer(report, args)
     return 0 if diagnosis.is_acceptable else 1
-
-
-def apply_other_methods(args: argparse.Namespace, diagnosis: Diagnosis, progress: Progress) -> list[Row]:
-    """Results of the other methods that --optimisers and --comparators ask for."""
-    if not (args.optimisers or args.comparators):
-        return []
-    from rig.studies import fault_size_methods
-
-    rows: list[Row] = []
-    if args.optimisers:
-        rows += fault_size_methods.apply_optimisers(diagnosis, args.seed, progress)
-    if args.comparators:
-        rows += fault_size_methods.apply_learners(diagnosis, args.seed, progress)
-    return rows
-
-
-def add_methods(report: Report, rows: Sequence[Row]) -> Report:
-    """The report with a table of the other methods, and their rows under "methods" in its JSON answer."""
-    from rig.studies.fault_size_methods import build_methods_section
-
-    return replace(report, sections=[*report.sections, build_methods_section(rows)],
-                   data={**report.data, "methods": [row._asdict() for row in rows]})
 
 
 def learn_bands(args: argparse.Namespace) -> int:

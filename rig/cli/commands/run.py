@@ -104,7 +104,7 @@ def run_command(args: argparse.Namespace) -> int:
         pages.finish_page()
     if junit is not None:
         from fdi.output import write_text
-        from rig.studies.suite.suite_junit import write_junit_of_run
+        from rig.suite.report import write_junit_of_run
 
         write_text(junit, write_junit_of_run(outcome, 1e-9 * clock.now()), "--junit")
     return outcome.status
@@ -119,7 +119,7 @@ def split_live(live: str | None, sequences: list[str]) -> tuple[str | None, list
 
 def is_suite(names: list[str]) -> bool:
     """Whether the command line names several sequences or a suite file."""
-    from rig.studies.suite.suite_file import is_suite_file
+    from rig.suite.suite import is_suite_file
 
     return len(names) > 1 or any(map(is_suite_file, names))
 

@@ -23,21 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="time axis of the trend (default: the first of these that all traces have)")
     add("--dates", metavar="FILE.csv", help="table file,date[,hours][,flights] (default: dates.csv in the folder)")
     add("--again", action="store_true", help="diagnose every trace again, even if its sizes are stored")
-    add("--score", action="store_true", help="score the prognosis method on simulated units, without FOLDER")
-    add("--units", type=options.parse_whole_number, default=20, metavar="N",
-        help="with --score: simulated units of each growth law (default 20)")
 
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if both faults are within MidBand at the last trace, 1 otherwise."""
     from plant import InputError
 
-    if args.score:
-        if not args.units:
-            raise InputError("--units", "0", "1 or more")
-        return score_method(args)
     if args.folder is None:
-        raise InputError("FOLDER", "", "a folder of dated traces, or --score")
+        raise InputError("FOLDER", "", "a folder of dated traces")
     from fdi.report.trend_report import build_trend_report
     from rig.cli.answer import choose_file, show_answer
 
@@ -75,21 +68,3 @@ def write_file(unit: UnitTrend, report: Report, out: Path) -> None:
         save_trends(unit, out)
     else:
         write_answer(report, Places(out, None) if out.suffix == ".html" else Places(None, out))
-
-
-def score_method(args: argparse.Namespace) -> int:
-    """Score the prognosis on simulated units; always exit status 0."""
-    from fdi.output import write_text
-    from fdi.report.json import to_json
-    from rig.cli.answer import choose_file, show_answer
-    from rig.cli.progress_bar import show_progress
-    from rig.studies.prognosis.prognosis_summary import score_laws
-    from rig.studies.prognosis.score_report import build_score_report
-
-    out = choose_file(args.out or None, (".json",), None)
-    with show_progress(is_silent=args.json or args.quiet) as progress:
-        report = build_score_report(score_laws(args.units, args.seed, progress))
-    if out is not None:
-        write_text(out, to_json(report.data) + "\n")
-    show_answer(report, args)
-    return 0

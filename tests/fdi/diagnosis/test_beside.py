@@ -21,7 +21,7 @@ from fdi.report.diagnosis_report import build_diagnosis_report
 from fdi.thresholds import GAIN_TIE, RESIDUAL_WORST
 from plant import load_model
 from plant.effects import CATALOGUE
-from rig.studies import faults_beside_effects as study
+from studies import faults_beside_effects as study
 
 COMMAND = np.concatenate([build_command()[2000:4200], build_command()[9000:11600]])  # steps, a ramp and a sine
 MODEL = load_model()

@@ -20,9 +20,9 @@ from fdi.estimation.final_rounds import linearise_across
 from fdi.estimation.preparation import hold_inputs
 from fdi.estimation.unidentifiable import find_flat_directions, relax_along
 from plant import Model, load_model
-from rig.studies.campaign.campaign_case import simulate_case
-from rig.studies.campaign.matrix import build_matrix
-from rig.studies.trial import cases, truth
+from rig.campaign.judge import simulate_case
+from rig.campaign.matrix import build_matrix
+from studies.hidden_effects import cases, truth
 
 MODEL = load_model()
 

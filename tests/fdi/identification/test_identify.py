@@ -24,8 +24,8 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 from rig.cli.main import main
-from rig.studies.identification.actuators import sample_actuator
-from rig.studies.trial.truth import SYMBOLS, has_compiler, simulate_truth
+from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
+from studies.identification import sample_actuator
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="no gcc for the independent simulator")
 

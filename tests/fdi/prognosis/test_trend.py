@@ -24,8 +24,15 @@ from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
 from rig.recorder.provenance import collect_provenance
-from rig.studies.prognosis import degrading_units
-from rig.studies.prognosis.prognosis_score import Prediction, find_false_trends, score_unit
+from studies.prognosis import (
+    LAWS,
+    Prediction,
+    Unit,
+    find_false_trends,
+    score_unit,
+    simulate_healthy_unit,
+    simulate_unit,
+)
 
 WEEKS = 7.0 * np.arange(14)
 RNG = np.random.default_rng(3)
@@ -187,11 +194,11 @@ def test_estimates_at_their_bound_only_say_not_more_than() -> None:
 
 
 def test_the_metrics_on_predictors_that_are_known() -> None:
-    unit = degrading_units.simulate_unit("linear", 4)
+    unit = simulate_unit("linear", 4)
     end, middle = unit.time_of_size(unit.fault.most), unit.time_of_size(unit.fault.middle)
 
     def by(factor: float) -> Any:
-        def predict(u: degrading_units.Unit, n: int) -> Prediction:
+        def predict(u: Unit, n: int) -> Prediction:
             spread = np.linspace(0.95, 1.05, 101) * factor
             return Prediction(True, spread * (middle - u.t[n - 1]), spread * (end - u.t[n - 1]))
         return predict
@@ -205,24 +212,24 @@ def test_the_metrics_on_predictors_that_are_known() -> None:
 
 
 def test_a_fleet_reaches_maxband_at_the_end_of_its_life() -> None:
-    for i, law in enumerate(degrading_units.LAWS):
-        unit = degrading_units.simulate_unit(law, i)
+    for i, law in enumerate(LAWS):
+        unit = simulate_unit(law, i)
         assert np.all(np.diff(unit.course) >= -1e-12) and unit.time_of_size(unit.fault.most) == pytest.approx(
             unit.course_t[-1], rel=0.02)
 
 
 def test_intervals_hold_the_truth() -> None:
-    """A quick part of `rig trend --score`: at half the life, all laws, those not fitted included."""
+    """A quick part of `python -m studies.prognosis`: at half the life, all laws, those not fitted included."""
     held = []
-    for i, law in enumerate(degrading_units.LAWS):
+    for i, law in enumerate(LAWS):
         for k in range(2):
-            u = degrading_units.simulate_unit(law, 100 * i + k)
+            u = simulate_unit(law, 100 * i + k)
             end = u.time_of_size(u.fault.most)
             n = int(np.searchsorted(u.t, (u.onset + end) / 2))
             left = fit_trend(u.fault, list(u.t[:n]), u.sizes[:n]).remaining["non_nominal"]
             held.append(left.low <= end - u.t[n - 1] <= left.high)
     assert sum(held) >= 0.8 * len(held)
-    assert len(find_false_trends(degrading_units.simulate_healthy_unit(seed) for seed in range(6))) <= 1
+    assert len(find_false_trends(simulate_healthy_unit(seed) for seed in range(6))) <= 1
 
 
 def points(path: Path, sizes: Sequence[float]) -> Path:
@@ -254,7 +261,7 @@ def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
     (bad := tmp_path / "bad.json").write_text("{}")
     (empty := tmp_path / "empty").mkdir()
     (nan := tmp_path / "nan.json").write_text(points(nan, LINE).read_text().replace('"t": ', '"t": NaN, "x": ', 1))
-    for words in ([], [bad], [nan], ["--score", "--units", "0"], [tmp_path / "none"], [empty], [bad, "--out", "x.txt"]):
+    for words in ([], [bad], [nan], [tmp_path / "none"], [empty], [bad, "--out", "x.txt"]):
         said = rig("trend", *words)
         assert said.status == 2 and said.err.count("\n") == 1, words
 

@@ -10,7 +10,6 @@ import pytest
 from noisy_traces import SHORT, record_healthy, record_plant
 from rig_command import Said, rig
 
-from fdi.diagnosis import comparators, optimisers
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Level
 from fdi.report.diagnosis_report import describe_verdict
@@ -100,28 +99,6 @@ def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     assert found.verdict == "SOMETHING_ELSE" and not found.is_acceptable and found.ruling is None
     assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
     assert "Something else is wrong" in describe_verdict(found)
-
-
-def test_global_optimisers_leave_less_than_the_grid(other_command: Diagnosis) -> None:
-    d, grid = other_command, (0.1, 38.0)
-    at_grid = optimisers.Objective(optimisers.make_problem(d.model, d.trace, d.floor), d.model, grid)
-    left = at_grid.report("grid", at_grid.start).left
-    for name in ("differential evolution", "simulated annealing", "genetic"):
-        if optimisers.is_available(name):
-            found = optimisers.METHODS[name](d.model, d.trace, grid, d.floor, 0)
-            assert found.left < 0.9 * left and 200 < found.simulations < 500
-            assert 19.0 <= found.fss <= 76.0 and 0.0 <= found.kintas <= 0.3
-
-
-def test_learners_know_units_that_they_never_saw(other_command: Diagnosis) -> None:
-    if not comparators.is_available():
-        pytest.skip("needs scikit-learn")
-    data = comparators.simulate_lesson(other_command.trace, other_command.model, cloggings=(0.0, 0.3),
-                                       frictions=(5.0, 45.0, 90.0), held_out=4)
-    assert data.unseen.sum() == 2 * 3 * 4
-    for learner in comparators.LEARNERS.values():
-        found = learner(data)
-        assert found.right[FRICTION.name] > 0.9 and found.levels[FRICTION.name] == Level.MAINTENANCE
 
 
 @pytest.mark.parametrize("missing", ["xj", "cor"])

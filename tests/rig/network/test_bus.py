@@ -24,7 +24,7 @@ from rig.network.frame import Frame
 from rig.network.link import Link
 from rig.network.turn import Turn
 from rig.network.udp import PORT, LoopbackBus
-from rig.studies.robustness.disturb import has_semaphores
+from studies.robustness.disturb import has_semaphores
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
 only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)

@@ -1,0 +1,285 @@
+"""Runs in real time that are shown while they run beside runs that are not: lateness and response of their cycles.
+
+Every run is a whole `rig run` process in a terminal of its own. The contenders take turns in short blocks, so that a
+disturbance of the machine hits all of them. Runs without the screen take part twice: how much these two differ is the
+noise of the comparison.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import termios
+from collections.abc import Iterator, Mapping, Sequence
+from fcntl import ioctl
+from importlib.util import find_spec
+from math import isfinite, log, nan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.estimation.geometric_mean import estimate_geometric_mean
+from fdi.progress import Progress, ignore_progress
+from fdi.report.numbers import format_digits
+from fdi.report.report import Cell, Column, Item, Line, Mood, Report, Section, Table
+from fdi.trace.trace import Trace
+from plant.errors import InputError, RigError
+from rig.bench.realtime import choose_priority, compute_percentiles
+from rig.live.viewer_feeder import make_viewer_command
+from rig.network.clock import WallClock
+from rig.network.raw_bus import can_open
+from rig.run.hard_loop import compile_cycle
+from rig.run.priority import list_cpus
+from rig.view.viewer import find_free_port, is_listening, kill_viewer
+
+Seconds = NDArray[np.float64]
+WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"
+QUANTITIES = ("lateness", "response", "feedback_response")
+SHARES = ("p50", "p99")
+_SEQUENCE = """title = "Live"
+setup = [{{ kind = "hold", time = 0.3 }}]
+main = [{{ name = "sine", kind = "sine", amplitude = 3e-3, frequency = 1.0, time = {seconds:g} }}]
+checks = [
+  {{ name = "tracking", kind = "rms_error", high = 1, unit = "mm" }},
+  {{ name = "position", kind = "never_exceeds", signal = "xj", high = 6, unit = "mm" }},
+]
+"""
+
+
+class Ratio(NamedTuple):
+    """How a percentile of a contender compares with that of the runs without a screen: geometric mean over blocks."""
+
+    quantity: str
+    share: str  # p50 or p99
+    contender: str
+    ratio: float
+    low: float  # of the simultaneous 95 % interval of all ratios; NaN with fewer than four blocks
+    high: float
+
+    @property
+    def word(self) -> str:
+        """slower, faster, no difference found, or, with fewer than four blocks, not known."""
+        if not isfinite(self.low):
+            return "not known"
+        if self.low > 1.0:
+            return "slower"
+        return "faster" if self.high < 1.0 else "no difference found"
+
+
+def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Measure all contenders on a bus for `seconds` each, in so many blocks.
+
+    Raises:
+        InputError: a bus that compiled code cannot use.
+        RigError: a run that came to no verdict.
+    """
+    if not can_open(bus):
+        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
+    compile_cycle(realtime=True)
+    missing = {} if find_spec("rerun") else {VIEWER: "not measured: pip install 'eha-rig[view]'"}
+    contenders = [name for name in (WITHOUT, AGAIN, LIVE, VIEWER) if name not in missing]
+    found: dict[str, list[dict[str, Seconds]]] = {name: [] for name in contenders}
+    for block in range(blocks):
+        turn = block % len(contenders)  # nobody is always the first
+        for number, name in enumerate(contenders[turn:] + contenders[:turn]):
+            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(contenders)) / blocks)
+            found[name].append(play_contender(name, bus, seconds / blocks))
+    return summarise_live_runs(found) | {
+        "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
+        "missing": missing,
+        "ended_early": {name: sum(len(run["lateness"]) < 900.0 * seconds / blocks for run in runs)
+                        for name, runs in found.items()}}
+
+
+def play_contender(name: str, bus: str, seconds: float) -> dict[str, Seconds]:
+    """Times of the cycles of a run of one kind, see `play_run`."""
+    if name != VIEWER:
+        return play_run(bus, seconds, ("--live",) if name == LIVE else ())
+    with open_hidden_viewer() as port:
+        return play_run(bus, seconds, ("--live", f"rerun:{port}"))
+
+
+@contextlib.contextmanager
+def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
+    """A viewer that draws without a display, by the CPUs that the loop leaves free; give its port on 127.0.0.1.
+
+    Raises:
+        RigError: it does not start, for example without a Vulkan driver.
+    """
+    port = find_free_port()
+    cpus = list_cpus()
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cpus[:-1] or cpus)  # the viewer inherits it
+    try:
+        viewer = subprocess.Popen([*make_viewer_command(port), "--headless", "--window-size", "1280x800"],
+                                  stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                                  start_new_session=True)
+    finally:
+        os.sched_setaffinity(0, before)
+    clock = WallClock()
+    try:
+        while not is_listening(port):
+            if viewer.poll() is not None or clock.now() > patience * 1e9:
+                raise RigError("the viewer does not start without a display; it needs a Vulkan driver (Debian: "
+                               "mesa-vulkan-drivers libvulkan1)")
+            clock.sleep_until(clock.now() + 100_000_000)
+        yield port
+    finally:
+        kill_viewer(viewer)
+
+
+def play_run(bus: str, seconds: float, options: Sequence[str]) -> dict[str, Seconds]:
+    """Times of the cycles of main of a run with its emulator; NaN where no answer came.
+
+    Raises:
+        RigError: the run came to no verdict.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        sequence, folder = Path(name) / "live.toml", Path(name) / "run"
+        sequence.write_text(_SEQUENCE.format(seconds=seconds))
+        words = [sys.executable, "-m", "rig.cli.main", "run", str(sequence), "--bus", bus, "--pace", "realtime",
+                 "--max-overruns", "1", "--out", str(folder), *options]
+        status, text = run_in_terminal(words)
+        if status not in (0, 1, 3):  # a verdict, whichever
+            lines = [line for line in text.splitlines() if line.strip()] or ["it printed nothing"]
+            raise RigError(f"rig run {' '.join(options)} ended with status {status}: {lines[-1].strip()}")
+        timing = Trace.read(folder, all=True).timing
+    main = timing.t >= 0.0
+    return {name: getattr(timing, name)[main] for name in (*QUANTITIES, "overrun")}
+
+
+def run_in_terminal(words: Sequence[str], size: tuple[int, int] = (40, 120)) -> tuple[int, str]:
+    """Run a program in a terminal of its own, `size` lines and columns; its exit status and what it wrote last."""
+    ours, theirs = pty.openpty()
+    try:
+        ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", *size, 0, 0))
+        process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+                                   env=os.environ | {"TERM": "xterm-256color"})
+        os.close(theirs)
+        text = b""
+        try:
+            while data := _read_some(ours):
+                text = (text + data)[-4096:]
+        finally:
+            process.send_signal(signal.SIGTERM)  # without effect on one that has ended
+            process.wait()
+    finally:
+        os.close(ours)
+    return process.returncode, text.decode(errors="replace")
+
+
+def _read_some(number: int) -> bytes:
+    try:
+        return os.read(number, 65536)
+    except OSError:  # the other end is closed
+        return b""
+
+
+def summarise_live_runs(found: Mapping[str, Sequence[Mapping[str, Seconds]]]) -> dict[str, Any]:
+    """Percentiles in us by quantity and contender over all blocks and of each block, ratios, overruns.
+
+    Args:
+        found: contender -> of each block, quantity -> times in s, and which cycles are overruns.
+    """
+    pooled = {quantity: {name: compute_percentiles(np.concatenate([block[quantity] for block in blocks]))
+                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    single = {quantity: {name: [compute_percentiles(block[quantity]) for block in blocks]
+                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    return {"times_us": pooled, "blocks_us": single,
+            "ratios": [ratio._asdict() | {"word": ratio.word} for ratio in compare_contenders(single)],
+            "overruns": {name: int(sum(block["overrun"].sum() for block in blocks)) for name, blocks in found.items()},
+            "cycles": {name: sum(len(block["lateness"]) for block in blocks) for name, blocks in found.items()}}
+
+
+def compare_contenders(blocks_us: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> list[Ratio]:
+    """The ratios of all contenders to the runs without a screen, by the logarithms of the blocks' percentiles."""
+    found = []
+    others = [name for name in next(iter(blocks_us.values())) if name != WITHOUT]
+    count = len(QUANTITIES) * len(SHARES) * len([name for name in others if name != AGAIN])
+    for quantity in QUANTITIES:
+        for share in SHARES:
+            logs = {name: np.array([log(block[share]) if block.get(share, 0.0) > 0.0 else nan for block in blocks])
+                    for name, blocks in blocks_us[quantity].items()}
+            for name in others:
+                base = logs[WITHOUT] if name == AGAIN else (logs[WITHOUT] + logs[AGAIN]) / 2
+                found.append(Ratio(quantity, share, name, *estimate_geometric_mean(logs[name] - base, 0.05 / count, 4)))
+    return found
+
+
+_TITLES = {
+    "lateness": ("SYNC lateness", "How long after its due time SYNC was sent."),
+    "response": ("SYNC to the controller's answer", "From SYNC until the drive frame of the controller arrived."),
+    "feedback_response": ("SYNC to feedback", "From SYNC until the kernel received the feedback frame of the plant."),
+}
+_MOODS: Mapping[str, Mood] = {"slower": "bad", "faster": "", "no difference found": "good", "not known": "doubtful"}
+
+
+def build_live_runs_report(figures: Mapping[str, Any]) -> Report:
+    """Report on the figures of `rig.bench.live.measure_live_runs`, which are its `data`."""
+    priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
+    overruns = ", ".join(f"{name} {count} of {figures['cycles'][name]}" for name, count in figures["overruns"].items())
+    lines: list[Item] = [
+        Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks on "
+                         f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}"),
+        Line("overruns", overruns),
+        *(Line("ended early", f"{name}: {count}") for name, count in figures["ended_early"].items() if count),
+        *(Line(name, reason) for name, reason in figures["missing"].items())]
+    return Report(
+        command="bench", title="live", sentence=describe_ratios(figures["ratios"]),
+        sections=[Section("With and without", [_tabulate_ratios(figures["ratios"])]),
+                  *(Section(title, [_tabulate_times(figures["times_us"][quantity], figures["blocks_us"][quantity],
+                                                    caption)]) for quantity, (title, caption) in _TITLES.items()),
+                  Section("Conditions", lines)],
+        data=dict(figures))
+
+
+def describe_ratios(ratios: Sequence[Mapping[str, Any]]) -> str:
+    """What the ratios say, in one sentence."""
+    names = list(dict.fromkeys(ratio["contender"] for ratio in ratios if not ratio["contender"].startswith(WITHOUT)))
+    shown = " and ".join(names)
+    changed = [f"{ratio['quantity'].replace('_', ' ')} {ratio['share']} {ratio['word']} with {ratio['contender']} "
+               f"({format_digits(ratio['ratio'])} times)" for ratio in ratios
+               if ratio["word"] in ("slower", "faster") and ratio["contender"] in names]
+    if changed:
+        return f"{'; '.join(changed)}."
+    if any(ratio["word"] == "not known" for ratio in ratios):
+        return f"Too few blocks to say whether {shown} changes lateness or response; ask for --blocks 4 or more."
+    return f"Lateness and response with {shown} differ from those without by no more than noise."
+
+
+def _tabulate_ratios(ratios: Sequence[Mapping[str, Any]]) -> Table:
+    columns = [Column("percentile"), Column("run"), Column("ratio", align="right"), Column("interval", align="right"),
+               Column("")]
+    rows: list[list[Cell | str]] = [
+        [f"{ratio['quantity'].replace('_', ' ')} {ratio['share']}", ratio["contender"], _format_number(ratio["ratio"]),
+         f"{_format_number(ratio['low'])} .. {_format_number(ratio['high'])}" if isfinite(ratio["low"]) else "",
+         Cell(ratio["word"], _MOODS[ratio["word"]])] for ratio in ratios]
+    return Table(columns, rows, f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same '
+                                "runs once more, which is the noise. All intervals together hold with 95 %.")
+
+
+def _format_number(ratio: float) -> str:
+    if not ratio < 100.0:
+        return "> 100" if ratio >= 100.0 else "-"
+    return f"{ratio:.2f}"
+
+
+def _tabulate_times(times: Mapping[str, Mapping[str, float]], blocks: Mapping[str, Sequence[Mapping[str, float]]],
+                    caption: str) -> Table:
+    columns = [Column("run"), *(Column(share, "us", "right") for share in SHARES),
+               *(Column(f"{share} by block", "us", "right") for share in SHARES)]
+    rows = [[name, *(f"{found[share]:.1f}" for share in SHARES),
+             *(_describe_spread([block[share] for block in blocks[name] if block]) for share in SHARES)]
+            for name, found in times.items() if found]
+    return Table(columns, rows, caption)
+
+
+def _describe_spread(values: Sequence[float]) -> str:
+    return f"{min(values):.1f} .. {max(values):.1f}"

@@ -1,0 +1,189 @@
+"""The cost of the plant: a step beside the same step in C, one run, whole processes, and the error of the step size.
+
+Costs are medians over rounds that alternate between the rivals, in one process.
+"""
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.progress import Progress, ignore_progress
+from plant import Actuator, Model, simulate
+from plant.model import STEPS, build_kernel
+from plant.run import sample_noise
+from plant.solve import run_closed_loop
+from rig.bench.stopwatch import (
+    FLAGS,
+    SAME_ROUNDING,
+    Work,
+    build_library,
+    find_gcc,
+    measure_durations,
+    measure_median_duration,
+)
+from rig.run.outcome import INTERRUPTED
+from rig.sequences import load_sequence
+
+Array = NDArray[np.float64]
+
+FRICTIONLESS = {f"{body}.{kind}_friction": 0.0 for body in ("spool", "jack") for kind in ("static", "dynamic")}
+QUIET = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
+
+
+class StepCost(NamedTuple):
+    """A step of the reference model in Python and in C, ns; `ratio` is Python's over C's."""
+
+    python: float
+    c: float  # gcc -O3 -march=native, free to fuse multiply and add
+    c_same_rounding: float  # without fusing
+    ratio: float
+    ratio_same_rounding: float
+    difference: float  # m, largest between the positions of Python and C over the run
+    identical: bool  # all columns, against C with the same rounding
+    compiler: str
+
+
+class Accuracy(NamedTuple):
+    """Error of one step size over a command, against the finest; position in um."""
+
+    steps: int  # a cycle
+    rms: float
+    largest: float
+    rms_friction: float
+    largest_friction: float
+
+
+def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
+    """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
+    if not find_gcc():
+        return None
+    model, draws = Model(), sample_noise(0, len(command))
+    with tempfile.TemporaryDirectory() as folder:
+        runs, outs = {}, {}
+        runs["python"], outs["python"] = _make_python_run(model, command, draws, steps)
+        for name, flags in (("c", FLAGS), ("c_same_rounding", SAME_ROUNDING)):
+            library = build_library("step.c", flags, Path(folder) / f"{name}.so")
+            runs[name], outs[name] = _make_c_run(library, model, command, draws, steps)
+        seconds = measure_durations(runs, rounds)
+    each = {name: float(np.median(t)) / (len(command) * steps) * 1e9 for name, t in seconds.items()}
+    ratios = {name: float(np.median(seconds["python"] / t)) for name, t in seconds.items()}  # round by round
+    version = subprocess.run([find_gcc(), "-dumpfullversion"], capture_output=True, text=True, check=True)
+    return StepCost(each["python"], each["c"], each["c_same_rounding"], ratios["c"], ratios["c_same_rounding"],
+                    float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
+                    bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version.stdout.strip()}")
+
+
+def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
+    out, load = np.empty((len(command), 4)), np.zeros_like(command)
+    run, state, record = build_kernel(run_closed_loop, model.effects), model.build_state(), model.build_record()
+    return lambda: run(state, command, load, draws, record, steps, out), out
+
+
+def _make_c_run(library: ctypes.CDLL, model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
+    record = model.build_record()
+    assert library.model_bytes() == record.nbytes, "step.c knows other parameters than plant.parameters"
+    out, load = np.empty((len(command), 4)), np.zeros_like(command)
+    # the arrays themselves, not their addresses: the closure keeps them alive
+    pointers = [np.ctypeslib.as_ctypes(a.view(np.float64).reshape(-1)) for a in (record, command, load, draws)]
+    result = np.ctypeslib.as_ctypes(out.reshape(-1))
+    return lambda: library.closed_loop(*pointers, len(command), steps, result), out
+
+
+def measure_accuracy(command: Array, steps: tuple[int, ...] = (20, 50, 100, 200, 500), finest: int = 5000
+                     ) -> list[Accuracy]:
+    """Error in XJ of some step sizes over `command` (n,) m, closed loop, without noise; friction off and on.
+
+    The truth is the same run with `finest` steps a cycle: 5000 are steps of 0.2 us.
+    """
+    columns = {}
+    for friction in (False, True):
+        model = Model().replace(QUIET | ({} if friction else FRICTIONLESS))
+        truth = simulate(model, command, steps=finest).xj
+        columns[friction] = [_measure_error(simulate(model, command, steps=n).xj - truth) for n in steps]
+    return [Accuracy(n, *off, *on) for n, off, on in zip(steps, columns[False], columns[True], strict=True)]
+
+
+def _measure_error(error: Array) -> tuple[float, float]:
+    """RMS and largest absolute value, um."""
+    return float(np.sqrt((error**2).mean())) * 1e6, float(np.abs(error).max()) * 1e6
+
+
+
+
+def measure_cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
+    """The cost of `Actuator.sample` and `advance` called from Python, s a cycle."""
+    plant = Actuator(Model())
+    plant.warm()
+
+    def run_cycles() -> None:
+        for _ in range(cycles):
+            plant.advance(1e-3 * plant.sample()[0])
+
+    return measure_median_duration(run_cycles, rounds) / cycles
+
+
+def measure_simulation_speed(command: Array, rounds: int = 9) -> float:
+    """The speed of a simulated run over `command` (n,) m, with noise and columns, as a multiple of real time."""
+    model = Model()
+    seconds = measure_median_duration(lambda: simulate(model, command), rounds)
+    return len(command) * model["controller.period"] / seconds
+
+
+def measure_bus_run_speed(runs: int = 3) -> float:
+    """The speed of a preflight run on the embedded bus, with its log, as a multiple of real time; best of `runs`."""
+    from rig.run.job import Job
+    from rig.run.runner import run_job
+    from rig.sequences import load_sequence
+
+    job = Job(sequence=load_sequence("preflight"), model=Model())
+    speeds = []
+    for _ in range(runs):
+        with tempfile.TemporaryDirectory() as folder:
+            speeds.append(run_job(job, Path(folder), ignore_progress, lambda: False).speed)
+    return max(speeds)
+
+
+def measure_run_process_speed(rounds: int = 3) -> float:
+    """The speed of a whole `rig run preflight` process with its log and report, as a multiple of real time."""
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = measure_median_duration(lambda: run_rig("run", "preflight", "--quiet", "--out", folder), rounds)
+    return load_sequence("preflight").duration / seconds
+
+
+def measure_help_time(rounds: int = 5) -> float:
+    """The time that `rig --help` takes as a process, s."""
+    return measure_median_duration(lambda: run_rig("--help"), rounds)
+
+
+def run_rig(*words: str) -> None:
+    """Run `rig` with these words in a process of its own.
+
+    Raises:
+        subprocess.CalledProcessError: it ended with a status other than 0.
+        KeyboardInterrupt: Ctrl-C in the terminal ended it, before this process heard of it.
+    """
+    done = subprocess.run([sys.executable, "-m", "rig.cli.main", *words], check=False, stdout=subprocess.DEVNULL)
+    if done.returncode == INTERRUPTED:
+        raise KeyboardInterrupt
+    done.check_returncode()
+
+
+
+
+def run_benchmarks(command: Array, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Measure everything over `command` (n,) m; `step` is None without gcc."""
+    progress("one run, and a run on the embedded bus", 0.0)
+    cost = compare_step_with_c(command)
+    return {"step": cost and cost._asdict(),
+            "times_real_time": measure_simulation_speed(command),
+            "cycle": measure_cycle_cost(),
+            "lockstep": measure_bus_run_speed(),
+            "run_process": measure_run_process_speed(),
+            "help_process": measure_help_time()}

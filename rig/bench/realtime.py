@@ -1,0 +1,228 @@
+"""The cycle in real time: its lateness beside cyclictest, its response beside a responder in C, its execution.
+
+The contenders take turns in short blocks, so that a disturbance of the machine hits all of them.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdi.progress import Progress, ignore_progress
+from plant.errors import InputError, RigError
+from rig.bench.responders import run_c_responder, run_emulator
+from rig.bench.stopwatch import find_gcc
+from rig.network.bus import open_can
+from rig.network.clock import WallClock
+from rig.network.link import Link
+from rig.network.master import Master
+from rig.network.raw_bus import can_open, open_raw_bus
+from rig.network.wire import LinkWire
+from rig.recorder import Recorder, Signals, Timing
+from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
+from rig.run.history import History
+from rig.run.loop import CycleInput, CycleLoop, Loop
+from rig.run.priority import (
+    LOOP_PRIORITY,
+    list_cpus,
+    lock_memory,
+    prevent_deep_sleep,
+    raise_priority,
+    suspend_garbage_collection,
+)
+from rig.sequences.faults import Plan, Schedule
+
+Seconds = NDArray[np.float64]
+CYCLICTEST, COMPILED, IN_C, PYTHON = "cyclictest", "compiled", "C", "Python"
+_QUANTITIES = ("lateness", "feedback_response", "valve_response", "execution")
+_SETTLING = 100  # cycles at the beginning of a block that are not counted
+
+
+class Target(NamedTuple):
+    """A ratio or a time, and the limit that it is to keep."""
+
+    name: str
+    value: float | None  # None: not measured
+    limit: float
+    unit: str  # "" for a ratio
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the value is known and within the limit."""
+        return self.value is not None and self.value <= self.limit
+
+
+def measure_realtime(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
+    """Measure all contenders on a bus for `seconds` each, in so many blocks.
+
+    Raises:
+        InputError: a bus that compiled code cannot use.
+        RigError: a bus or a node that does not work.
+    """
+    if not can_open(bus):
+        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
+    compile_cycle(realtime=True)
+    contenders = list_contenders(bus, seconds / blocks)
+    times: dict[str, dict[str, list[Seconds]]] = {name: {} for name in contenders}
+    for block in range(blocks):
+        turn = block % len(contenders)  # nobody is always the first
+        for name in [*contenders][turn:] + [*contenders][:turn]:
+            progress(name, block / blocks)
+            for quantity, values in contenders[name]().items():
+                times[name].setdefault(quantity, []).append(values)
+    pooled = {name: {quantity: np.concatenate(parts) for quantity, parts in found.items()}
+              for name, found in times.items()}
+    return summarise_contenders(pooled) | {
+        "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
+        "missing": [name for name, path in (("cyclictest", find_cyclictest()), ("gcc", find_gcc())) if not path]}
+
+
+def list_contenders(bus: str, seconds: float) -> dict[str, Callable[[], dict[str, Seconds]]]:
+    """What is measured in a block of so many seconds, by name; without those that this machine does not have."""
+    def measure_python() -> dict[str, Seconds]:
+        with run_emulator(bus, is_compiled=False):
+            return play_block(bus, seconds, is_compiled=False)
+
+    def measure_compiled() -> dict[str, Seconds]:
+        with run_emulator(bus, is_compiled=True):
+            return play_block(bus, seconds)
+
+    def measure_c() -> dict[str, Seconds]:
+        with run_c_responder(bus):
+            return play_block(bus, seconds)
+
+    found: dict[str, Callable[[], dict[str, Seconds]]] = {}
+    if find_cyclictest():
+        found[CYCLICTEST] = lambda: {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
+    found[COMPILED] = measure_compiled
+    if find_gcc():
+        found[IN_C] = measure_c
+    return found | {PYTHON: measure_python}
+
+
+def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000) -> dict[str, Seconds]:
+    """Times of the rig's cycle on a bus, with its log, without the first cycles; NaN where no answer came."""
+    history = History()
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        recorder = Recorder(Path(folder) / "trace.mcap", {}, {})
+        stack.callback(recorder.close)
+        clock = WallClock()
+        wire = LinkWire(Link(open_can(bus), clock.now), clock)
+        stack.callback(wire.close)
+        master = Master(wire, clock.now, stamped=True)
+        master.on_frame = recorder.frame
+        log = _Log(history, recorder)
+        loop: Loop = (HardLoop(master, Schedule(Plan(stop=0)), log, open_raw_bus(bus, RECEIVED), period_ns, True)
+                      if is_compiled else CycleLoop(master, Schedule(Plan(stop=0)), log, period_ns, True))
+        stack.callback(loop.close)
+        stack.enter_context(enter_real_time(is_compiled))
+        for _ in range(round(seconds * 1e9 / period_ns)):
+            loop.cycle(CycleInput(1, 0.0, 0.0, 0))
+        loop.finish()
+    return {name: history.column(name)[_SETTLING:].copy() for name in _QUANTITIES}
+
+
+class _Log:
+    """Keeps the cycles and records them, as a run does."""
+
+    def __init__(self, history: History, recorder: Recorder) -> None:
+        self._history, self._recorder = history, recorder
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        self._history.add(signals, timing)
+        self._recorder.cycle(t_ns, signals, timing)
+
+
+@contextlib.contextmanager
+def enter_real_time(is_compiled: bool) -> Iterator[None]:
+    """The rights that a run takes in real time."""
+    with (raise_priority(1 if is_compiled else LOOP_PRIORITY), lock_memory(), prevent_deep_sleep(),
+          suspend_garbage_collection()):
+        yield
+
+
+def choose_priority() -> int:
+    """The loop's real-time priority, or 0 where the machine does not grant it."""
+    with raise_priority():
+        return LOOP_PRIORITY if os.sched_getscheduler(0) == os.SCHED_FIFO else 0
+
+
+def summarise_contenders(times: Mapping[str, Mapping[str, Seconds]]) -> dict[str, Any]:
+    """Percentiles in us by quantity and contender, lost answers, and the targets."""
+    tables: dict[str, dict[str, dict[str, float]]] = {
+        quantity: {name: compute_percentiles(found[quantity]) for name, found in times.items() if quantity in found}
+        for quantity in _QUANTITIES}
+    tables["execution"].pop(PYTHON, None)  # it is another quantity there: up to SYNC
+    lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items() if len(found) > 1}
+    return {"times_us": tables, "lost": lost, "cycles": {name: len(found["lateness"]) for name, found in times.items()},
+            "targets": [target._asdict() | {"is_met": target.is_met} for target in list_targets(tables)]}
+
+
+def compute_percentiles(seconds: Seconds) -> dict[str, float]:
+    """p50, p99, p99.9 and the largest of the values that are there, us."""
+    known = seconds[~np.isnan(seconds)] * 1e6
+    if not len(known):
+        return {}
+    values = (*np.percentile(known, (50, 99, 99.9)), known.max())
+    return dict(zip(("p50", "p99", "p99_9", "max"), map(float, values), strict=True))
+
+
+def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[Target]:
+    """The ratios to cyclictest and to the responder in C, and the execution."""
+    found = []
+    for quantity, rival, limit in (("lateness", CYCLICTEST, 1.2), ("feedback_response", IN_C, 1.3),
+                                   ("valve_response", IN_C, 1.3)):
+        for share in ("p50", "p99"):
+            own, other = (tables[quantity].get(name, {}).get(share) for name in (COMPILED, rival))
+            ratio = own / other if own is not None and other else None
+            found.append(Target(f"{quantity.replace('_', ' ')} {share}, compiled / {rival}", ratio, limit, ""))
+    own = tables["execution"].get(COMPILED, {}).get("p99_9")
+    return [*found, Target("execution p99.9", own, 100.0, "us")]
+
+
+GET_CYCLICTEST = "apt-get install rt-tests"
+
+
+def find_cyclictest() -> str:
+    """The path of cyclictest; "" without it."""
+    return shutil.which("cyclictest", path="/usr/bin:/usr/local/bin:/bin:/usr/sbin") or ""
+
+
+def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 1000) -> NDArray[np.float64]:
+    """Latencies of cyclictest, s, to the microsecond: one thread, absolute due times, memory locked.
+
+    `priority` 0 runs it without real-time priority.
+
+    Raises:
+        RigError: it ended with an error.
+    """
+    words = [find_cyclictest(), "-q", "-m", f"--priority={priority}", f"--policy={'fifo' if priority else 'other'}",
+             f"--interval={period_us}", f"--loops={round(seconds * 1e6 / period_us)}", "--histogram=100000",
+             f"--affinity={cpu}"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RigError(f"cyclictest: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+    return parse_histogram(done.stdout)
+
+
+def parse_histogram(text: str) -> NDArray[np.float64]:
+    """The latencies, s, in the histogram that cyclictest prints; those beyond its end count as its maximum."""
+    bins, most, overflows = [], 0, 0
+    for line in text.splitlines():
+        words = line.split()
+        if line.startswith("# Max Latencies:"):
+            most = int(words[-1])
+        elif line.startswith("# Histogram Overflows:"):
+            overflows = int(words[-1])
+        elif len(words) == 2 and words[0].isdigit():
+            bins.append((int(words[0]), int(words[1])))
+    latencies, counts = np.array([*bins, (most, overflows)]).T
+    return np.repeat(latencies, counts) * 1e-6

@@ -1,0 +1,158 @@
+"""The folder of a campaign.
+
+    campaign.json      the matrix, and a hash of the code; a folder belongs to one campaign
+    finished.jsonl     one row per finished case (see `rig.campaign.row_file`)
+    results.parquet    all rows in the matrix's order; replaced as a whole
+"""
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from plant.errors import InputError
+from rig.campaign.matrix import Matrix, restore_matrix
+from rig.campaign.row_file import Row, RowFile, read_rows
+
+MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
+PART = ".part"
+
+
+class CampaignFolder:
+    """A campaign's folder, opened for writing by one process at a time; `file` holds its rows.
+
+    Raises:
+        InputError: the folder belongs to another matrix or to something else, the code has changed since the campaign
+            was started, another process is at work in it, or it cannot be written.
+    """
+
+    def __init__(self, path: str | Path, matrix: Matrix, sources: str) -> None:
+        self.path = Path(path)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._claim(matrix, sources)
+        except OSError as error:
+            raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
+        self.file = RowFile(self.path / ROWS)
+
+    def __enter__(self) -> CampaignFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+                 ) -> None:
+        self.file.__exit__(kind, error, where)
+
+    def _claim(self, matrix: Matrix, sources: str) -> None:
+        """Make sure that the folder is this campaign's; an empty one becomes so."""
+        expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
+        if is_campaign_folder(self.path):
+            present = _read_campaign(self.path)
+            if present["matrix"] != expected["matrix"]:
+                changed = ", ".join(_list_differences(present["matrix"], expected["matrix"]))
+                raise InputError(self.path, "--out", f"a folder of this matrix, or a new one; it differs in {changed}")
+            if present["code"] != sources:
+                raise InputError(self.path, "--out", "a new folder: the code has changed since this campaign was "
+                                                     "started")
+            return
+        if any(not file.name.endswith(PART) for file in self.path.iterdir()):
+            raise InputError(self.path, "--out", "an empty folder, or one of this campaign")
+        replace_file(self.path / MATRIX, (json.dumps(expected, indent=1) + "\n").encode())
+
+    def newest_rows(self) -> list[Row]:
+        """The newest row of each finished case, in the matrix's order."""
+        return _select_newest(self.file.rows)
+
+    def write_results(self) -> None:
+        """Write all rows so far to results.parquet."""
+        write_parquet(self.path / RESULTS, self.newest_rows(), _read_campaign(self.path))
+
+
+def is_campaign_folder(folder: str | Path) -> bool:
+    """Whether the folder is one of a campaign."""
+    return (Path(folder) / MATRIX).is_file()
+
+
+def read_matrix_of_folder(folder: str | Path) -> Matrix:
+    """The matrix of a campaign's folder. Raises InputError."""
+    return restore_matrix(_read_campaign(Path(folder))["matrix"])
+
+
+def read_campaign_rows(source: str | Path) -> list[Row]:
+    """The rows of a campaign's folder, finished or not, or of a results.parquet, in the matrix's order.
+
+    Raises:
+        InputError: there is no such campaign.
+    """
+    path = Path(source)
+    if path.is_dir() and is_campaign_folder(path):
+        return _select_newest(read_rows(path / ROWS))
+    if path.suffix != ".parquet" or not path.is_file():
+        raise InputError(source, "", f"the folder of a campaign, or its {RESULTS}")
+    parquet = import_pyarrow()[1]
+    try:
+        rows: list[Row] = parquet.read_table(path).to_pylist()
+    except (OSError, ValueError) as error:
+        raise InputError(source, "", f"a Parquet file ({error})") from None
+    return [{key: value for key, value in row.items() if value is not None} for row in rows]
+
+
+def write_parquet(path: Path, rows: Iterable[Row], metadata: Mapping[str, Any]) -> None:
+    """Replace a Parquet file by one with these rows; `metadata` goes into its schema, under "campaign"."""
+    pa, parquet = import_pyarrow()
+    rows = list(rows)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
+    table = table.replace_schema_metadata({"campaign": json.dumps(metadata)})
+    part = path.with_name(path.name + PART)
+    parquet.write_table(table, part)
+    part.replace(path)
+
+
+def import_pyarrow() -> tuple[Any, Any]:
+    """The modules pyarrow and pyarrow.parquet.
+
+    Raises:
+        InputError: they are not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("pyarrow", "", "the extra: pip install 'eha-rig[fleet]'") from None
+    return pyarrow, pyarrow.parquet
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file as a whole: a reader sees the old content or the new one. Raises InputError."""
+    part = path.with_name(path.name + PART)
+    try:
+        with part.open("wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        part.replace(path)
+    except PermissionError as error:
+        raise InputError(path, "", f"a place that can be written ({error.strerror})") from None
+
+
+def _read_campaign(folder: Path) -> dict[str, Any]:
+    """The content of campaign.json. Raises InputError."""
+    try:
+        content = json.loads((folder / MATRIX).read_text(encoding="utf-8"))
+        return {"matrix": content["matrix"], "code": content["code"]}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(folder / MATRIX, "", f"the matrix of a campaign ({type(error).__name__})") from None
+
+
+def _select_newest(rows: Iterable[Row]) -> list[Row]:
+    """The last row of each case, ordered by its number."""
+    newest = {row["case"]: row for row in rows if "case" in row}
+    return [newest[number] for number in sorted(newest)]
+
+
+def _list_differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The keys whose values differ."""
+    return [key for key in {**one, **other} if one.get(key) != other.get(key)]

@@ -1,1 +1,0 @@
-"""Studies over many runs: blind trial, campaign, prognosis scores and benchmarks."""

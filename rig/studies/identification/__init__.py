@@ -1,1 +1,0 @@
-"""Trials of `rig identify` on actuators of another size, simulated in C."""

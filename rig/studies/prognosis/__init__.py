@@ -1,1 +1,0 @@
-"""How good remaining lives are, scored on simulated units."""

@@ -1,0 +1,380 @@
+"""Several runs as one suite: the suite file, its cases, and running them side by side."""
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+import signal
+import tomllib
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, NamedTuple
+
+from fdi.progress import Progress, ignore_progress
+from fdi.report.run_report import write_run_page
+from plant.errors import InputError, RigError
+from rig.campaign.worker_processes import run_in_processes
+from rig.network.clock import WallClock
+from rig.run.differences import find_differences
+from rig.run.job_choice import JobChoice, build_job
+from rig.run.outcome import Outcome
+from rig.run.participants import EMBEDDED_NAMES
+from rig.run.runner import run_job
+from rig.run.servovalve import describe_finding, diagnose_servovalve, has_fault
+from rig.sequences.checks import CheckResult
+from rig.sequences.sequence import load_sequence
+from rig.sequences.tables import Place, build_dataclass, parse_table
+
+Value = float | str
+MOST_CASES = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaseEntry:
+    """An entry [[case]]: where a list stands, a case is made for each element, in every combination."""
+
+    sequence: str | tuple[str, ...]
+    name: str = ""
+    model: str | tuple[str, ...] = ()
+    set: Mapping[str, float | str | tuple[float | str, ...]] = field(default_factory=dict)
+    seed: int | tuple[int, ...] = 0
+    effects: tuple[str, ...] = ()
+    requirement: str | tuple[str, ...] = ()
+    timeout: Annotated[float, "s"] | None = None
+    fdi: bool = False
+
+    def __post_init__(self) -> None:
+        for key in ("sequence", "seed"):
+            if getattr(self, key) == ():
+                raise InputError("case", key, "at least one")
+        if any(seed < 0 for seed in _as_tuple(self.seed)):
+            raise InputError("case", "seed", "whole numbers from 0")
+        if self.timeout is not None and not 0 < self.timeout <= 1e6:
+            raise InputError("case", "timeout", f"above 0 s and at most 1e6, not {self.timeout:g}")
+        for name, values in self.set.items():
+            if values == ():
+                raise InputError("case", "set", f"at least one value of {name}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteFile:
+    """The keys of a suite file. `requirements`: a list of ids, or a table of ids and texts."""
+
+    title: str
+    case: tuple[CaseEntry, ...]
+    requirements: tuple[str, ...] | Mapping[str, str] = ()
+
+
+class Suite(NamedTuple):
+    """Cases, and the requirements that they shall cover: id to text."""
+
+    title: str
+    cases: list[Case]
+    requirements: Mapping[str, str]
+    source: str = ""  # the suite file
+
+    def put_into(self, folder: Path) -> Suite:
+        """The same suite with the folders of its cases in this one."""
+        return self._replace(cases=[case._replace(folder=folder / case.folder) for case in self.cases])
+
+
+class Variant(NamedTuple):
+    """A run before it has its place in the suite."""
+
+    name: str
+    choice: JobChoice
+    timeout: float | None = None
+    requirement: tuple[str, ...] = ()
+
+
+def is_suite_file(name: str) -> bool:
+    """Whether a file is a suite and no sequence: it has the key `case`. False for what cannot be read."""
+    path = Path(name)
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return "case" in tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # whoever reads it as a sequence says what is wrong
+        return False
+
+
+def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Variant]]:
+    """The content of a suite file and its variants; `base` has what the command line chooses for all of them.
+
+    Raises:
+        InputError: the file, line and key that cannot be used.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(path, "", f"a file that can be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "", "text in UTF-8") from error
+    table, place = parse_table(text, str(path))
+    suite = build_dataclass(SuiteFile, table, place)
+    if not suite.case:
+        raise place.at("case").refuse("at least one case")
+    variants: list[Variant] = []
+    for i, entry in enumerate(suite.case):
+        for variant in _vary(entry, path.parent, base):
+            _try_variant(variant, place.at("case", i))
+            variants.append(variant)
+            if len(variants) > MOST_CASES:
+                raise place.at("case", i).refuse(f"at most {MOST_CASES} cases in all")
+    return suite, variants
+
+
+def _try_variant(variant: Variant, place: Place) -> None:
+    """Refuse a sequence that is not there with the line of the suite file that names it."""
+    try:
+        load_sequence(variant.choice.sequence)
+    except InputError as error:
+        if error.where == variant.choice.sequence:
+            raise place.at("sequence").refuse(f"a sequence; {error}") from error
+        raise
+
+
+def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
+    """Every combination of the lists of an entry."""
+    sequences, models, seeds = _as_tuple(entry.sequence), _as_tuple(entry.model) or (None,), _as_tuple(entry.seed)
+    values = {name: _as_tuple(value) for name, value in entry.set.items()}
+    effects = (*base.effects, *(folder / name for name in entry.effects))
+    for sequence, model, seed, *chosen in itertools.product(sequences, models, seeds, *values.values()):
+        changes: dict[str, Value] = dict(zip(values, chosen, strict=True))
+        words = [entry.name or Path(sequence).stem]
+        words += [Path(sequence).stem] if entry.name and len(sequences) > 1 else []
+        words += [Path(model).stem] if model is not None and len(models) > 1 else []
+        words += [f"{name}={_show(value)}" for name, value in changes.items() if len(values[name]) > 1]
+        words += [f"seed {seed}"] if len(seeds) > 1 else []
+        choice = base._replace(sequence=_find_beside(folder, sequence), changes=changes, seed=seed, effects=effects,
+                               model=None if model is None else _find_beside(folder, model),
+                               is_diagnosed=base.is_diagnosed or entry.fdi)
+        yield Variant(", ".join(words), choice, entry.timeout, _as_tuple(entry.requirement))
+
+
+def build_suite(title: str, variants: Sequence[Variant], requirements: Mapping[str, str], source: str = "", *,
+                is_trusted: bool = False) -> Suite:
+    """The suite of these variants; each is tried first: sequence, model, parameters, effects.
+
+    The folders of its cases are names without a place, see `Suite.put_into`.
+
+    Raises:
+        InputError: a variant that cannot run, or code that a model brings along and that is not trusted.
+    """
+    cases: list[Case] = []
+    names: set[str] = set()
+    folders: set[str] = {"suite.html", "suite.json"}
+    for variant in variants:
+        name = _find_free(variant.name, names, " ({})")
+        slug = _find_free(re.sub(r"[^\w.=+-]+", "-", variant.name).strip("-.")[:80] or "case", folders, "-{}")
+        job = build_job(variant.choice, is_trusted=is_trusted)
+        checks = tuple(PlannedCheck(check.name, check.requirements) for check in job.sequence.checks)
+        seconds = 300.0 + 10.0 * job.sequence.duration if variant.timeout is None else variant.timeout
+        cases.append(Case(name, Path(slug), variant.choice, seconds, checks, variant.requirement))
+    return Suite(title, cases, requirements, source)
+
+
+def _find_free(name: str, taken: set[str], pattern: str) -> str:
+    """The name, with a number from 2 if it is taken; whether letters are capitals makes no difference."""
+    free = next(each for number in itertools.count(1)
+                if (each := name if number == 1 else name + pattern.format(number)).lower() not in taken)
+    taken.add(free.lower())
+    return free
+
+
+def _find_beside(folder: Path, name: str) -> str:
+    """A file beside the suite file; a name without suffix is that of a shipped sequence or model."""
+    return str(folder / name) if Path(name).suffix == ".toml" else name
+
+
+def _as_tuple(value: object) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _show(value: Value) -> str:
+    return f"{value:g}" if isinstance(value, float) else value
+
+
+NO_VERDICT = ("ERROR", "NOT_RUN")  # cases without a run that was judged
+
+
+class PlannedCheck(NamedTuple):
+    """A check of the sequence of a case, as it is known before the run."""
+
+    name: str
+    requirement: tuple[str, ...]
+
+
+class Case(NamedTuple):
+    """One run of a suite."""
+
+    name: str  # unique in the suite
+    folder: Path  # of its results
+    choice: JobChoice
+    timeout: float  # s of wall-clock time
+    checks: tuple[PlannedCheck, ...] = ()
+    requirement: tuple[str, ...] = ()  # that the run as a whole verifies
+
+
+class CaseResult(NamedTuple):
+    """What came out of a case. `verdict` is that of the run, or ERROR (crash, timeout, bad input), or NOT_RUN."""
+
+    case: Case
+    verdict: str
+    why: str = ""
+    seconds: float = 0.0  # wall-clock time
+    checks: tuple[CheckResult, ...] = ()
+    differences: str = "nothing"  # from the nominal test
+    fdi: Mapping[str, Any] = {}  # answer of `rig fdi`, if the case asked for it
+
+    @property
+    def failed(self) -> list[CheckResult]:
+        """The checks that did not pass."""
+        return [check for check in self.checks if not check.passed]
+
+    @property
+    def reason(self) -> str:
+        """Why the case did not pass, in a few words: the first check that failed and the number of the others.
+
+        A fault of the servovalve is named beside them. So is a diagnosis that leaves the level of a fault open.
+        """
+        if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
+            return "rig fdi cannot tell"
+        failed = self.failed
+        if self.verdict != "FAIL" or (len(failed) < 2 and not self.has_fault):
+            return self.why
+        more = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
+        checks = [f"{failed[0].name}{more}"] if failed else []
+        return "; ".join([*checks, describe_finding(self.fdi)] if self.has_fault else checks)
+
+    @property
+    def has_fault(self) -> bool:
+        """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+        return has_fault(self.fdi)
+
+
+def find_status(results: Sequence[CaseResult], *, is_interrupted: bool) -> int:
+    """The exit status of a suite: 130 interrupted, 1 if a case did not pass, 3 if the timing of one is invalid, 0."""
+    verdicts = {result.verdict for result in results}
+    if is_interrupted:
+        return 130
+    if verdicts & {"FAIL", "ABORTED", *NO_VERDICT}:
+        return 1
+    return 3 if "INVALID_TIMING" in verdicts else 0
+
+
+def find_verdict(results: Sequence[CaseResult]) -> str:
+    """The worst verdict of the cases: that of the suite."""
+    order = ("ERROR", "FAIL", "ABORTED", "NOT_RUN", "INVALID_TIMING", "NOT_JUDGED")
+    verdicts = {result.verdict for result in results}
+    return next((word for word in order if word in verdicts), "PASS")
+
+
+def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult], None],
+              patience: float = 5.0) -> tuple[list[CaseResult], bool]:
+    """Run all cases.
+
+    Args:
+        cases: what to run; each has been tried (`build_suite`).
+        processes: how many run at a time.
+        show: called with each result as it comes.
+        patience: s that a run that is broken off has to come to rest and close its log.
+
+    Returns:
+        The results in the order of the cases, and whether Ctrl-C has interrupted them: then some are NOT_RUN.
+
+    Raises:
+        RigError: a worker process cannot start.
+    """
+    found: dict[str, CaseResult] = {}
+    is_interrupted = False
+    finished = run_in_processes(play_case, cases, processes, _describe_failure, attempts=1, choose_limit=_choose_limit,
+                                patience=patience)
+    with contextlib.closing(finished):  # type: ignore[type-var]  # a generator
+        try:
+            for case, result in finished:
+                found[case.name] = result
+                show(result)
+        except KeyboardInterrupt:
+            is_interrupted = True
+    missing = "the suite was interrupted before it had finished"
+    return [found.get(case.name) or CaseResult(case, "NOT_RUN", missing) for case in cases], is_interrupted
+
+
+def _choose_limit(case: Case) -> float:
+    return case.timeout
+
+
+def _describe_failure(case: Case, reason: str) -> CaseResult:
+    return CaseResult(case, "ERROR", reason)
+
+
+def play_case(case: Case) -> CaseResult:
+    """Run a case and write its page. Errors are part of the result; an internal one is written to error.txt."""
+    clock = WallClock()
+    try:
+        with catch_termination(case.choice.bus) as is_to_stop:
+            job = build_job(case.choice, is_trusted=True, announce=_ignore)  # the code was announced when it was tried
+            diagnose = partial(diagnose_servovalve, progress=_make_progress(is_to_stop), workers=1)
+            outcome = run_job(job, case.folder, ignore_progress, is_to_stop,
+                              diagnose=diagnose if case.choice.is_diagnosed else None)
+            write_run_page(case.folder / "trace.mcap", case.folder / "report.html")
+    except RigError as error:
+        return CaseResult(case, "ERROR", str(error), 1e-9 * clock.now())
+    except Exception as error:
+        case.folder.mkdir(parents=True, exist_ok=True)
+        (case.folder / "error.txt").write_text(traceback.format_exc())
+        text = f"internal error, {type(error).__name__}: {error} ({case.folder}/error.txt)"
+        return CaseResult(case, "ERROR", text, 1e-9 * clock.now())
+    return make_result(case, outcome, 1e-9 * clock.now())
+
+
+def _make_progress(is_to_stop: Callable[[], bool]) -> Progress:
+    """The progress of a diagnosis, which follows the run: it ends the process if the case is to stop."""
+    def end_if_asked(stage: str, share: float) -> None:
+        if is_to_stop():
+            raise SystemExit(128 + signal.SIGTERM)
+
+    return end_if_asked
+
+
+def make_result(case: Case, outcome: Outcome, seconds: float) -> CaseResult:
+    """The result of a case from the outcome of its run, which took `seconds`."""
+    return CaseResult(case, outcome.verdict, outcome.why, seconds, tuple(outcome.checks),
+                      find_differences(outcome.job).describe(), outcome.fdi)
+
+
+@contextlib.contextmanager
+def catch_termination(bus: str, patience: float = 1.0) -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether the run is to stop: whether this process was sent SIGTERM.
+
+    On the embedded bus there is nothing to bring to rest. There the process ends `patience` s after the signal if the
+    run has not stopped by then, for it may be in a user's function that does not return; the log is closed.
+    """
+    is_asked = False
+    is_embedded = bus.partition(":")[0] in EMBEDDED_NAMES
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal is_asked
+        is_asked = True
+        if is_embedded:
+            signal.setitimer(signal.ITIMER_REAL, patience, 0.5)  # repeated: an exception may be lost in a callback
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, ask), signal.SIGALRM: signal.signal(signal.SIGALRM, end)}
+    try:
+        yield lambda: is_asked
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _ignore(text: str) -> None:
+    """Announce nothing."""

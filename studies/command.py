@@ -1,0 +1,58 @@
+"""What the commands `python -m studies.NAME` share: options, progress on standard error, the answer."""
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from fdi.report.json import to_json
+from fdi.report.report import Report
+from plant.errors import RigError
+from rig.campaign.batch import BatchProgress
+from rig.cli.answer import choose_file, show_answer
+from rig.cli.options import parse_whole_number
+
+
+def run_study_command(name: str, text: str | None, arguments: Sequence[str] | None,
+                      add_options: Callable[[argparse.ArgumentParser], None],
+                      run: Callable[[argparse.Namespace], tuple[Report, bool]]) -> int:
+    """Parse the options, run the study, show its report; exit status 0 if it met its aims, 1 if not, 2 for bad input.
+
+    Args:
+        name: the module, "studies.peers".
+        text: its docstring; the first line is the description.
+        arguments: the words of the command line; None for those of the process.
+        add_options: adds the study's own options to --seed, --json, --quiet and --out FILE.json.
+        run: from the options to the report and whether the study met its aims.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=(text or "").splitlines()[0])
+    add_options(parser)
+    parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed (default 0)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object on standard output, nothing else")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--out", metavar="FILE.json", help="also write the JSON there")
+    args = parser.parse_args(arguments)
+    try:
+        out = choose_file(args.out, (".json",), None)
+        report, is_met = run(args)
+        if out is not None:
+            out.write_text(to_json(report.data) + "\n", encoding="utf-8")
+        show_answer(report, args)
+    except RigError as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.status
+    return 0 if is_met else 1
+
+
+def report_progress(stage: str, share: float) -> None:
+    """A line on standard error for each tenth of a stage."""
+    done = (stage, round(10 * share))
+    if report_progress.__dict__.get("last") != done:
+        report_progress.__dict__["last"] = done
+        print(f"{stage}: {100 * share:.0f} %" if share else stage, file=sys.stderr, flush=True)
+
+
+def make_row_progress(describe: Callable[[BatchProgress], str]) -> Callable[[Any], None]:
+    """A progress function of a batch that prints a line for each finished row on standard error."""
+    return lambda progress: print(describe(progress), file=sys.stderr, flush=True)

@@ -1,0 +1,186 @@
+"""How right is `rig fdi --with-effects`? Valve faults are hidden beside each other effect of the catalogue.
+
+The units are those of the trial's simulator, with scatter, coloured noise and hum. Each has one of the states of
+`VALVES` and one other effect at a typical size, the middle of its logarithmic range:
+
+    python -m studies.faults_beside_effects --out beside --most 40
+
+The folder holds beside.jsonl, one row for each finished case; an interrupted study resumes there. Cases come in a
+random order, so that the first ones are a fair sample of all.
+"""
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdi.diagnosis.diagnosis import diagnose
+from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Level, classify_size
+from fdi.estimation.binomial import measure_share
+from fdi.sources import hash_sources
+from fdi.trace.trace import Trace
+from plant.model import load_model
+from plant.threads import count_threads
+from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch
+from rig.campaign.row_file import Row, RowFile
+from studies.hidden_effects import cases, hidden
+from studies.hidden_effects.hidden import Hidden
+from studies.hidden_effects.truth import nominal_symbols
+
+VALVES: tuple[Mapping[str, float], ...] = (
+    {}, {CLOGGING.name: 0.25}, {CLOGGING.name: 0.35}, {FRICTION.name: 35.0}, {FRICTION.name: 70.0})
+"""Faults of the valve, by effect: none, and each at MidBand and MaxBand."""
+OTHERS = ("none", *(name for name in hidden.CATALOGUE if name not in (CLOGGING.name, FRICTION.name)))
+"""What is wrong beside them."""
+FIRST_SEED = 8600
+SIGNALS = ("xj", "p12", "xs")
+
+
+class Job(NamedTuple):
+    """One case of the study."""
+
+    number: int
+    seed: int
+    valve: Mapping[str, float]
+    other: str
+
+
+def list_jobs(repeats: int = 1, first_seed: int = FIRST_SEED) -> list[Job]:
+    """Every state of the valve beside every other effect, in a random order; each case uses the next seed."""
+    plan = [(valve, other) for _ in range(repeats) for valve in VALVES for other in OTHERS]
+    order = np.random.default_rng(first_seed).permutation(len(plan)).tolist()
+    return [Job(number, first_seed + number, *plan[place]) for number, place in enumerate(order)]
+
+
+def run_study(jobs: Sequence[Job], folder: Path, report_progress: Callable[[BatchProgress], None] = lambda _: None,
+              signals: Sequence[str] = SIGNALS) -> list[Row]:
+    """The rows of the jobs.
+
+    Raises:
+        InputError: no C compiler, or the folder cannot be made.
+    """
+    sources = hash_sources("plant", "fdi", "studies/hidden_effects", "studies/faults_beside_effects.py")
+
+    def describe_failure(job: Job, reason: str) -> Row:
+        return {"case": job.number, "verdict": "CRASHED", "error": reason, "sources": sources}
+
+    batch = Batch({job.number: job for job in jobs}, partial(judge_job, signals=signals, sources=sources), "case",
+                  describe_failure, lambda row: bool(row["sources"] == sources),
+                  lambda row: bool(row["verdict"] == "CRASHED"))
+    with RowFile(folder / "beside.jsonl") as file:
+        return list(run_batch(batch, file, Workers(1), report_progress).values())
+
+
+def make_case(job: Job) -> cases.Case:
+    """The unit of a job: bench-level scatter and noise, the faults, the other effect at a typical size."""
+    healthy = cases.sample_case(job.seed, kind="nothing", level="bench")
+    symbols, effects = nominal_symbols() | healthy.plant, []
+    for name, size in job.valve.items():
+        changes = hidden.CATALOGUE[name].apply(size, symbols)
+        effects.append(Hidden(name, size, changes, size, 0.0))
+        symbols |= changes
+    if job.other != "none":
+        effects.append(hidden.sample_hidden_effect(job.other, symbols, np.random.default_rng([job.seed, 17]), 0.5, 0.5))
+    load = max((effect.known_load for effect in effects), default=0.0)
+    return healthy._replace(kind="two", effects=tuple(effects), load=load)
+
+
+def record_case(job: Job, signals: Sequence[str] = SIGNALS) -> Trace:
+    """The recording of a job's unit."""
+    run = cases.measure_case(make_case(job), "est").trace
+    columns = {name: getattr(run, name) for name in ("com", "cor", "load", "xj", *signals)}
+    return Trace.from_columns(columns, 1e-3, {"source": f"case {job.number}"})
+
+
+def judge_job(job: Job, signals: Sequence[str], sources: str) -> Row:
+    """Record the unit and diagnose it with the search for other effects."""
+    found = diagnose(record_case(job, signals), load_model(), workers=count_threads(), with_effects=True)
+    assert found.beside is not None
+    row: Row = {"case": job.number, "seed": job.seed, "valve": dict(job.valve), "other": job.other, "sources": sources,
+                "verdict": found.verdict, "effects": list(found.beside.effects), "others": sorted(found.others),
+                "explanations": [[list(e.effects), e.weight] for e in found.beside.explanations],
+                "ratio": max(found.refinement.ratio.values())}
+    for fault in FAULTS:
+        size, level = found.sizes[fault.name], found.levels[fault.name]
+        row[fault.symbol] = [size.value, size.low, size.high]
+        row[f"level_{fault.symbol}"] = "cannot_tell" if level is None else level.word
+    return row
+
+
+class Score(NamedTuple):
+    """What counts in one case."""
+
+    is_right: bool  # the level of the fault that is there; without one, both levels
+    is_healthy_blamed: bool  # a fault that is not there has a level beyond acceptable
+    inside: tuple[bool, bool]  # whether the intervals of Kintas and FSS hold the true size
+
+
+def score_row(row: Mapping[str, Any]) -> Score:
+    """A row against the truth."""
+    true = {f.name: row["valve"].get(f.name, f.healthy) for f in FAULTS}
+    levels = {f.name: row[f"level_{f.symbol}"] for f in FAULTS}
+    wanted = {f.name: classify_size(f, true[f.name]).word for f in FAULTS}
+    judged = list(row["valve"]) or [f.name for f in FAULTS]
+    healthy = [f.name for f in FAULTS if f.name not in row["valve"]]
+    blamed = any(levels[name] not in (Level.ACCEPTABLE.word, "cannot_tell") for name in healthy)
+    inside = tuple(row[f.symbol][1] <= true[f.name] <= row[f.symbol][2] for f in FAULTS)
+    return Score(all(levels[name] == wanted[name] for name in judged), blamed, (inside[0], inside[1]))
+
+
+def name_valve(valve: Mapping[str, float]) -> str:
+    """The state of a valve, in words.
+
+    >>> name_valve({}), name_valve({"spool_friction": 35.0})
+    ('no fault', 'FSS 35 N')
+    """
+    words = {CLOGGING.name: "Kintas {:g}", FRICTION.name: "FSS {:g} N"}
+    return ", ".join(words[name].format(size) for name, size in valve.items()) or "no fault"
+
+
+def format_table(rows: Iterable[Row]) -> str:
+    """Counts in Markdown: a line for each state of the valve, and one for all."""
+    rows = [row for row in rows if row["verdict"] != "CRASHED"]
+    lines = ["| valve | cases | level right | absent fault reported | SOMETHING_ELSE | Kintas inside | FSS inside |",
+             "|---|---|---|---|---|---|---|"]
+    groups = [(name_valve(valve), [row for row in rows if row["valve"] == dict(valve)]) for valve in VALVES]
+    for name, own in [*groups, ("all", rows)]:
+        scores = [score_row(row) for row in own]
+        counts = [sum(s.is_right for s in scores), sum(s.is_healthy_blamed for s in scores),
+                  sum(row["verdict"] == "SOMETHING_ELSE" for row in own), *(sum(s.inside[k] for s in scores)
+                                                                           for k in (0, 1))]
+        lines.append(f"| {name} | {len(own)} | " + " | ".join(f"{n} of {len(own)}" for n in counts) + " |")
+    if rows:
+        right = measure_share(sum(score_row(row).is_right for row in rows), len(rows))
+        lines += ["", f"Level right: {100 * right.value:.0f} % ({100 * right.low:.0f} .. {100 * right.high:.0f})."]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study and print its table; see --help."""
+    parser = argparse.ArgumentParser(prog="python -m studies.faults_beside_effects",
+                                     description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder of the rows")
+    parser.add_argument("--most", type=int, default=None, help="only the first so many cases")
+    parser.add_argument("--repeats", type=int, default=1, help="units of each kind")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="of the first case")
+    parser.add_argument("--signals", default=",".join(SIGNALS), help="what is measured (default: xj,p12,xs)")
+    given = parser.parse_args(arguments)
+
+    def show(progress: BatchProgress) -> None:
+        row = progress.row
+        print(f"{progress.done} of {progress.total}: {name_valve(row.get('valve', {}))}, {row.get('other')}: "
+              f"{row['verdict']} {' '.join(row.get('effects', ()))}", flush=True)
+
+    jobs = list_jobs(given.repeats, given.seed)[:given.most]
+    print(f"process {os.getpid()}", flush=True)
+    print(format_table(run_study(jobs, given.out, show, given.signals.split(","))))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

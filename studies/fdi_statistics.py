@@ -1,0 +1,87 @@
+"""Write the tables of a campaign into fdi_statistics.md, and its figure: python studies/fdi_statistics.py FOLDER ..
+
+The first campaign gives all tables, further ones their rates only.
+"""
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdi.diagnosis.faults import FAULTS
+from rig.campaign.folder import read_campaign_rows, read_matrix_of_folder
+from rig.campaign.report import draw_detection_curves, format_requirement, format_share
+from rig.campaign.summary import name_size, summarise_campaign
+
+PAGE = Path(__file__).parent.parent / "docs" / "fdi_statistics.md"
+MET = {None: "", True: "met", False: "**not met**"}
+BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
+
+
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines) + "\n"
+
+
+def format_rates(found: Sequence[Mapping[str, Any]]) -> str:
+    """The required rates as a table."""
+    return format_table(("", "count", "share", "95 % interval", "required", ""),
+                        [(r["name"].strip(), *format_share(r["share"]),
+                          format_requirement(100 * r["least"], 100 * r["most"]), MET[r["met"]])
+                         for r in found if r["share"]["of"]])
+
+
+def format_tolerance(figures: Mapping[str, Any]) -> str:
+    """All tables of the cases with one tolerance."""
+    out = f"## Plants with {100 * figures['tolerance']:g} % scatter: {figures['cases']} cases\n\n"
+    out += format_rates(figures["rates"])
+    for fault in FAULTS:
+        points = figures["curves"][fault.name]
+        if len(points) > 1:
+            out += format_table((name_size(fault), "maintenance or worse", "share", "95 % interval", "non-nominal",
+                                 "ruling", "by the bands alone"),
+                                [(f"{p['size']:g}", *format_share(p["detected"]),
+                                  *(format_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
+    for fault in FAULTS:
+        counts = figures["levels"][fault.name]
+        said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
+        out += format_table((f"{name_size(fault)}: true level, reported", *said),
+                     [(name, *(str(row[word]) for word in said)) for name, row in counts.items() if any(row.values())])
+    said = sorted({word for row in figures["ruling"].values() for word in row})
+    out += format_table(("ruling fault: truth, reported", *said),
+                 [(name, *(str(row.get(word, 0)) for word in said)) for name, row in figures["ruling"].items()])
+    return out + format_table(
+        ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
+        [(e["label"], name_size(next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),
+          *(f"{e[key]:.2g}" for key in ("bias", "rms", "most")), *format_share(e["covered"])[1:])
+         for e in figures["errors"]])
+
+
+def format_other_campaign(folder: str) -> str:
+    """The required rates of a further campaign."""
+    figures = summarise_campaign(read_campaign_rows(folder))
+    out = f"## Truth by the {read_matrix_of_folder(folder).spec['simulator']} simulator: {figures['cases']} cases\n\n"
+    return out + "".join(f"{100 * of['tolerance']:g} % scatter, {of['cases']} cases\n\n{format_rates(of['rates'])}"
+                         for of in reversed(figures["tolerances"]))
+
+
+def main(folder: str, *others: str) -> None:
+    """Write the page and its figure."""
+    figures = summarise_campaign(read_campaign_rows(folder))
+    took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
+    times = f"{took['median']:.1f} s (median), {took['p95']:.1f} s (95th percentile), {took['most']:.1f} s (longest)"
+    text = f"{figures['cases']} cases: {status}. Time per trace on one core, beside other work: {times}.\n\n"
+    text += "".join(format_tolerance(of) for of in reversed(figures["tolerances"]))
+    text += "".join(map(format_other_campaign, others))
+    for reason in figures["reasons"]:
+        text += f"{reason['status']}: {reason['case']}, seed {reason['seed']}: {reason['reason']}\n\n"
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    PAGE.write_text(before + BEGIN + "\n" + text + END + rest.partition(END)[2], encoding="utf-8")
+    curves = max(figures["tolerances"], key=lambda of: sum(map(len, of["curves"].values())))
+    PAGE.with_suffix(".svg").write_text(draw_detection_curves(curves), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,68 @@
+"""What both comparisons share: compilers, optional libraries, and rivals measured in alternating rounds."""
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.stopwatch import GET_GCC, find_gcc, measure_durations
+
+Array = NDArray[np.float64]
+Replay = Callable[[], Array]
+"""A rival's runs; each call makes all of them and returns their results."""
+
+GET_EXTRA = "pip install 'eha-rig[bench]'"
+
+
+class Rival(NamedTuple):
+    """One way to make many runs, and how fast it is."""
+
+    name: str
+    speed: float | None  # steps of a run per second; None if it could not be measured
+    ratio: float | None  # speed of this software over that of the rival; median over the rounds
+    difference: float | None  # m, largest difference of its positions from those of this software
+    note: str
+
+
+class Race(NamedTuple):
+    """Rivals measured against one of them, which is this software."""
+
+    rivals: list[Rival]
+    reference: Array  # results of this software
+    speed: float  # of this software, steps of a run per second
+
+
+def race_rivals(replays: Mapping[str, Replay], reference: str, steps: int, rounds: int,
+                difference: Callable[[Array, Array], float]) -> Race:
+    """Measure rivals in alternating rounds.
+
+    Args:
+        replays: the rivals by name.
+        reference: the name of the one that is this software.
+        steps: steps of a run in all runs of one call.
+        rounds: how often each is called.
+        difference: the difference of a rival's results from those of the reference, m.
+    """
+    results = {name: replay().copy() for name, replay in replays.items()}
+    seconds = measure_durations(replays, rounds)
+    rivals = [Rival(name, float(steps / np.median(taken)), float(np.median(taken / seconds[reference])),
+                    difference(results[name], results[reference]), "") for name, taken in seconds.items()]
+    return Race(rivals, results[reference], steps / float(np.median(seconds[reference])))
+
+
+def skip_rival(name: str, reason: str) -> Rival:
+    """A rival that could not be measured."""
+    return Rival(name, None, None, None, f"skipped, {reason}")
+
+
+def explain_missing_gcc() -> str:
+    """Why the rivals in C cannot be measured; "" if gcc is installed."""
+    return "" if find_gcc() else f"gcc is not installed; to get it: {GET_GCC}"
+
+
+def explain_missing(module: str) -> str:
+    """Why a rival from the extra `bench` cannot be measured; "" if it is installed."""
+    return "" if importlib.util.find_spec(module) else f"{module} is not installed; to get it: {GET_EXTRA}"

@@ -1,0 +1,335 @@
+"""rig campaign: the same rows by one process, by a cluster that loses a worker, and after a kill."""
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from places import SUPPORT
+from rig_command import finished, grown, rig, started
+
+from fdi.trace.trace import Trace
+from plant import InputError, Model
+from plant.effects import CATALOGUE
+from rig.campaign import batch, folder, matrix, units
+from rig.campaign import judge as cases
+from rig.campaign import summary as campaign_summary
+from rig.campaign.batch import BatchProgress, Workers, run_jobs
+from rig.campaign.judge import plan_batch, run_campaign
+from studies.hidden_effects.truth import SYMBOLS, has_compiler
+
+pytest.importorskip("distributed", reason="the extra fleet is not installed")
+pytest.importorskip("pyarrow", reason="the extra fleet is not installed")
+MATRIX = ("--fault", "healthy", "--fault", "filter_clogging=0.2,0.9", "--fault", "spool_friction=30/jack_friction=1600",
+          "--seeds", 2, "--work", "campaign_work:judge_quickly")
+TAKES = ("seconds",)  # what may differ between two runs
+
+
+def rows(where: Path) -> list[dict[str, Any]]:
+    return [{key: value for key, value in row.items() if key not in TAKES} for row in folder.read_campaign_rows(where)]
+
+
+def calls(path: Path) -> list[tuple[int, str]]:
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [(int(line.split(" ", 1)[0]), line.split(" ", 1)[1]) for line in lines]
+
+
+@pytest.fixture
+def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """For processes: where the judgement is found, and the file in which it leaves its marks."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("CAMPAIGN_CALLS", str(tmp_path / "calls"))
+    return tmp_path / "calls"
+
+
+@pytest.fixture
+def gate(environment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that holds up every case while it is there."""
+    monkeypatch.setenv("CAMPAIGN_GATE", str(tmp_path / "gate"))
+    (tmp_path / "gate").touch()
+    return tmp_path / "gate"
+
+
+def wait_for(holds: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 600.0) -> None:
+    """Wait until something holds that `process` brings about; the limit only ends a test that hangs."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished campaign of eight cases, by this process."""
+    where = tmp_path_factory.mktemp("campaign") / "local"
+    model = Model()
+    whole = matrix.build_matrix({"seeds": 2, "case": matrix.parse_faults(MATRIX[1:6:2])}, model, MATRIX[-1], "test")
+    run_campaign(whole, where, Workers())
+    return where
+
+
+@pytest.fixture
+def cluster(gate: Path, tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """The address of a Dask scheduler with two worker processes, over TCP."""
+    def start(program: str, *words: object) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *map(str, words)]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=tmp_path)
+
+    where, note = "tcp://127.0.0.1", tmp_path / "scheduler.json"
+    processes = [start("scheduler", "--host", where, "--port", 0, "--dashboard-address", "127.0.0.1:0",
+                       "--scheduler-file", note)]
+    processes += [start("worker", "--scheduler-file", note, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--host",
+                        where) for _ in range(2)]
+    grown(note, 10)
+    yield json.loads(note.read_text())["address"], processes
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
+        cluster: tuple[str, list[subprocess.Popen[bytes]]], environment: Path, gate: Path, local: Path,
+        tmp_path: Path) -> None:
+    address, processes = cluster
+    there = tmp_path / "there"
+    process = started("campaign", *MATRIX, "--out", there, "--scheduler", address, "--quiet")
+    wait_for(lambda: len({pid for pid, _ in calls(environment)}) == 2, process)
+    victim, at_work = calls(environment)[-1]  # in the middle of a case, for the gate holds it up
+    assert victim in [worker.pid for worker in processes[1:]]
+    os.kill(victim, signal.SIGKILL)
+    gate.unlink()
+    assert finished(process).status == 1  # one case fails
+    assert rows(there) == rows(local) == rows(there / folder.RESULTS)
+    did = calls(environment)
+    assert Counter(source for _, source in did)[at_work] == 2 and len({pid for pid, _ in did}) >= 2
+
+
+def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
+        environment: Path, gate: Path, local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMPAIGN_FREE", "3")
+    there, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
+    process = started("campaign", *MATRIX, *few, "--out", there)
+    wait_for(lambda: len(calls(environment)) == 4 and (there / folder.ROWS).read_bytes().count(b"\n") == 3, process)
+    process.kill()
+    process.wait()
+    gate.unlink()
+    done = rows(there)
+    assert len(done) == 3
+    with (there / folder.ROWS).open("a") as out:
+        out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
+    said = rig("campaign", there, *few, *MATRIX[-2:], "--json")
+    assert (said.status, said.json["cases"]) == (0, 6)
+    assert rows(there) == rows(local)[:6] and rows(there / folder.RESULTS) == rows(there)
+    again = Counter(source for _, source in calls(environment))
+    assert len(again) == 6 and sum(again.values()) <= 7  # the one that the kill interrupted may have begun twice
+    for row in done:
+        assert again[f"{row['label']} {row['seed']}"] == 1
+
+
+class KilledWorker(Exception):
+    """As Dask raises it."""
+
+
+class Dead:
+    """The future of a case that kills whoever tries it."""
+
+    status = "error"
+
+    def result(self) -> None:
+        raise KilledWorker("Attempted to run task on 4 different workers")
+
+    def cancelled(self) -> bool:
+        return False
+
+
+def open_gate(gate: Path, environment: Path, workers: int, seconds: float = 600.0) -> None:
+    """Let the cases go on when so many workers have begun one; `seconds` only ends a test that hangs."""
+    end = time.monotonic() + seconds
+    while len({pid for pid, _ in calls(environment)}) < workers and time.monotonic() < end:
+        time.sleep(0.02)
+    gate.unlink()
+
+
+def test_processes_listen_to_no_port_and_give_the_same_rows(environment: Path, gate: Path, local: Path) -> None:
+    import psutil
+
+    threading.Thread(target=open_gate, args=(gate, environment, 2), daemon=True).start()
+    whole = folder.read_matrix_of_folder(local)
+    plan, sockets = plan_batch(whole, cases.hash_campaign_sources(), 4), []
+    found: dict[int, dict[str, Any]] = {}
+    workers = Workers(2, single_threaded=True)
+    for case, row in run_jobs(plan.work, list(plan.jobs.values()), workers, plan.describe_failure):
+        assert row["case"] == case.number
+        found[case.number] = row
+        me = psutil.Process()
+        sockets += [s for p in (me, *me.children(recursive=True)) for s in p.net_connections("inet")]
+    assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
+    kept = [{key: value for key, value in found[i].items() if key not in TAKES} for i in range(4)]
+    assert kept == rows(local)[:4]
+    assert len({pid for pid, _ in calls(environment)} - {os.getpid()}) == 2
+
+
+def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:
+    whole = folder.read_matrix_of_folder(local)
+    plan = plan_batch(whole, cases.hash_campaign_sources())
+    row = batch.take_result(Dead(), whole.cases[3], plan.describe_failure)
+    assert row["reason"] == "KilledWorker: every worker that tried it died" and row["true_fss"] == 30.0
+    assert plan.is_failed(row) and plan.is_valid(row)
+    assert not plan_batch(whole, "", redo_failed=True).is_valid(row)
+
+
+def test_progress_counts_the_cases_and_estimates_the_time_left(local: Path, tmp_path: Path) -> None:
+    seen: list[BatchProgress] = []
+    found = run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append, count=8)
+    assert [(p.done, p.total) for p in seen] == [(i + 1, 8) for i in range(8)]
+    assert seen[-1].left == 0.0 < seen[0].left and seen[-1].failed == 1
+    assert [row["case"] for row in found] == list(range(8))
+    run_campaign(folder.read_matrix_of_folder(local), tmp_path / "there", Workers(), seen.append)
+    assert len(seen) == 8  # nothing was left to do
+
+
+def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
+    failed = [row for row in rows(local) if row["status"] == "failed"]
+    assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
+        ("filter_clogging=0.9", 1, "ZeroDivisionError: nothing left to divide")]
+    assert "rms" not in failed[0] and "rms" in rows(local)[0]
+    copy, seen = shutil.copytree(local, tmp_path / "copy"), list[BatchProgress]()
+    whole = folder.read_matrix_of_folder(copy)
+    assert len(run_campaign(whole, copy, Workers(), seen.append)) == 8 and seen == []
+    again = run_campaign(whole, copy, Workers(), seen.append, redo_failed=True)
+    assert [p.row["label"] for p in seen] == ["filter_clogging=0.9"] and seen[0].done == 8
+    assert [row["case"] for row in again] == list(range(8)) and rows(copy) == rows(local)
+
+
+def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tmp_path: Path) -> None:
+    said = rig("campaign", *MATRIX, "--seeds", 4, "--out", local)
+    assert said.status == 2 and "a folder of this matrix, or a new one; it differs in seeds, case" in said.err
+    (tmp_path / "notes.txt").write_text("mine")
+    assert "an empty folder" in rig("campaign", *MATRIX, "--out", tmp_path).err
+    whole, sources = folder.read_matrix_of_folder(local), cases.hash_campaign_sources()
+    with pytest.raises(InputError, match="the code has changed"):
+        folder.CampaignFolder(local, whole, "another")
+    with folder.CampaignFolder(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
+        folder.CampaignFolder(local, whole, sources)
+
+
+@pytest.mark.parametrize(("words", "complaint"), [
+    (("--fault", "spool_frction=3"), "an effect of the catalogue; did you mean spool_friction?"),
+    (("--fault", "filter_clogging=1.5"), "filter_clogging: expected a number"),
+    (("--fault", "filter_clogging"), "--fault: filter_clogging: expected healthy"),
+    (("--fault", "healthy", "--tolerance", "0.5"), "tolerance: expected a number from 0 to 0.2"),
+    (("--fault", "healthy", "--seeds", "0"), "seeds: expected a whole number from 1"),
+    (("--fault", "healthy", "--model", "ehs"), "--model: ehs: expected eha"),
+    (("--fault", "healthy", "--set", "controller.period=2e-3"), "--set: controller.period: expected 0.001 s"),
+    (("--fault", "healthy", "--jobs", "0"), "--jobs: 0: expected 1 or more"),
+    (("--fault", "healthy", "--work", "nothing:here"), "--work: nothing:here: expected module:function"),
+    (("--fault", "healthy", "--work", ".:x"), "--work: .:x: expected module:function"),
+    (("--fault", "healthy", "--work", "math:pi"), "--work: math:pi: expected module:function"),
+    (("--fault", "healthy", "--scheduler", "tcp://127.0.0.1:1"), "--scheduler: tcp://127.0.0.1:1: expected the addr"),
+    (("--fault", "healthy", "--scheduler", "nowhere"), "--scheduler: nowhere: expected the address"),
+    ((), "expected a matrix file, the shipped matrix statistics, a folder of traces, or --fault EFFECT=SIZE,.."),
+    (("nothing.toml",), "nothing.toml: expected a readable file"),
+])
+def test_bad_input_is_one_line(words: tuple[str, ...], complaint: str, tmp_path: Path,
+                               monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "connect_to_cluster", partial(batch.connect_to_cluster, timeout=0.5))
+    said = rig("campaign", *words, "--out", tmp_path / "x", *(() if "--work" in words else MATRIX[-2:]))
+    assert (said.status, said.err.count("\n")) == (2, 1) and complaint in said.err
+
+
+def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_sample(tmp_path: Path) -> None:
+    text = '''
+        seeds = 2
+        [[case]]
+        seeds = 8
+        [[case]]
+        filter_clogging = [0.1, 0.2]
+        spool_friction = 45.0
+        tolerance = [0.0, 0.02]'''
+    (tmp_path / "m.toml").write_text(text)
+    found = matrix.build_matrix(matrix.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
+    assert Counter(c.label for c in found.cases) == {
+        "healthy": 8, "filter_clogging=0.1 spool_friction=45": 4, "filter_clogging=0.2 spool_friction=45": 4}
+    assert [c.number for c in found.cases] == list(range(16)) and len(set(map(str, found.cases))) == 16
+    assert {c.tolerance for c in found.cases if c.sizes} == {0.0, 0.02}
+    assert Counter(c.label for c in found.cases[:8]).most_common()[-1][1] == 2  # half of all: half of each
+    assert matrix.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
+    shipped = matrix.build_matrix(matrix.read_matrix("statistics"), Model(), "fdi", "statistics")
+    labels = Counter(c.label for c in shipped.cases)
+    assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[campaign_summary.OFF_GRID] >= 200
+
+
+def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
+    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
+    case = matrix.Case(5, "spool_friction=45", {"spool_friction": 45.0}, 0.015, 3)
+    first, second = (units.simulate_case(case._replace(number=n), spec, Model()) for n in (5, 99))
+    other = units.simulate_case(case._replace(seed=4), spec, Model())
+    for name in ("xj", "cor", "p12", "xs"):
+        assert (first.column(name) == second.column(name)).all() and (first.column(name) != other.column(name)).any()
+    broken = units.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
+    assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
+    assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
+    chance = [units.sample_random_parts(case._replace(seed=seed), 4000, 0.8, 0.0) for seed in range(60)]
+    assert np.std([scatter[SYMBOLS["GQ"]] for scatter, _ in chance]) == pytest.approx(0.015, rel=0.3)
+    noise = chance[0][1]
+    assert noise.std(0) == pytest.approx(np.ones(4), rel=0.1)
+    assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.8, abs=0.05)
+    alone = units.simulate_case(case, {**spec, "signals": "xj"}, Model())
+    assert set(alone.signals) == {"com", "xj", "cor", "load"}
+
+
+IN_C = "studies.hidden_effects.campaign_simulator:simulate_unit"
+
+
+@pytest.mark.skipif(not has_compiler(), reason="no gcc: the independent simulator cannot be built")
+def test_the_independent_simulator_makes_the_same_unit() -> None:
+    spec = matrix.build_matrix({"case": [{}]}, Model(), "", "x").spec
+    case = matrix.Case(0, "filter_clogging=0.3", {"filter_clogging": 0.3}, 0.015, 3)
+    simulators = (matrix.OWN_SIMULATOR, IN_C)
+    ours, its = (units.simulate_case(case, {**spec, "simulator": name}, Model()) for name in simulators)
+    healthy = units.simulate_case(case._replace(sizes={}), spec, Model())
+    apart = [float(np.sqrt(((x.xj - its.xj) ** 2).mean())) for x in (ours, healthy)]
+    assert apart[0] < 15e-6 and apart[1] > 2 * apart[0]
+    with pytest.raises(InputError, match="an effect with a single size"):
+        units.simulate_case(case._replace(sizes={"moving_mass": 120.0}), {**spec, "simulator": IN_C}, Model())
+
+
+def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tmp_path: Path) -> None:
+    n = 400
+    columns = {name: np.linspace(0.0, 1e-3, n) for name in ("com", "xj", "cor", "p12", "xs", "load")}
+    for name in ("b.csv", "a.csv.gz"):
+        Trace.from_columns(columns, 1e-3, {}).write_csv(tmp_path / name)
+    (tmp_path / "c.csv").write_text("nothing\n1\n")
+    words = ("campaign", tmp_path, "--out", tmp_path / "out", *MATRIX[-2:], "--json", "--jobs", 1)
+    said = rig(*words)
+    assert said.json["status"] == {"ok": 2, "refused": 1} and said.status == 0
+    assert [row["label"] for row in rows(tmp_path / "out")] == ["a.csv.gz", "b.csv", "c.csv"]
+    assert rows(tmp_path / "out")[2]["reason"].startswith(str(tmp_path / "c.csv"))
+    Trace.from_columns(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
+    assert "it differs in files" in rig(*words).err
+
+
+def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(tmp_path: Path) -> None:
+    said = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
+               "--out", tmp_path, "--json", "--jobs", 1)
+    row, = folder.read_campaign_rows(tmp_path)
+    assert row["status"] == "ok" and said.json["cases"] == 1, row["reason"]
+    assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)
+    assert row["kintas_low"] < 0.17 < row["kintas_high"] and row["fss_low"] < 45.0 < row["fss_high"]
+    assert (row["level_spool_friction"], row["ruling"]) == ("maintenance", "spool_friction")
+    assert rig("campaign", tmp_path, "--summary", "--json").json == said.json
+    shown = rig("campaign", tmp_path / folder.RESULTS, "--summary").out
+    assert "off-grid FSS within 2 %" in shown and "1/1" in shown
+    assert json.loads((tmp_path / "summary.json").read_text()) == said.json

@@ -1,0 +1,177 @@
+"""`rig check`: the command of a sequence against the limits of the actuator, and the run it is predicted to make."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_command import rig
+from short_sequences import SHORT, job, play
+
+from fdi.trace.trace import Trace
+from plant import Model, simulate
+from rig.suite.dry_run import find_capabilities, make_dry_run, plan_faults, split_jumps
+from rig.suite.dry_run_report import draw_dry_run
+
+FAR = """
+title = "Far"
+setup = [{ kind = "hold", time = 0.05 }]
+main = [
+  { name = "out", kind = "ramp", to = 0.05, time = 0.15 },
+  { name = "end", kind = "hold", time = 0.1 },
+]
+load = [{ kind = "ramp", to = 4e4, time = 0.2 }]
+checks = [{ name = "steps", kind = "settling_time", window = [0.0, 0.1], band = 2.0, high = 1.0 }]
+guards = [{ name = "far out", signal = "xj", high = 20.0, unit = "mm" }]
+"""
+
+
+def test_a_sequence_within_the_limits(tmp_path: Path) -> None:
+    said = rig("check", "preflight", "--json")
+    answer = said.json
+    assert (said.status, answer["verdict"], answer["problems"]) == (0, "WITHIN_LIMITS", [])
+    assert answer["durations"] == {"setup": 0.5, "main": 13.5, "cleanup": 0.5}
+    largest = {each["name"]: each for each in answer["demands"]}
+    assert (largest["position"]["value"], largest["step"]["value"], largest["step"]["section"]) == (
+        5e-3, 5e-3, "step 5 mm")
+    assert largest["speed"]["section"] == "chirp" and largest["speed"]["value"] == pytest.approx(
+        2 * np.pi * 20 * 1e-3, rel=0.03)
+    assert largest["acceleration"]["value"] == pytest.approx((2 * np.pi * 20) ** 2 * 1e-3, rel=0.03)
+    assert {each["signal"] for each in answer["predicted"]["limits"]} == {"xs", "cor"}  # steps; no reason to refuse it
+    assert answer["not_predicted"] == ["no emergency"]
+
+
+def test_the_prediction_is_that_of_the_run(preflight: Path) -> None:
+    """Predicted without a bus, whose frames round the signals: the checks come out alike."""
+    dry = make_dry_run(job((Path(__file__).parents[3] / "rig" / "sequences" / "preflight.toml").read_text()))
+
+
+    answer = json.loads((preflight / "verdict.json").read_text())
+    measured = {check["name"]: check["value"] for check in answer["checks"]}
+    assert len(dry.checks) == 16
+    for check in dry.checks:
+        assert check.value == pytest.approx(measured[check.name], rel=0.25), check.name
+
+
+def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
+    (tmp_path / "far.toml").write_text(FAR)
+    said = rig("check", tmp_path / "far.toml", "--out", tmp_path / "far.html")
+    assert said.status == 1
+    text = " ".join(said.out.split())
+    for words in ("BEYOND_LIMITS position 50 mm beyond 40 mm (jack.travel) in 'end', t = 0.150 s",
+                  "speed 333.3 mm/s beyond 250 mm/s (no-load speed) in 'out'",
+                  "load 40 kN beyond 30.15 kN (stall force)",
+                  "guard 'far out' violated at t = 0.0", "check 'steps': the command does not step here"):
+        assert words in text, words
+    page = (tmp_path / "far.html").read_text()
+    assert "BEYOND_LIMITS" in page and "<svg" in page and "stall force" in page
+    assert not list(tmp_path.glob("runs")) and not list(tmp_path.glob("*.mcap"))
+
+
+def test_changes_of_the_model_count(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SHORT)
+    assert rig("check", tmp_path / "s.toml").status == 0
+    said = rig("check", tmp_path / "s.toml", "--set", "jack.travel=5e-4", "--json")
+    assert (said.status, said.json["verdict"]) == (1, "BEYOND_LIMITS")
+    assert said.json["problems"][0].startswith("position 1 mm beyond 0.5 mm (jack.travel) in 'step'")
+    assert said.json["differences"] == "jack.travel = 0.0005 m"
+
+
+def test_faults_are_not_predicted(tmp_path: Path) -> None:
+    fault = 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.9, start = 0.0 }]'
+    (tmp_path / "s.toml").write_text(f"{SHORT}\n{fault}\n")
+    said = rig("check", tmp_path / "s.toml")
+    assert said.status == 0 and "the prediction is without the faults of the sequence" in " ".join(said.out.split())
+
+
+FAULTS = """
+faults = [
+  { kind = "parameter", parameter = "filter.clogging", value = 0.9, start = 0.05, end = 0.25, ramp = 0.1 },
+  { name = "some", kind = "lost", frame = "drive", start = 0.1, count = 2, every = 5 },
+  { name = "biased", kind = "offset", signal = "xj", value = 1e-4, start = 0.3, end = 9.0 },
+  { name = "mute", kind = "heartbeat", node = "plant", start = 0.2, end = 0.25 },
+  { kind = "reset", start = 0.125 },
+]
+"""
+
+
+def test_the_faults_of_a_sequence_are_listed_and_drawn(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SHORT + FAULTS)
+    said = rig("check", tmp_path / "s.toml", "--json")
+    listed = {each["name"]: each for each in said.json["faults"]}
+    assert {name: (each["kind"], each["target"], each["t0"], each["t1"]) for name, each in listed.items()} == {
+        "parameter filter.clogging": ("parameter", "filter.clogging", 0.05, 0.25),
+        "some": ("lost", "frame drive", 0.1, 0.106), "biased": ("offset", "sensor xj", 0.3, 0.35),
+        "mute": ("heartbeat", "node plant", 0.2, 0.25), "reset node": ("reset", "node controller", 0.125, 0.126)}
+    assert listed["biased"]["duration"] == pytest.approx(0.05)
+    assert listed["parameter filter.clogging"]["size"] == "0 to 0.900 within 100 ms"
+    said = rig("check", tmp_path / "s.toml", "--out", tmp_path / "s.html")
+    text = " ".join(said.out.split())
+    assert "biased sensor xj 0.300 0.350 100 um" in text and "ends with main at 0.35 s, not at 9 s" in text
+    page = (tmp_path / "s.html").read_text()
+    assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in listed)
+
+
+def test_times_and_frames_of_the_list_are_those_of_the_run(tmp_path: Path) -> None:
+    """The events of a run tell when each fault began and ended."""
+    text = SHORT + FAULTS.replace("{ kind = \"reset\", start = 0.125 },", "")  # which would end the run
+    play(job(text), tmp_path)
+    planned = {each.name: (each.t0, each.t1) for each in plan_faults(job(text))}
+    events = [event for event in Trace.read(tmp_path, all=True).events if event.kind == "fault"]
+    found = {event.text: event.t for event in events}
+    assert len(planned) == 4
+    for name, (t0, t1) in planned.items():
+        assert found[f"{name} begins"] == pytest.approx(t0, abs=2e-3), found
+        assert found[f"{name} ends"] == pytest.approx(t1, abs=2e-3), found
+
+
+@pytest.mark.parametrize(("fault", "line"), [
+    ('kind = "lost", frame = "drive", start = 9.0', "s.toml:14: faults[0].start: expected a time within main's 0.35 s"),
+    ('kind = "lost", frame = "drive", start = 0.3499', "faults[0].start: expected a fault that acts in a cycle"),
+    ('kind = "lost", frame = "drive", start = 0.1, end = 0.1001', "faults[0].end: expected a fault that acts in a cyc"),
+    ('kind = "lost", frame = "drives", start = 0.1', "faults[0].frame: expected 'command', 'drive'"),
+    ('kind = "heartbeat", node = "controller", start = 0.1', "faults[0].node: expected 'plant' or 'rig'"),
+    ('kind = "offset", signal = "xk", value = 1.0, start = 0.1', "faults[0].signal: expected 'p12'"),
+    ('kind = "parameter", parameter = "filter.cloging", value = 0.5, start = 0.1', "faults[0].parameter: expected"),
+    ('kind = "parameter", parameter = "filter.clogging", value = 5.0, start = 0.1', "faults[0].value: expected"),
+    ('kind = "gone", start = 0.1', "faults[0].kind: expected a kind:")])
+def test_impossible_faults_are_one_line(fault: str, line: str, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SHORT + f"faults = [{{ {fault} }}]\n")
+    said = rig("check", tmp_path / "s.toml")
+    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1) and line in said.err, said
+
+
+def test_the_bench_drives_no_other_plant() -> None:
+    said = rig("check", "preflight", "--model", "servo")
+    assert said.status == 2 and said.err.count("\n") == 1 and "--model: servo: expected a model of eha" in said.err
+
+
+def test_the_no_load_speed_is_that_of_the_simulated_ram() -> None:
+    model = Model()
+    xj = simulate(model, np.full(150, 0.035)).xj
+    speed = float(np.diff(xj[60:110]).mean()) * 1000
+    assert speed == pytest.approx(find_capabilities(model)["no-load speed"], rel=0.05)
+
+
+def test_jumps_are_no_speed() -> None:
+    ramp = np.arange(10) * 1e-4
+    command = np.concatenate((ramp, np.full(10, 5e-3), 5e-3 + ramp))
+    speed, jumps = split_jumps(command, [0, 10, 20])
+    assert np.flatnonzero(jumps).tolist() == [10] and jumps[10] == pytest.approx(5e-3 - 9e-4)
+    assert speed.max() == pytest.approx(0.1)
+    speed, jumps = split_jumps(np.arange(30) * 1e-4, [0, 10, 20])  # a line through three sections
+    assert not jumps.any() and np.abs(speed[1:] - 0.1).max() < 1e-9
+
+
+def test_the_picture_has_limits_and_checks() -> None:
+    drawing = draw_dry_run(make_dry_run(job(FAR)))
+    for words in ("position [mm]", "speed [mm/s]", "load [kN]", "current [mA]"):
+        assert words in drawing
+
+
+def test_bad_input_is_one_line() -> None:
+    for words, line in ((("nothing",), "expected a .toml file"), (("preflight", "--out", "x.png"), "FILE.html"),
+                        (("preflight", "--set", "jack.mas=1"), "did you mean mass")):
+        said = rig("check", *words)
+        assert said.status == 2 and said.err.count("\n") == 1 and line in said.err

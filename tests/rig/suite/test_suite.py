@@ -1,0 +1,276 @@
+"""Suites: the matrix, one report, requirements, JUnit; a crash or a timeout of one case costs only that one."""
+from __future__ import annotations
+
+import json
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from junit_schema import read_valid_junit
+from rig_command import Said, finished, rig, started
+from short_sequences import SHORT
+
+from rig.run.job_choice import JobChoice
+from rig.sequences.checks import CheckResult
+from rig.suite.report import Evidence, trace_requirements, write_junit
+from rig.suite.suite import (
+    Case,
+    CaseResult,
+    PlannedCheck,
+    build_suite,
+    find_status,
+    find_verdict,
+    is_suite_file,
+    read_suite_file,
+)
+
+ROOT = Path(__file__).parents[3]
+CODE = """
+import os, time
+
+def crash(window):
+    os.kill(os.getpid(), 9)
+
+def hang(window):
+    open(__file__ + ".hangs", "w").close()
+    while True:
+        time.sleep(0.01)
+
+def fail(window):
+    return window.nothing
+"""
+OWN_CHECK = '{{ name = "own", kind = "python", python = "own.py:{}", high = 1.0, requirement = "R-3" }},'
+SUITE = """
+title = "All kinds"
+requirements = ["R-1", "R-2", "R-9"]
+
+[[case]]
+sequence = "short.toml"
+seed = [1, 2]
+
+[[case]]
+name = "weak"
+sequence = "short.toml"
+set = { "filter.clogging" = 0.9, "jack.mass" = [90.0, 110] }
+requirement = "R-2"
+
+[[case]]
+sequence = ["crash.toml", "fail.toml"]
+
+[[case]]
+sequence = "hang.toml"
+timeout = 1.0
+"""
+
+
+def write_sequences(folder: Path) -> None:
+    requirement = 'requirement = "R-1", high = 30.0'
+    (folder / "short.toml").write_text(SHORT.replace("high = 30.0", requirement))
+    (folder / "own.py").write_text(CODE)
+    for name in ("crash", "hang", "fail"):
+        (folder / f"{name}.toml").write_text(SHORT.replace("checks = [", f"checks = [\n  {OWN_CHECK.format(name)}"))
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
+    """The folder of a suite that ran as a user's command, and what the command said."""
+    folder = tmp_path_factory.mktemp("suite")
+    write_sequences(folder)
+    (folder / "suite.toml").write_text(SUITE)
+    process = started("run", folder / "suite.toml", "--out", folder / "out", "--junit", folder / "out" / "junit.xml",
+                      "--jobs", 2)
+    return folder / "out", finished(process, 120)
+
+
+def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, Said]) -> None:
+    folder, said = suite
+    answer = json.loads((folder / "suite.json").read_text())
+    cases = {case["name"]: case for case in answer["cases"]}
+    assert list(cases) == ["short, seed 1", "short, seed 2", "weak, jack.mass=90", "weak, jack.mass=110", "crash",
+                           "fail", "hang"]
+    verdicts = [case["verdict"] for case in cases.values()]
+    assert verdicts == ["PASS", "PASS", "FAIL", "FAIL", "ERROR", "ERROR", "ERROR"], said
+    assert (said.status, answer["verdict"], answer["jobs"]) == (1, "ERROR", 2)
+    assert cases["crash"]["why"] == "its process was ended by signal 9 (SIGKILL)"
+    assert cases["hang"]["why"] == "it took longer than 1 s"
+    assert re.search(r"own\.py:13: fail: expected .*AttributeError", cases["fail"]["why"])
+    assert cases["weak, jack.mass=90"]["set"] == {"filter.clogging": 0.9, "jack.mass": 90.0}
+    assert "jack.mass = 110 kg" in cases["weak, jack.mass=110"]["differences"]
+    assert [case["seed"] for case in cases.values()] == [1, 2, 0, 0, 0, 0, 0]
+
+
+def test_the_keys_of_the_answer_are_documented(suite: tuple[Path, Said]) -> None:
+    answer = json.loads((suite[0] / "suite.json").read_text())
+    page = (ROOT / "docs" / "json.md").read_text().split("With several sequences or a suite file")[1].split("\n## ")[0]
+    keys = {*answer, *answer["cases"][0], *answer["requirements"][0], *answer["requirements"][0]["checks"][0]}
+    assert keys <= set(re.findall(r"`(\w+)`", page))
+
+
+def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
+    _, said = suite
+    lines = said.out.splitlines()
+    assert lines[0] == "All kinds: 7 cases, 2 at a time"
+    ended = [line.split() for line in lines[1:8]]
+    assert sorted(words[0] for words in ended) == ["ERROR"] * 3 + ["FAIL"] * 2 + ["PASS"] * 2
+    assert {word for words in ended for word in words if word.endswith("/7")} == {f"{n}/7" for n in range(1, 8)}
+    assert lines[8] == "ERROR  5 of 7 cases did not pass: weak, jack.mass=90, weak, jack.mass=110, crash and 2 more."
+    assert "Traceback" not in said.err
+
+
+def test_folders_and_page(suite: tuple[Path, Said]) -> None:
+    folder, _ = suite
+    page = (folder / "suite.html").read_text()
+    links = re.findall(r'<a href="([^"]+)"', page)
+    assert set(links) == {"short-seed-1/report.html", "short-seed-2/report.html", "weak-jack.mass%3D90/report.html",
+                          "weak-jack.mass%3D110/report.html"}
+    for name in ("short-seed-1", "short-seed-2", "weak-jack.mass=90", "weak-jack.mass=110"):
+        assert json.loads((folder / name / "verdict.json").read_text())["verdict"] in ("PASS", "FAIL")
+        assert "R-1" in (folder / name / "report.html").read_text()
+    assert "script" not in page and page.count("http") == 0
+
+
+def test_requirements_are_traced(suite: tuple[Path, Said]) -> None:
+    folder, said = suite
+    answer = json.loads((folder / "suite.json").read_text())
+    traced = {each["id"]: each for each in answer["requirements"]}
+    assert list(traced) == ["R-1", "R-2", "R-9", "R-3"]
+    assert [each["verdict"] for each in traced.values()] == ["FAIL", "FAIL", "NOT_COVERED", "OPEN"]
+    assert [each["check"] for each in traced["R-2"]["checks"]] == ["whole run"] * 2
+    assert {(each["case"], each["verdict"]) for each in traced["R-3"]["checks"]} == {
+        ("crash", "OPEN"), ("fail", "OPEN"), ("hang", "OPEN")}
+    assert "note      no check verifies R-9" in said.out
+
+
+def test_junit_is_valid_and_complete(suite: tuple[Path, Said]) -> None:
+    folder, _ = suite
+    root = read_valid_junit(folder / "junit.xml")
+    suites = {each.get("name"): each for each in root}
+    assert len(suites) == 7
+    assert [each.get("errors") for each in root] == ["0"] * 4 + ["1"] * 3
+    failed = suites["weak, jack.mass=90"].findall("testcase[failure]")
+    assert [case.get("name") for case in failed] == ["overshoot"]
+    assert re.fullmatch(r"measured [\d.]+ %, limits <= 30 %", str(failed[0][0].get("message")))
+    assert "requirement R-1" in str(failed[0].findtext("system-out"))
+    values = [each.get("value") for each in suites["weak, jack.mass=90"].findall("properties/property")]
+    assert "R-1: overshoot" in values and "R-2: whole run" in values
+
+
+def test_several_sequences_on_the_command_line(tmp_path: Path) -> None:
+    write_sequences(tmp_path)
+    said = rig("run", tmp_path / "short.toml", tmp_path / "short.toml", "--seed", 3, "--json", "--jobs", 1,
+               "--out", tmp_path / "out")
+    assert said.status == 0, said.err
+    assert [(case["name"], Path(case["folder"]).name, case["seed"]) for case in said.json["cases"]] == [
+        ("short", "short", 3), ("short (2)", "short-2", 3)]
+    a, b = (case["checks"] for case in said.json["cases"])
+    assert a == b
+
+
+def test_junit_of_one_sequence(tmp_path: Path) -> None:
+    write_sequences(tmp_path)
+    assert rig("run", tmp_path / "short.toml", "--out", tmp_path, "--junit", tmp_path / "j.xml", "--quiet").status == 0
+    root = read_valid_junit(tmp_path / "j.xml")
+    names = [case.get("name") for case in root[0].findall("testcase")]
+    assert names[:3] == ["run", "overshoot", "no emergency"] and "R-1: overshoot" in [
+        each.get("value") for each in root[0].findall("properties/property")]
+
+
+@pytest.mark.parametrize(("old", "new", "line"), [
+    ('sequence = "short.toml"\nseed', 'sequence = "shirt.toml"\nseed', r"suite\.toml:6: case\[0\]\.sequence: .*shirt"),
+    ("seed = [1, 2]", "seed = [1, -2]", r"suite\.toml:7: case\[0\]\.seed: expected whole numbers from 0"),
+    ("seed = [1, 2]", "seed = []", r"suite\.toml:7: case\[0\]\.seed: expected at least one"),
+    ("seed = [1, 2]", "seeds = [1, 2]", r"suite\.toml:7: case\[0\]\.seeds: expected a key: .*'seed'\?"),
+    ('"jack.mass" = [90.0, 110]', '"jack.mas" = 90', r"jack\.mas: expected"),
+    ('"jack.mass" = [90.0, 110]', '"jack.mass" = [90, -1]', r"jack\.mass: expected .*-1"),
+    ("timeout = 1.0", "timeout = 0", r"suite\.toml:\d+: case\[3\]\.timeout: expected above 0 s"),
+    ("timeout = 1.0", 'model = "none.toml"', r"none\.toml"),
+    ('title = "All kinds"', "", r"suite\.toml: expected also the key 'title'"),
+])
+def test_bad_input_is_one_line_before_anything_runs(tmp_path: Path, old: str, new: str, line: str) -> None:
+    write_sequences(tmp_path)
+    assert old in SUITE
+    (tmp_path / "suite.toml").write_text(SUITE.replace(old, new))
+    said = rig("run", tmp_path / "suite.toml", "--out", tmp_path / "out")
+    assert (said.status, said.out, said.err.count("\n")) == (2, "", 1), said
+    assert re.search(line, said.err), said.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_options_that_do_not_go_together(tmp_path: Path) -> None:
+    write_sequences(tmp_path)
+    (tmp_path / "suite.toml").write_text(SUITE)
+    for words, line in ((["suite.toml", "--seed", 1], "--seed: expected in the suite file"),
+                        (["short.toml", "short.toml", "--junit", "x.txt"], "expected FILE.xml"),
+                        (["short.toml", "short.toml", "--pace", "realtime", "--jobs", 2], "--jobs: 2: expected 1 in")):
+        paths = [tmp_path / word if str(word).endswith(".toml") else word for word in words]
+        said = rig("run", *paths, "--out", tmp_path / "out")
+        assert said.status == 2 and said.err.count("\n") == 1 and line in said.err, said
+
+
+def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
+    write_sequences(tmp_path)
+    (tmp_path / "suite.toml").write_text('title = "Long"\n[[case]]\nsequence = "short.toml"\n[[case]]\n'
+                                         'sequence = ["hang.toml"]\nseed = [1, 2]\n')
+    process = started("run", tmp_path / "suite.toml", "--out", tmp_path / "out", "--junit", tmp_path / "j.xml",
+                      "--jobs", 1)
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("PASS"):
+        assert process.poll() is None
+    deadline = time.monotonic() + 600.0  # only ends a test that hangs
+    while not (tmp_path / "own.py.hangs").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    said = finished(process)
+    assert said.status == 130, said
+    answer = json.loads((tmp_path / "out" / "suite.json").read_text())
+    assert [case["verdict"] for case in answer["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
+    assert len(read_valid_junit(tmp_path / "j.xml").findall("testsuite/testcase[skipped]")) == 2
+    assert "Traceback" not in said.err and "3 at" not in said.out
+    assert rig("report", tmp_path / "out" / "hang-seed-1", "--quiet").status == 0  # its log was closed
+
+
+def make_result(verdict: str, *passed: bool) -> CaseResult:
+    """A result of a case with checks "a", "b", .. that verify R-1."""
+    checks = tuple(CheckResult(name, "max_error", "xj", 1.0, "m", 0.0, 2.0, is_passed, 0.0, 1.0, "", ("R-1",))
+                   for name, is_passed in zip("abc", passed, strict=False))
+    planned = tuple(PlannedCheck(check.name, ("R-1",)) for check in checks)
+    return CaseResult(Case("case", Path("case"), JobChoice(), 1.0, planned, ("R-2",)), verdict, "because", 1.0, checks)
+
+
+@pytest.mark.parametrize(("verdicts", "status", "worst"), [
+    ("PASS PASS", 0, "PASS"), ("PASS NOT_JUDGED", 0, "NOT_JUDGED"), ("PASS INVALID_TIMING", 3, "INVALID_TIMING"),
+    ("INVALID_TIMING FAIL", 1, "FAIL"), ("ABORTED PASS", 1, "ABORTED"), ("FAIL ERROR", 1, "ERROR")])
+def test_the_exit_status_is_the_worst(verdicts: str, status: int, worst: str) -> None:
+    results = [make_result(word) for word in verdicts.split()]
+    assert (find_status(results, is_interrupted=False), find_verdict(results)) == (status, worst)
+    assert find_status(results, is_interrupted=True) == 130
+
+
+def test_a_late_bench_proves_nothing(tmp_path: Path) -> None:
+    """Neither a passed nor a failed check of a run with invalid timing verifies a requirement; JUnit skips failures."""
+    late = make_result("INVALID_TIMING", True, False)
+    traced = trace_requirements([late], {})
+    assert [(each.id, each.verdict) for each in traced] == [("R-2", "OPEN"), ("R-1", "OPEN")]
+    assert traced[1].evidence == (Evidence("case", "a", "OPEN"), Evidence("case", "b", "OPEN"))
+    (tmp_path / "j.xml").write_text(write_junit("t", [late, make_result("ABORTED", True), make_result("NOT_JUDGED")]))
+    root = read_valid_junit(tmp_path / "j.xml")
+    assert [[child.tag for child in case if child.tag != "system-out"] for case in root.iter("testcase")] == [
+        ["error"], [], ["skipped"], ["failure"], [], ["skipped"]]
+
+
+def test_the_example_of_the_page(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "suite.md").read_text()
+    block = re.search(r"(?m)^    title = (?:.*\n)(?:(?:    .*)?\n)*", text)
+    assert block is not None
+    (tmp_path / "acceptance.toml").write_text(re.sub(r"(?m)^    ", "", block[0]))
+    assert is_suite_file(str(tmp_path / "acceptance.toml"))
+    content, variants = read_suite_file(tmp_path / "acceptance.toml", JobChoice())
+    cases = build_suite(content.title, variants, {}).cases
+    assert len(cases) == 7 and "This file makes 3 + 4 cases".lower() in " ".join(text.lower().split())
+    for name in ("preflight, seed 2", "reactions, lost_feedback, jack.mass=80"):
+        assert f"`{name}`" in text and name in [case.name for case in cases]
+    assert [case.requirement for case in cases] == [("REQ-1",)] * 3 + [("REQ-2",)] * 4
+    assert {case.timeout for case in cases[3:]} == {120.0} and cases[0].timeout > 400.0

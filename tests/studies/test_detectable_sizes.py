@@ -1,0 +1,46 @@
+"""Sizes are hidden as they were claimed, and the study finds what it should."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from plant.effects import CATALOGUE
+from plant.model import Model
+from studies import detectable_sizes
+from studies.hidden_effects.hidden import NOT_SIMULATED
+from studies.hidden_effects.truth import parameter_names
+
+
+@pytest.mark.parametrize("effect", detectable_sizes.EFFECTS)
+def test_the_hidden_size_is_the_claimed_one_in_the_unit_of_the_fit(effect: str) -> None:
+    first = CATALOGUE[effect].fitted[0]
+    off = CATALOGUE[effect].off.get(first, Model().kind.nominal.get(first, 0.0))
+    size = 0.3 * min(abs(start[first] - off) for start in CATALOGUE[effect].starts)
+    healthy = detectable_sizes.sample_healthy_case(1, effect)
+    (hidden,) = detectable_sizes.hide_effect(healthy, effect, size).effects
+    assert hidden.value == pytest.approx(off + size)
+    shown = {"jack_friction": "FSJ", "viscous_drag": "CJ", "moving_mass": "MJ", "spool_friction": "FSS",
+             "constant_load": "force", "filter_clogging": "Kintas"}
+    if effect in shown:
+        assert hidden.changes[shown[effect]] == pytest.approx(off + size)
+    assert set(hidden.changes) - set(NOT_SIMULATED) <= set(parameter_names())
+
+
+def test_the_table_counts_by_effect_and_size() -> None:
+    rows = [{"effect": "null_bias", "factor": 1.5, "claimed": 1e-6, "found": True},
+            {"effect": "null_bias", "factor": 1.5, "claimed": 2e-6, "found": False},
+            {"effect": "null_bias", "factor": 0.5, "claimed": 1e-6, "found": False},
+            {"effect": "sensor_gain", "factor": 1.5, "claimed": None, "found": None}]
+    table = detectable_sizes.format_table(rows).splitlines()
+    assert table[2] == "| `null_bias` | 1e-06 to 2e-06 A | 1 of 2 | 0 of 1 |"
+    assert table[3] == "| `sensor_gain` | none | 0 of 0 | 0 of 0 |"
+
+
+@pytest.mark.slow
+def test_claims_hold(tmp_path: Path) -> None:
+    """About two minutes a case."""
+    rows = detectable_sizes.run_study(2 * len(detectable_sizes.EFFECTS), tmp_path)
+    large = [row["found"] for row in rows if row["factor"] > 1.0 and row["found"] is not None]
+    small = [row["found"] for row in rows if row["factor"] < 1.0 and row["found"] is not None]
+    assert sum(large) >= 0.9 * len(large) and sum(small) <= 0.5 * len(small)

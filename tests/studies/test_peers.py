@@ -1,0 +1,63 @@
+"""Peers make the same runs as this software, and a peer that is missing is named with its reason."""
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from physics_cases import PREFLIGHT
+
+from rig.bench import stopwatch
+from studies.peers import __main__ as command
+from studies.peers import grid_runs, many_runs, rivals
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {stopwatch.GET_GCC}")
+
+
+def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(stopwatch.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rivals.importlib.util, "find_spec", lambda name: None)
+    assert command.main([]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "C, one run after the other skipped, gcc is not installed; to get it: apt-get install gcc" in words
+    assert "C, OpenMP skipped, gcc is not installed" in words
+    assert "jax, vmap skipped, jax is not installed; to get it: pip install 'eha-rig[bench]'" in words
+    assert "ProgPy, vectorised skipped, progpy is not installed" in words
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_runs() -> None:
+    """Those of the `bench` extra where it is installed; without fused multiply-add C even to the last bit."""
+    stages: list[str] = []
+
+    def note_stage(stage: str, share: float) -> None:
+        stages.append(stage)
+
+    found = {rival.name: rival for rival in many_runs.compare_many_runs(PREFLIGHT, note_stage, rounds=2, cycles=300)}
+    assert len(found) == 8 and stages
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        else:
+            assert rival.speed > 0.0 and rival.ratio is not None and rival.difference is not None
+            assert rival.difference < 1e-12
+    for name in (many_runs.OURS, "ours, a thread a core", "C, 16 runs, -ffp-contract=off"):
+        assert found[name].difference == 0.0
+
+
+@needs_gcc
+def test_every_rival_makes_the_same_map() -> None:
+    stages: list[str] = []
+
+    def note_stage(stage: str, share: float) -> None:
+        stages.append(stage)
+
+    found = {rival.name: rival for rival in grid_runs.compare_grid_runs(PREFLIGHT[:1500], note_stage, rounds=2)}
+    assert len(found) == 8 and stages
+    for name, rival in found.items():
+        if rival.speed is None:
+            assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
+        elif name != grid_runs.REFERENCE:
+            assert rival.difference is not None and rival.difference < 1e-12
+    reference = found[grid_runs.REFERENCE]
+    assert reference.ratio is not None and reference.ratio > 0.0  # 13 on a quiet machine
+    assert reference.difference is not None and 1e-6 < reference.difference < 3e-3

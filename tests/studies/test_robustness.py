@@ -1,0 +1,131 @@
+"""The robustness study in small: the same code as `python -m studies.robustness`, with fewer frames and runs."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from c_device import CFirmware
+from short_sequences import job, play
+
+from rig.network.frame import Frame, Send
+from rig.nodes.firmware import Firmware
+from studies.robustness import fuzz
+from studies.robustness.datagrams import fuzz_datagrams
+from studies.robustness.disturb import PROCESSES, disturb_run, find_processes, has_semaphores, judge_verdict
+from studies.robustness.frames import invent_frames
+from studies.robustness.fuzz import fuzz_node, fuzz_rig
+from studies.robustness.logs import fuzz_logs
+from studies.robustness.nodes import Usage
+from studies.robustness.run_study import build_robustness_report, run_study
+from studies.robustness.soak import Soak
+
+
+def test_a_seed_gives_the_same_frames_again() -> None:
+    frames = list(invent_frames(5000, 3))
+    assert frames == list(invent_frames(5000, 3)) != list(invent_frames(5000, 4))
+    assert 400 < sum(frame.cob_id == 0x080 and not frame.data for frame in frames) < 900
+    assert {len(frame.data) for frame in frames} == set(range(9))
+    assert len({frame.cob_id for frame in frames}) > 300
+
+
+@pytest.mark.parametrize("target", ["plant", "controller"])
+def test_fuzz_frames_into_a_node(target: str) -> None:
+    count = fuzz_node(target, 20_000, 5)
+    assert count.failures == () and count.works and count.answers > 500 and count.growth < 16 << 20
+
+
+def test_fuzz_frames_into_the_c_firmware(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuzz, "Firmware", CFirmware)
+    count = fuzz_node("controller", 20_000, 6)
+    assert count.failures == () and count.works and count.answers > 500
+
+
+def test_fuzz_frames_into_the_rig() -> None:
+    count = fuzz_rig(20_000, 7)
+    assert count.failures == () and count.works and count.frames >= 20_000
+
+
+def test_a_node_that_breaks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Fragile(Firmware):
+        def __init__(self, send: Send) -> None:
+            super().__init__(send)
+            take = self.receive
+
+            def receive(frame: Frame) -> None:
+                if len(frame.data) == 3:
+                    raise IndexError("three bytes")
+                if frame.cob_id != 0x602:  # nor does it answer SDO
+                    take(frame)
+
+            self.receive = receive
+
+    monkeypatch.setattr(fuzz, "Firmware", Fragile)
+    count = fuzz_node("controller", 2000, 8)
+    assert len(count.failures) == 10 and "IndexError: three bytes" in count.failures[0] and not count.works
+
+
+def test_fuzz_datagrams_on_the_udp_bus() -> None:
+    count = fuzz_datagrams(3000, 9, "239.74.164.9")
+    assert count.verdict == "PASS" and count.problems == () and max(count.growth.values()) < 16 << 20
+
+
+@pytest.mark.parametrize("victim", PROCESSES)
+def test_a_killed_process(victim: str) -> None:
+    trials = []
+    for seed in range(11, 17):  # a moment may come before the first cycle
+        trials.append(disturb_run("kill", victim, seed))
+        assert trials[-1].problems == (), trials[-1]
+        if trials[-1].cycles > 0:
+            break
+    assert trials[-1].cycles > 0, trials
+
+
+GONE = "ABORTED node 3 plant stopped answering: no feedback frame since cycle 9; "
+
+
+@pytest.mark.parametrize(("action", "victim", "pause", "status", "said", "is_sound"), [
+    ("kill", "plant", 0.0, 1, f"{GONE}its process was ended by SIGKILL", True),
+    ("kill", "plant", 0.0, 1, f"{GONE}no heartbeat any more: last heartbeat 0.30 s ago", False),
+    ("kill", "controller", 0.0, 1, f"{GONE}its process was ended by SIGKILL", False),  # the wrong node
+    ("kill", "plant", 0.0, 0, "PASS", False),
+    ("stop", "plant", 0.9, 0, "PASS", True),
+    ("stop", "plant", 0.9, 1, f"{GONE}no heartbeat for 2.1 s either", False),
+    ("stop", "plant", 3.1, 1, f"{GONE}no heartbeat for 2.1 s either", True),
+    ("stop", "plant", 3.1, 0, "PASS", False),
+    ("stop", "rig", 3.1, 0, "PASS", True),
+    ("stop", "rig", 0.9, 2, "rig run: the turn to send was held for more than 1 s by process 7", True),
+])
+def test_what_the_verdict_of_a_disturbed_run_must_be(action: str, victim: str, pause: float, status: int, said: str,
+                                                     is_sound: bool) -> None:
+    assert (judge_verdict(action, victim, pause, status, said) == []) == is_sound
+
+
+@pytest.mark.parametrize("action", ["remove folder", "fill disk"])
+def test_a_log_that_cannot_be_written(action: str) -> None:
+    trial = disturb_run(action, "rig", 12)
+    assert trial.problems == () and trial.status == 2 and "log" in trial.message, trial
+
+
+def test_what_a_soak_calls_growth() -> None:
+    flat = {"rig": Usage(100 << 20, 6, 2)}
+    for end, grown in ((Usage(101 << 20, 6, 2), []), (Usage(120 << 20, 6, 2), ["memory"]), (Usage(0, 7, 2), ["files"]),
+                       (Usage(0, 6, 3), ["threads"])):
+        found = Soak(1.0, 1, 1, {}, flat, {"rig": end}, ()).find_growth()
+        assert [line.split()[1] for line in found] == grown
+
+
+def test_the_study_as_a_whole(tmp_path: Path) -> None:
+    figures = run_study(1000, 0, 0.05, 1, "builtin", lambda stage, share: None)
+    assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
+    report = build_robustness_report(figures)
+    assert report.verdict == "PASS" and len(report.sections) == 4
+    assert not has_semaphores("239.1.1.1") and not find_processes("239.1.1.1")
+    assert build_robustness_report({**figures, "problems": ["it hung"]}).verdict == "FAIL"
+
+
+def test_changed_logs(tmp_path: Path) -> None:
+    """Some are still good enough to be read; the others are refused, and nothing else happens."""
+    play(job(), tmp_path / "run")
+    count = fuzz_logs(tmp_path / "run" / "trace.mcap", tmp_path, 60, 10)
+    assert count.failures == () and count.accepted["recover"] > 50
+    assert 10 < count.accepted["report"] < 50 and count.accepted["report"] + count.refused["report"] == 60
