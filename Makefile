@@ -1,5 +1,6 @@
 # Two commands: `make preflight` runs the bench, `make test` proves it. Both make their own environment first.
-#   make lint     ruff and mypy alone          make test ARGS="-k bus"   a part of the tests (no lint: make pytest ARGS=..)
+#   make quick    ruff and the short tests, for every edit                make test ARGS="-k bus"   a part of the tests
+#   make lint     ruff and mypy alone                                     make pytest ARGS=..       the same without lint
 #   make newcomer every line of README, tutorial and how-to pages, bad inputs, Ctrl-C; ARGS=inputs a part (shown, pages, ..)
 #   make docs     the pages as a searchable site in site/, which needs no network
 #   make bench    the project's benchmarks     make clean                what was made here, but for runs/
@@ -12,14 +13,22 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
 
-.PHONY: env env-test preflight lint pytest test newcomer bench clean help
+.PHONY: env env-test preflight quick lint pytest test newcomer bench clean help
 .DELETE_ON_ERROR:
 
 preflight: env
 	@$(BIN)/rig run preflight
 
-test: lint
-	@$(MAKE) --no-print-directory pytest
+# mypy runs beside the tests, at the price of one more process
+test: env-test
+	@echo "== ruff, and mypy --strict beside the tests"
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy >$(VENV)/.mypy.log 2>&1 & types=$$!; $(MAKE) --no-print-directory pytest; tests=$$?; \
+	  wait $$types || { cat $(VENV)/.mypy.log; exit 1; }; tail -1 $(VENV)/.mypy.log; exit $$tests
+
+quick: env-test
+	@$(BIN)/ruff check .
+	@$(MAKE) --no-print-directory pytest ARGS="--quick $(ARGS)"
 
 pytest: env-test
 	@echo "== pytest"

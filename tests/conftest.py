@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from long_tests import LONG_TESTS
 from plugin_bus_summary import require_bus_kind
 from rig_command import rig
 
@@ -19,6 +20,20 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell script starts what it puts in the background with Ctrl-C ignored, and children inherit that. The tests of
     # Ctrl-C need it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add --quick, which leaves out the files of `long_tests.LONG_TESTS`."""
+    parser.addoption("--quick", action="store_true", help="without the tests that take long: enough for every edit")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the long tests if --quick was given."""
+    if config.getoption("--quick"):
+        root = config.rootpath / "tests"
+        long = [item for item in items if item.path.relative_to(root).as_posix().startswith(LONG_TESTS)]
+        config.hook.pytest_deselected(items=long)
+        items[:] = [item for item in items if item not in set(long)]
 
 
 @pytest.fixture(params=["embedded", "virtual", "udp_multicast", "socketcan"])

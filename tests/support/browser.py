@@ -1,10 +1,11 @@
 """A headless browser for pages: how wide they come out, pictures of them, and their print as PDF.
 
-Without chromium `find_browser` is None; what needs it is skipped.
+Without chromium `find_browser` is None; what needs it is skipped, or fails with EHA_RIG_REQUIRE_BROWSER=1.
 """
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -12,6 +13,8 @@ import tempfile
 from html import unescape
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 PROBE = """<script>addEventListener("load", () => {
   const root = document.documentElement, width = root.clientWidth, out = [];
@@ -47,6 +50,10 @@ class PageSize(NamedTuple):
 def find_browser() -> str | None:
     """Chromium, if this machine has one."""
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+needs_browser = pytest.mark.skipif(find_browser() is None and not os.environ.get("EHA_RIG_REQUIRE_BROWSER"),
+                                   reason="no chromium (Debian: apt-get install chromium)")
 
 
 def call_browser(*arguments: str, seconds: float = 120.0) -> str:

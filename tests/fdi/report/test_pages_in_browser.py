@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import find_browser, measure_page, print_page, take_picture
+from browser import measure_page, needs_browser, print_page, take_picture
 from page_pictures import FIND_SCROLLING
 from PIL import Image  # comes with matplotlib
 
@@ -15,7 +15,7 @@ from fdi.report.report import Column, Report, Section, Table
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Check, Trace
 
-pytestmark = pytest.mark.skipif(find_browser() is None, reason="this machine has no chromium")
+pytestmark = needs_browser
 
 ZOOM = """
 const svg = document.querySelector("svg[data-axes]"), r = svg.getBoundingClientRect();

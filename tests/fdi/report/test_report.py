@@ -4,7 +4,6 @@ from __future__ import annotations
 import html
 import math
 import re
-import shutil
 import subprocess
 import sys
 import warnings
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import call_browser, needs_browser
 from synthetic_run import record_run
 
 from fdi.report import drawing, run_figures
@@ -206,16 +206,13 @@ def test_command(log: Path) -> None:
     assert done.returncode == 0 and done.stdout == f"{log.parent / 'report.html'}\n", done.stderr
 
 
+@needs_browser
 def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no chromium on this machine (Debian: apt-get install chromium)")
     from matplotlib.image import imread
 
     write_run_page(log, tmp_path / "report.html")
-    words = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-             f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", (tmp_path / "report.html").as_uri()]
-    subprocess.run(words, capture_output=True, check=True, timeout=120)
+    place = (tmp_path / "report.html").as_uri()
+    call_browser(f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", place)
     shades = (imread(str(tmp_path / "page.png"))[..., :3] * 255).astype(int)
     for name, _, _, colour in run_figures.PANELS[:4]:
         wanted = np.array([int(colour[i:i + 2], 16) for i in (1, 3, 5)])

@@ -89,13 +89,8 @@ class TestEveryBus:
 
     def test_silent_bus_gives_nothing(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (station, _):
-            taken = []
-            for _ in range(10):
-                begin = time.monotonic()
-                assert station.poll(0.0) == []
-                assert station.poll(0.05) == []
-                taken.append(time.monotonic() - begin)
-            assert min(taken) < 1.0  # unless the machine stands still ten times running
+            assert station.poll(0.0) == []
+            assert station.poll(0.05) == []
 
     def test_whole_bench_runs_its_cycle(self, bus_kind: str) -> None:
         """Boot-up, NMT start, 50 SYNCs with command, feedback, valve state and drive; each node on its own station."""
