@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fdi import identify
 from fdi.report.drawing import shorten_svg
-from fdi.report.identify_figures import draw_estimates
+from fdi.report.identify_report import draw_estimates
 from studies.identification import simulate_unit
 
 

@@ -1,4 +1,4 @@
-"""Make preflight.svg, falling_error.svg and viewer.png: python docs/pictures.py (needs the extra `view`)."""
+"""Make falling_error.svg and viewer.png: python docs/pictures.py (needs the extra `view`)."""
 from __future__ import annotations
 
 import contextlib
@@ -9,9 +9,7 @@ from pathlib import Path
 
 from PIL import Image  # comes with matplotlib
 
-from fdi import Trace
-from fdi.discovery.model_file import load_model_file
-from fdi.report import run_figures
+from fdi.discovery.update_model import load_model_file
 from fdi.report.drawing import shorten_svg
 
 HERE = Path(__file__).parent
@@ -36,7 +34,6 @@ def main() -> None:
         draw_falling_error(Path(folder))
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([*RIG, "run", "preflight", "--quiet", "--out", folder], check=True)
-        (HERE / "preflight.svg").write_text(run_figures.draw_signals(Trace.read(folder)), encoding="utf-8")
         picture = Path(folder, "viewer.png")
         subprocess.run([*RIG, "view", folder, "--headless", "--screenshot", str(picture)], check=True)
         with Image.open(picture) as image:  # a palette does for a user interface, at a quarter of the size

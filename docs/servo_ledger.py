@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from fdi.comparison.controller_law import fit_directional_gains
-from fdi.discovery.model_file import Provenance, Row, format_model_file
+from fdi.comparison.blocks import fit_directional_gains
 from fdi.discovery.runs import read_source
-from fdi.estimation.preparation import prepare_trace
-from fdi.estimation.replay import compute_residuals, replay_current, replay_lanes
+from fdi.discovery.update_model import Provenance, Row, format_model_file
+from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current, replay_lanes
 from fdi.estimation.unknowns import WITHOUT_NOISE
 from fdi.report.drawing import COMMAND, DRAWN_UNITS, GREEN, shorten_svg, start_figure, to_svg
 from fdi.sources import name_software

@@ -12,12 +12,11 @@ from matplotlib.figure import Figure
 from fdi import Trace
 from fdi.comparison.compare import compare
 from fdi.discovery import explain
-from fdi.discovery.model_file import load_model_file
 from fdi.discovery.residual_pattern import find_pattern
 from fdi.discovery.runs import read_runs
-from fdi.estimation.preparation import prepare_trace
-from fdi.estimation.replay import compute_residuals, replay_current
-from fdi.report import explain_figures
+from fdi.discovery.update_model import load_model_file
+from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current
+from fdi.report import explain_report
 from fdi.report.drawing import STYLE, shorten_svg, to_svg
 from plant import Model
 from plant.effects import load_effects
@@ -34,7 +33,7 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
     with rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.subplots(3, 1, sharex=True)
-        models = ((Model(), explain_figures.BEFORE, "nominal model"), (model, explain_figures.AFTER, "after rig add"))
+        models = ((Model(), explain_report.BEFORE, "nominal model"), (model, explain_report.AFTER, "after rig add"))
         for which, colour, label in models:
             prepared = prepare_trace(trace, which)
             rest = compute_residuals(prepared, replay_current(prepared, which))
@@ -46,7 +45,7 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
                 ax.set_ylabel(title)
         for ax, (name, _, scale) in zip(axes, SIGNALS, strict=True):
             for side in (-2, 2):
-                ax.axhline(side * floor[name].floor.value * scale, color=explain_figures.FLOOR, lw=0.8, ls=":")
+                ax.axhline(side * floor[name].floor.value * scale, color=explain_report.FLOOR, lw=0.8, ls=":")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
         return to_svg(figure, run)
@@ -57,14 +56,14 @@ def main(folder: str) -> None:
     os.chdir(folder)
     runs = read_runs(Model(), "cog.csv", ["cog2.csv"], "cogheld.csv")
     found = explain(runs.model, runs.est, runs.repeats, runs.holdout, lambda what, share: None)
-    shape = explain_figures.draw_pattern(find_pattern(found.search, found.ledger[-1]), runs.est.t)
+    shape = explain_report.draw_pattern(find_pattern(found.search, found.ledger[-1]), runs.est.t)
     (HERE / "shape.svg").write_text(shorten_svg(shape), encoding="utf-8")
     load_effects(Path("found.py"))
     for example, run, repeat, file in (("first", "run.csv", "run2.csv", "better.toml"),
                                        ("second", "cog.csv", "cog2.csv", "cogged.toml")):
         model, known = load_model_file(Path(file))
         (HERE / f"{example}_left.svg").write_text(shorten_svg(draw_residuals(run, repeat, model)), encoding="utf-8")
-        drawn = explain_figures.draw_ledger(known.ledger, known.floor or {})
+        drawn = explain_report.draw_ledger(known.ledger, known.floor or {})
         (HERE / f"{example}_ledger.svg").write_text(shorten_svg(drawn), encoding="utf-8")
 
 

@@ -25,10 +25,9 @@ if TYPE_CHECKING:
 
     from fdi.comparison.compare import Comparison
     from fdi.diagnosis.diagnosis import Diagnosis
-    from fdi.discovery.candidates import Answer
-    from fdi.discovery.model_file import Provenance
+    from fdi.discovery.explain_runs import Answer
     from fdi.discovery.runs import Runs
-    from fdi.discovery.update_model import ModelUpdate
+    from fdi.discovery.update_model import ModelUpdate, Provenance
     from fdi.identification.identify import Identification
 
 TraceOrPath = Trace | str | Path
@@ -246,7 +245,7 @@ class IdentificationResult(Result):
         Raises:
             InputError: a path that cannot be written.
         """
-        from fdi.identification.model_text import write_identified_model
+        from fdi.identification.identify import write_identified_model
 
         write_identified_model(self.identification, path, "fdi.identify")
 
@@ -336,13 +335,13 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     Raises:
         InputError: an effect that this model cannot take, or runs that cannot be used.
     """
-    from fdi.discovery import model_file
+    from fdi.discovery import update_model
     from fdi.discovery.update_model import add_effects
-    from fdi.report.model_report import build_model_report
+    from fdi.report.explain_report import build_model_report
 
     effects = [effect] if isinstance(effect, str) else list(effect)
     own_model, known = _load_model_file(model, trust)
-    runs = _collect_runs(model_file.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
+    runs = _collect_runs(update_model.remove_all_effects(own_model, known), trace, repeats, holdout, signals)
     command = f"fdi.add_effect({', '.join(map(repr, effects))})"
     update = add_effects(effects, runs, own_model, known, command)
     return ModelResult(build_model_report(update), update)
@@ -366,9 +365,12 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     Raises:
         InputError: runs, a model, a signal or a range that cannot be used.
     """
-    from fdi.identification.free_parameters import parse_free_parameters, read_free_parameters
+    from fdi.identification.free_parameters import (
+        collect_identification_runs,
+        parse_free_parameters,
+        read_free_parameters,
+    )
     from fdi.identification.identify import identify_model
-    from fdi.identification.runs import collect_identification_runs
     from fdi.report.identify_report import build_identification_report
 
     own_model = _load_model(model, trust)
@@ -394,7 +396,7 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     Raises:
         InputError: a trace, a model or bands that cannot be used.
     """
-    from fdi.diagnosis.bands_file import load_bands
+    from fdi.diagnosis.bands import load_bands
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
     from fdi.report.diagnosis_report import build_diagnosis_report
 
@@ -424,7 +426,7 @@ def _load_model(model: ModelOrPath, trust: bool) -> Model:
 
 def _load_model_file(model: ModelOrPath, trust: bool) -> tuple[Model, Provenance]:
     """A model and where it comes from, which only a model file knows."""
-    from fdi.discovery.model_file import Provenance, load_model_file
+    from fdi.discovery.update_model import Provenance, load_model_file
 
     if not isinstance(model, Model) and Path(model).is_file():
         load_effects_of_model(model, is_trusted=trust)

@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import ctypes
 import dis
+import fcntl
 import hashlib
 import math
 import os
@@ -161,12 +162,32 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     linked = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
     plain = rebind_names(linked.py_func)
     settings: Any = numba.config
+    folder = _find_folder_of_code(root)
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
-        before, settings.CACHE_DIR = settings.CACHE_DIR, str(_find_folder_of_code(root))
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
         try:
-            return numba.njit(plain, cache=True, nogil=True, error_model="numpy")
+            compiled = numba.njit(plain, cache=True, nogil=True, error_model="numpy")
         finally:
             settings.CACHE_DIR = before
+    _compile_in_one_process(compiled, folder)
+    return compiled
+
+
+def _compile_in_one_process(dispatcher: Any, folder: Path) -> None:
+    """Let one process at a time compile or load the code of a folder: the next one finds it stored."""
+    compile_here = dispatcher.compile
+
+    def compile_alone(signature: Any) -> Any:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = (folder / "lock").open("w")
+        except OSError:
+            return compile_here(signature)
+        with lock:  # closing it, also by a kill, frees it
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return compile_here(signature)
+
+    dispatcher.compile = compile_alone
 
 
 def is_function_stored(function: Function, ports: Mapping[str, Function] | None = None) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from rig.network import bus
-from rig.run import lateness
+from rig.run import priority
 
 Status = Literal["ok", "limited", "missing"]
 
@@ -206,33 +206,33 @@ def examine_rights() -> Iterator[Finding]:
     kernel = f"{platform.release()}, {'PREEMPT_RT' if preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
     remedy = "" if preempt_rt else "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"
     yield Finding("real time", "kernel", "ok" if preempt_rt else "limited", kernel, "bounds the worst lateness", remedy)
-    fifo = bool(lateness.run_under_fifo(lambda: True))
-    limit = lateness.read_priority_limit()
+    fifo = bool(priority.run_under_fifo(lambda: True))
+    limit = priority.read_priority_limit()
     text = f"SCHED_FIFO up to priority {limit}" if fifo else ""
     remedy = "as root: echo \"$USER - rtprio 90\" >> /etc/security/limits.d/rt.conf, then log in again"
     yield _make_finding("real time", "priority", text, "other programs do not delay the loop", remedy)
-    locked = lateness.read_memory_lock_limit()
+    locked = priority.read_memory_lock_limit()
     enough = locked < 0 or locked >= 1 << 29
     text = "unlimited" if locked < 0 else f"{locked / 1e6:.0f} MB"
     remedy = "" if enough else "as root: echo \"$USER - memlock unlimited\" >> /etc/security/limits.d/rt.conf"
     yield Finding("real time", "memory lock", "ok" if enough else "limited", text, "no page faults in the loop", remedy)
     source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
-    clock = f"{lateness.read_clock_resolution_ns():.0f} ns, {source}"
-    fine = lateness.read_clock_resolution_ns() <= 1e3
+    clock = f"{priority.read_clock_resolution_ns():.0f} ns, {source}"
+    fine = priority.read_clock_resolution_ns() <= 1e3
     remedy = "" if fine else "a kernel with CONFIG_HIGH_RES_TIMERS"
     yield Finding("real time", "clock", "ok" if fine else "limited", clock, "the cycle's due times", remedy)
 
 
 def measure_timers(seconds: float) -> Iterator[Finding]:
     """Lateness of a 1 kHz timer, measured now: as an ordinary process, and under SCHED_FIFO where that is allowed."""
-    ordinary = lateness.measure_timer_lateness(seconds)
+    ordinary = priority.measure_timer_lateness(seconds)
     yield _make_timer_finding("timer at 1 kHz", ordinary, "what --pace realtime can expect here")
-    fifo = lateness.run_under_fifo(lambda: lateness.measure_timer_lateness(seconds))
+    fifo = priority.run_under_fifo(lambda: priority.measure_timer_lateness(seconds))
     if fifo is not None:
         yield _make_timer_finding("timer under FIFO", fifo, "the same with real-time priority")
 
 
-def _make_timer_finding(name: str, late: lateness.Lateness, purpose: str) -> Finding:
+def _make_timer_finding(name: str, late: priority.Lateness, purpose: str) -> Finding:
     text = f"late by {late.p50:.0f} us (p50), {late.p99:.0f} (p99), {late.p99_9:.0f} (p99.9), {late.max:.0f} (max)"
     if late.missed == 0:
         return Finding("real time", name, "ok", text, purpose)

@@ -5,11 +5,10 @@ import math
 
 import numpy as np
 
-from fdi.diagnosis.bands import judge_position
-from fdi.diagnosis.bands_file import load_default_bands
+from fdi.diagnosis.bands import judge_position, load_default_bands
 from fdi.diagnosis.faults import FAULTS, Level
+from fdi.diagnosis.learn_bands import UnitKind, simulate_units
 from fdi.diagnosis.precursors import format_precursor
-from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.trace.sections import find_sections
 from plant import load_model
 from rig.sequences import load_sequence

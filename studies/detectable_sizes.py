@@ -22,8 +22,7 @@ from fdi.discovery.search import Search
 from fdi.sources import hash_sources
 from plant.effects import CATALOGUE
 from plant.model import Model
-from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch
-from rig.campaign.row_file import Row, RowFile
+from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from studies.hidden_effects import cases, hidden
 from studies.hidden_effects.hidden import Hidden
 from studies.hidden_effects.run_trial import run_rig_explain

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Fault, Level, classify_size
+from fdi.diagnosis.learn_bands import UnitKind, simulate_units
 from fdi.diagnosis.precursors import compute_features
 from fdi.diagnosis.refine import (
     COARSE_STARTS,
@@ -22,7 +23,6 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.estimation.likelihood import compute_misfit
 from fdi.progress import Progress, ignore_progress
 from fdi.report.json import to_plain

@@ -26,8 +26,7 @@ from fdi.sources import hash_sources
 from fdi.trace.trace import Trace
 from plant.model import load_model
 from plant.threads import count_threads
-from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch
-from rig.campaign.row_file import Row, RowFile
+from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from studies.hidden_effects import cases, hidden
 from studies.hidden_effects.hidden import Hidden
 from studies.hidden_effects.truth import nominal_symbols

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.estimation.binomial import measure_share
-from fdi.identification.free_parameters import read_free_parameters
+from fdi.identification.free_parameters import collect_identification_runs, read_free_parameters
 from fdi.identification.identify import identify_model
-from fdi.identification.runs import collect_identification_runs
 from fdi.trace.trace import Trace
 from plant.model import load_model
 from rig.campaign.units import FLOORS

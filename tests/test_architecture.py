@@ -86,7 +86,7 @@ CLOCK_MODULES = {"time", "datetime", "sched"}
 CLOCK_FILES = (
     "studies/",
     "rig/bench/responders.py",  # waits for a node to boot
-    "rig/network/", "rig/run/loop.py", "rig/run/lateness.py", "rig/cli/commands/",
+    "rig/network/", "rig/run/loop.py", "rig/run/priority.py", "rig/cli/commands/",
     "rig/live/",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time
     "rig/view/viewer.py",  # waits for the viewer to come up

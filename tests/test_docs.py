@@ -24,7 +24,7 @@ from plant.state import Input, Ports, State
 from rig.cli import main
 from rig.cli.command_list import HELP_OF_COMMAND
 from rig.sequences import faults
-from rig.sequences.guards import Guard
+from rig.sequences.checks import Guard
 from rig.sequences.python_parts import Step
 from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, Sequence, parse_sequence
 
@@ -72,18 +72,6 @@ def test_the_example_of_a_sequence_is_valid() -> None:
     text = next(block for block in indented_blocks(SEQUENCES) if block.startswith("title ="))
     sequence = parse_sequence(text, "example.toml", lambda name: b"")
     assert sequence.faults and sequence.checks and sequence.guards and sequence.load
-
-
-def test_the_effect_in_the_readme_works(tmp_path: Path) -> None:
-    text = next(block for block in indented_blocks(README) if block.startswith("# my_effects.py")).split("\nrig ")[0]
-    (tmp_path / "my_effects.py").write_text(text)
-    try:
-        assert load_effects(tmp_path / "my_effects.py") == ["cogging"]
-        command = np.full(50, 1e-3)
-        plain, cogged = (simulate(model, command).xj for model in (Model(), Model().replace({"cogging.force": 2e3})))
-        assert np.abs(plain - cogged).max() > 1e-6
-    finally:
-        CATALOGUE.pop("cogging", None)
 
 
 def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:

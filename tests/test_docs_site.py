@@ -22,7 +22,7 @@ from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS
 
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 PAGES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
-MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md"}
+MADE = {f"docs/{NOTEBOOK.stem}.md", "ARCHITECTURE.md", "CHANGELOG.md", "examples/README.md", "studies/README.md"}
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,10 @@ from plant.segments import Segment
 from rig.cli.commands import list as list_command
 from rig.sequences import faults, tables
 from rig.sequences.check import Check
-from rig.sequences.guards import Guard
+from rig.sequences.checks import Guard
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import Step
-from rig.sequences.required_firmware import RequiredFirmware
-from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, Sequence
+from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, RequiredFirmware, Sequence
 from rig.sequences.timing import TimingPolicy
 
 

@@ -27,15 +27,19 @@ from fdi.estimation.noise import (
     sensor_floors,
     simulate_reading_noise,
 )
-from fdi.estimation.preparation import Repeat, align_columns, find_repeat, match_period, prepare_trace
 from fdi.estimation.replay import (
     Columns,
+    Repeat,
     Replay,
     Scatter,
+    align_columns,
     compute_residuals,
+    find_repeat,
     fit_scatter,
+    match_period,
     measure_drift,
     measure_misfit,
+    prepare_trace,
     replay_command,
     replay_current,
     replay_with_checked_steps,

@@ -16,11 +16,11 @@ from fdi.diagnosis.bands import (
     is_nominal_plant,
     judge_trace,
     list_design,
+    load_default_bands,
     matches_command,
 )
-from fdi.diagnosis.bands_file import load_default_bands
-from fdi.diagnosis.beside import Beside
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
+from fdi.diagnosis.joint_search import Beside
 from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import (
     COARSE_STARTS,
@@ -34,7 +34,7 @@ from fdi.diagnosis.refine import (
 from fdi.diagnosis.rms_grid import Grid, search_grid
 from fdi.estimation.long_recordings import cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
-from fdi.estimation.preparation import SAME_PERIOD, match_period, prepare_trace
+from fdi.estimation.replay import SAME_PERIOD, match_period, prepare_trace
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     MOVING_RAM,

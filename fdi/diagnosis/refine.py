@@ -21,12 +21,21 @@ from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
-from fdi.estimation.final_rounds import descend_valley, guess_covariance, start_fit
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, scale_noise, span_all_rows
-from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogOpenFilter, LogProblem, take_logarithm
 from fdi.estimation.long_recordings import Excerpt, choose_excerpt, judge_on_all
-from fdi.estimation.unidentifiable import FLAPPER, find_flat_directions
+from fdi.estimation.unidentifiable import (
+    FLAPPER,
+    LogFree,
+    LogFrictionRatio,
+    LogOpenFilter,
+    LogProblem,
+    descend_valley,
+    find_flat_directions,
+    guess_covariance,
+    start_fit,
+    take_logarithm,
+)
 from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, silence_readings
 from fdi.progress import NO_STAGE, Progress, Stage, ignore_progress
 from fdi.thresholds import (

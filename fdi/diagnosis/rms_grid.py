@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
-from fdi.estimation.preparation import read_cycles
-from fdi.estimation.replay import has_known_start
+from fdi.estimation.replay import has_known_start, read_cycles
 from fdi.thresholds import ANCHOR_RATE
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace

@@ -1,32 +1,45 @@
 """The whole way from measured runs to an answer: starting sizes, compiled kernels, search, pattern, discrimination."""
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.candidates import Answer, assess_explanation
-from fdi.discovery.explain import Explanation, explain
-from fdi.discovery.laws.effect_source import write_law_file
+from fdi.discovery.detectable import Detectable
+from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
+from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.refit import lean_model
 from fdi.discovery.runs import Runs
-from fdi.discovery.search import WholeRuns, choose_search_excerpt
+from fdi.discovery.search import Hypothesis, WholeRuns, choose_search_excerpt, compute_p_value
+from fdi.estimation.fit import Fit, Value
+from fdi.estimation.likelihood import limit_friction_values
 from fdi.estimation.long_recordings import PIECE, can_be_cut, cut_excerpt, make_excerpt
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
+from fdi.thresholds import (
+    EFFECT_INTERVAL_FACTOR,
+    EFFECT_SYSTEMATIC_SD,
+    ERROR_PARTLY_EXPLAINED,
+    INTERVAL_95_SD,
+    RESIDUAL_HELD_OUT,
+    RESIDUAL_IS_NOISE,
+    SUSPICIOUS_TOLERANCES,
+)
 from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes, compile_kernels
-from plant.model import Model, list_searched_effects
+from plant.model import Model, find_quantity, list_searched_effects
 from plant.run import report_law_errors
 from plant.starts import ensure_starts
 
 if TYPE_CHECKING:
     from fdi.discovery.laws.find_law import LawSearch
     from fdi.discovery.residual_pattern import Pattern
+
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
 
@@ -156,3 +169,196 @@ def discriminate(explanation: Explanation) -> dict[str, Any]:
     equal = [h for h in explanation.ranked if h.is_at_floor and set(h.effects) <= set(explanation.effects)]
     separation = find_separation(explanation.search, equal)
     return separation._asdict() if separation else {}
+
+
+class Candidate(NamedTuple):
+    """An effect as part of an explanation, the one it does best in."""
+
+    effect: str
+    beside: tuple[str, ...]  # what else is in that explanation
+    parameters: dict[str, Value]
+    error: dict[str, float]  # RMS that the explanation leaves of each signal
+    holdout: dict[str, float]
+    ratios: dict[str, float]  # what is left and repeats over the floor, 1 = noise alone
+    evidence: float  # gain in log likelihood, less the charge
+    p_value: float
+    word: str
+
+    @property
+    def ratio(self) -> float:
+        """That of the signal that is explained worst."""
+        return max(self.ratios.values(), default=math.inf)
+
+
+class Blind(NamedTuple):
+    """An effect that the tolerances make up for, so that this test does not show it at any usual size."""
+
+    effect: str
+    parameter: str
+    usual: float  # distance from the off value, the largest that is usual
+    unit: str
+    revealed_by: str  # what would show it
+
+
+class Suspicious(NamedTuple):
+    """A parameter of the reference model further off than a healthy unit has it."""
+
+    parameter: str
+    value: float
+    unit: str
+    tolerances: float
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """All that is told of an explanation. `baseline` holds error, holdout and floor of each signal, SI."""
+
+    explanation: Explanation
+    candidates: tuple[Candidate, ...]
+    baseline: Mapping[str, Mapping[str, float]]
+    blind: tuple[Blind, ...]
+    noiseless: tuple[str, ...]  # effects that leave their mark without noise, of whatever size
+    suspicious: tuple[Suspicious, ...]
+    ledger: tuple[tuple[str | None, Mapping[str, float], Mapping[str, float]], ...]  # effect, error, holdout
+    pattern: str = ""
+    separate: Mapping[str, Any] = field(default_factory=dict)
+    law: LawSearch | None = None  # where more than noise is left
+    law_effects: tuple[str, ...] = ()  # of the effect file that was written
+
+    @property
+    def verdict(self) -> str:
+        """One of the six words of docs/json.md."""
+        return self.explanation.verdict
+
+    @property
+    def best(self) -> Hypothesis:
+        """The explanation that is told: the best one, or none at all."""
+        e = self.explanation
+        return e.ledger[-1] if len(e.ledger) > 1 else e.base
+
+    @property
+    def explanations(self) -> tuple[Candidate, ...]:
+        """The candidates, each set of effects once, with the parameters of all its effects that are candidates."""
+        found: dict[frozenset[str], Candidate] = {}
+        for c in self.candidates:
+            effects = frozenset((*c.beside, c.effect))
+            first = found.get(effects, c)
+            found[effects] = first._replace(parameters={**first.parameters, **c.parameters})
+        return tuple(found.values())
+
+
+def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None
+                       ) -> Answer:
+    """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
+    hand = _list_firmware_marks(e)
+    baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
+    if hand:
+        unit = e.marks.resolution
+        baseline["error"]["cor"], baseline["floor"]["cor"] = e.marks.controller * unit, unit
+    best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
+    model = e.search.problem.model
+    blind = tuple(_describe_blind(d) for d in e.hidden)
+    noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
+    suspicious = tuple(list_suspicious(best, model.plant))
+    return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,
+                  tuple(_list_ledger(e, hand)), pattern, separate or {})
+
+
+def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
+    """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
+    found = {}
+    values, entry = limit_friction_values(fit.values), CATALOGUE[effect]
+    for f in fit.free:
+        if f.name in entry.fitted:
+            value = values[f.name]
+            size = abs(value - entry.off.get(f.name, model.nominal.get(f.name, 0.0)))
+            half = INTERVAL_95_SD * math.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(f.name), EFFECT_SYSTEMATIC_SD * size)
+            found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
+                                  entry.parameters[f.name].unit)
+    for name, v in found.items():  # dynamic friction is not above static friction, nor is its interval
+        static = found.get(name.replace("dynamic", "static"), v)
+        found[name] = v._replace(high=max(min(v.high, static.high), v.value))
+    return found
+
+
+def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
+    """Parameters that are more than `SUSPICIOUS_TOLERANCES` tolerances from where a healthy unit has them."""
+    return [Suspicious(f.name, f.value(float(x)), find_quantity(f.name, plant=plant).unit, float(x))
+            for f, x in zip(fit.free, fit.x, strict=True)
+            if np.isfinite(f.prior) and abs(x) > SUSPICIOUS_TOLERANCES * f.prior]
+
+
+def _list_candidates(e: Explanation, seed: int) -> list[Candidate]:
+    """Each effect once, in the order of the explanations it is part of."""
+    found = {p.effect: _describe_mark(e, p) for p in e.marks.prints}
+    for rank, h in enumerate(e.ranked):
+        for effect in h.effects if rank == 0 else h.effects[-1:]:
+            if effect not in found:
+                found[effect] = _describe_candidate(e, h, effect, seed)
+    return list(found.values())
+
+
+def _describe_candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
+    won, extra = measure_gain(e.base, h), _count_unknown(h.fit) - _count_unknown(e.base.fit)
+    samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
+    charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
+    values = list_fitted_parameters(effect, h.fit, e.search.problem.model)
+    return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
+                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * won - charge,
+                     compute_p_value(e.blind, won, max(extra, 1), seed), _choose_word(e, h, effect))
+
+
+def _count_unknown(fit: Fit) -> int:
+    """How many parameters of which nothing was known."""
+    return sum(not np.isfinite(f.prior) for f in fit.free)
+
+
+def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
+    """What to think of an effect, in a word or two."""
+    words = {"EXPLAINED": "explains", "AMBIGUOUS": "equal", "PARTLY": "part", "NOT_RESOLVABLE": "too small to be sure"}
+    if effect in e.effects and e.verdict in words:
+        return words[e.verdict]
+    worst, before = max(h.ratio.values()), max(e.base.ratio.values())
+    if worst <= RESIDUAL_IS_NOISE and not e.base.is_at_floor:
+        held = e.holdout.get(h.effects, {})
+        fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in held.items())
+        return "fails on the held-out run" if fails else "less likely"
+    return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.is_at_floor else "no"
+
+
+def _list_firmware_marks(e: Explanation) -> list[Fingerprint]:
+    return [p for p in e.marks.prints if CATALOGUE[p.effect].firmware]
+
+
+def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
+    """An effect that was found by a mark without noise."""
+    values = {name: Value(*of, CATALOGUE[p.effect].parameters[name].unit) for name, of in p.parameters.items()}
+    error, ratios = dict(e.base.errors), dict(e.base.ratio)
+    if CATALOGUE[p.effect].firmware:
+        error["cor"] = p.after * e.marks.resolution
+        ratios = {"cor": p.after}
+    n = len(e.search.problem.trace)
+    won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
+    evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
+    return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
+                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), 1e-300),
+                     "explains" if p.effect in e.effects else "no")
+
+
+def _describe_blind(d: Detectable) -> Blind:
+    entry = CATALOGUE[d.effect]
+    first = entry.fitted[0]
+    return Blind(d.effect, first, d.usual, entry.parameters[first].unit, entry.revealed_by)
+
+
+def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]
+            ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
+    unit = e.marks.resolution
+    cor = {"cor": e.marks.controller * unit} if hand else {}
+    rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
+        (None, e.base.errors | cor, e.holdout.get((), {}))]
+    for p in e.marks.prints:
+        if p.effect in e.effects:
+            cor = {"cor": p.after * unit} if p in hand else cor
+            rows.append((p.effect, e.base.errors | cor, e.holdout.get((), {})))
+    return rows + [(h.effects[-1], h.errors | cor, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.explain import measure_gain, measure_holdout
-from fdi.discovery.fingerprints import find_marks
-from fdi.discovery.scan import Prospect, scan_effects
-from fdi.discovery.search import Hypothesis, Search, WholeRuns, choose_search_excerpt
-from fdi.estimation.final_rounds import finish_fit
+from fdi.discovery.explain import find_marks, measure_gain, measure_holdout
+from fdi.discovery.search import Hypothesis, Prospect, Search, WholeRuns, choose_search_excerpt, scan_effects
 from fdi.estimation.fit import Fit, continue_fit, linearise
 from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
 from fdi.estimation.long_recordings import can_be_cut, cut_excerpt
+from fdi.estimation.unidentifiable import finish_fit
 from fdi.estimation.unknowns import (
     UNREPLAYED,
     complete_model,

@@ -7,8 +7,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fdi.estimation.noise import describe_doubtful_repeats, find_floors, sensor_floors
-from fdi.estimation.preparation import SAME_PERIOD, align_repeat, find_repeat, hold_inputs, match_period, prepare_trace
-from fdi.estimation.replay import compute_residuals, replay_current
+from fdi.estimation.replay import (
+    SAME_PERIOD,
+    align_repeat,
+    compute_residuals,
+    find_repeat,
+    hold_inputs,
+    match_period,
+    prepare_trace,
+    replay_current,
+)
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace
 from plant.errors import InputError

@@ -13,7 +13,7 @@ from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import Noise
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.thresholds import MISFIT_DISCRIMINATES
 from fdi.trace.signals import OUTPUTS
 from fdi.trace.trace import Trace

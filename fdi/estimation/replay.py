@@ -13,9 +13,9 @@ model, each parameter tied to its value by its own tolerance, and judges by a re
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +29,18 @@ from fdi.thresholds import (
     ANCHOR_RATE,
     FRICTION_UNCERTAINTY,
     RESIDUAL_IS_SCATTER,
+    SAME_COMMAND_POSITION,
     SCATTER_LARGE_RESIDUAL,
     SCATTER_TOLERANCES,
     SOLVER_ERROR_SHARE,
     UNDECIDED_SMALLEST,
 )
-from fdi.trace.signals import OUTPUTS
-from fdi.trace.trace import Trace, bridge_gaps, rms
+from fdi.trace.signals import OUTPUTS, SIGNALS
+from fdi.trace.trace import PER_ROW, Trace, bridge_gaps, hold_last, hold_next, rms
+from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
+from plant.plants import MODULES
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -310,3 +313,351 @@ def _replay_scaled(lanes: Lanes, values: Floats, trace: Trace, scale: Floats) ->
     out = replay_lanes(lanes, values[None], trace)[0].T[trace.output_columns]
     left: Floats = np.nan_to_num((trace.measurements - out) / scale)
     return left
+
+
+FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
+PERIODS = (1e-4, 0.1)  # s, shortest and longest of a controller: the bounds of `controller.period`
+SAME_PERIOD = 0.01  # of a period: two periods that differ by less are the same
+BRIDGED_ROWS = 5  # of missing current that are interpolated; longer gaps are left out
+STILL = 5e-5  # m; a ram that moves further than that moves every sensor
+LIMITS = (("xj", 3.0, "jack.travel"), ("com", 5.0, "jack.travel"), ("xs", 3.0, "spool.travel"),
+          ("p12", 3.0, "supply.pressure"), ("cor", 20.0, "controller.current_limit"))  # signal, times, parameter
+FAINT = {"p12": 1e3, "xs": 1e-9}  # a signal whose range is smaller is in another unit
+
+
+def prepare_trace(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
+    """The recording on the controller's cycles, as replays and fits use it.
+
+    Where the rows can be read in more than one way, the way that a replay of the model fits best is taken.
+
+    Args:
+        trace: the recording; needs Com, XJ and Cor.
+        model: its plant says what a signal can be, its controller how long a cycle is.
+        outputs: signals that replays are compared with; default: all of xj, p12, xs that were measured.
+        source: the recording's name in error messages.
+
+    Raises:
+        InputError: a recording that cannot be replayed.
+    """
+    ways = read_cycles(trace, model, outputs, source)
+    if len(ways) == 1:
+        return ways[0]
+    return min(ways, key=lambda way: measure_misfit(way, match_period(model, way)))
+
+
+def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: object = "trace") -> Trace:
+    """The recording with missing inputs held at their last value, all rows usable, and no check of units or sensors.
+
+    For recordings of other plants, whose ranges are not known, and for simulated ones.
+
+    Raises:
+        InputError: too few rows, no Com, XJ or Cor, or a chosen signal that was not measured.
+    """
+    measured = [name for name in OUTPUTS if name in trace.signals]
+    chosen = measured if outputs is None else [name for name in OUTPUTS if name in outputs]
+    for name in chosen:
+        if name not in measured:
+            raise InputError(source, name, f"a measured signal (it has {', '.join(measured) or 'none'})")
+    for name in ("com", "xj", "cor"):
+        if name not in trace.signals:
+            raise InputError(source, name, "a measured column")
+    if len(trace) < FEWEST_ROWS:
+        raise InputError(source, "t", f"at least {FEWEST_ROWS} cycles, not {len(trace)}")
+    return replace(trace, cor=hold_last(trace.cor), load=hold_last(trace.load), com=hold_last(trace.com),
+                   incomplete=_find_incomplete(trace), outputs=tuple(chosen))
+
+
+def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
+    """The model with the recording's period as its controller's; the model itself within a relative `tolerance`.
+
+    Raises:
+        InputError: a period that no controller has.
+    """
+    own = model["controller.period"]
+    if own == trace.period or abs(own / trace.period - 1.0) < tolerance:
+        return model
+    shortest, longest = PERIODS
+    if not shortest <= trace.period <= longest:
+        raise InputError("trace", "t", f"one row a controller cycle, {1e3 * shortest:g} to {1e3 * longest:g} ms apart; "
+                                       f"these rows are {1e3 * trace.period:.4g} ms apart")
+    return replace(model, values={**model.values, "controller.period": trace.period})
+
+
+def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None, source: object = "trace"
+                ) -> list[Trace]:
+    """The prepared recording; several where its rows can be read in more than one way.
+
+    Rows every 2 ms can come from a controller that is that slow, or be every other cycle of one at 1 ms.
+
+    Raises:
+        InputError: a recording that cannot be replayed.
+    """
+    chosen = _choose_outputs(trace, outputs, source)
+    _check_signals(trace, model, chosen, source)
+    rows = _take_rows(trace, chosen)
+    ratio = trace.period / model["controller.period"]
+    rows_in_cycle, cycles_in_row = round(1 / ratio), round(ratio)
+    ms = 1e3 * trace.period
+    if abs(ratio - 1) < SAME_PERIOD:
+        return [_fill_inputs(rows, trace, source)]
+    if rows_in_cycle > 1 and abs(1 / ratio / rows_in_cycle - 1) < SAME_PERIOD:
+        phase = _find_new_current(rows.cor, rows_in_cycle)
+        if phase is not None:
+            note = f"rows every {ms:g} ms, current new every {rows_in_cycle}: one row a cycle is used"
+            return [_fill_inputs(_thin_rows(rows, rows_in_cycle, phase).with_notes(note), trace, source)]
+    ways = [rows.with_notes(f"the model's cycle of {1e3 * model['controller.period']:g} ms is taken as the trace's, "
+                            f"{ms:g} ms")]
+    if 1 < cycles_in_row <= 20 and abs(ratio / cycles_in_row - 1) < SAME_PERIOD:
+        note = f"rows every {ms:g} ms are taken as one cycle in {cycles_in_row}; the current between is interpolated"
+        ways.append(_spread_rows(rows, cycles_in_row).with_notes(note))
+    return [_fill_inputs(way, trace, source) for way in ways]
+
+
+def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object) -> tuple[str, ...]:
+    for name in ("cor", "com", "xj"):
+        if name not in trace.signals:
+            raise InputError(source, name, "a measured column: a replay starts from the current, Com and XJ")
+    if len(trace) < FEWEST_ROWS:
+        raise InputError(source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
+    measured = [name for name in OUTPUTS if name in trace.signals]
+    for name in outputs or ():
+        if name not in OUTPUTS:
+            raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
+        if name not in measured:
+            raise InputError(source, name, f"a measured signal; this trace has {', '.join(measured)}")
+    return tuple(name for name in measured if not outputs or name in outputs)
+
+
+def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: object) -> None:
+    """Refuse another plant's recordings, other units and dead sensors."""
+    recorded = trace.provenance.get("plant", "")
+    if recorded in MODULES and recorded != model.plant:
+        raise InputError(source, "--model", f"{recorded}, whose rig recorded this, not {model.plant}")
+    if trace.period > 50 * model["controller.period"]:
+        raise InputError(source, "t", f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
+    for name, factor, limit in LIMITS:
+        largest = float(np.nanmax(np.abs(trace.column(name)))) if name in trace.signals else 0.0
+        if largest > factor * model.values.get(limit, math.inf):
+            times = largest / model[limit]
+            raise InputError(source, name, f"values in {SIGNALS[name].unit}; the largest, {largest:g}, is "
+                                           f"{times:.0f} times {limit}")
+    moves = float(np.nanmax(trace.com) - np.nanmin(trace.com)) > STILL
+    for name in chosen:
+        values = trace.column(name)
+        lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
+        if lowest == highest and (moves or name == "xj"):
+            without = ",".join(other for other in chosen if other != name) or "xj"
+            hint = "" if name == "xj" else f" (--signals {without} leaves it out)"
+            raise InputError(source, name, f"a signal that changes; it is {lowest:g} throughout{hint}")
+        if moves and highest - lowest < FAINT.get(name, 0.0):
+            raise InputError(source, name, f"values in {SIGNALS[name].unit}; the largest is {highest:g}")
+
+
+def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
+    """The recording row by row, nothing filled yet; of the outputs only those that were chosen, and XJ."""
+    notes = []
+    grid = trace.t[0] + trace.period * np.arange(len(trace))
+    jitter = float(np.abs(trace.t - grid).max())
+    if jitter > 0.1 * trace.period:
+        notes.append(f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
+    nothing = np.full(len(trace), np.nan)
+    # the controller's block and the anchor of a replay need XJ, chosen or not
+    left_out = {name: nothing for name in OUTPUTS if name not in chosen and name != "xj"}
+    return replace(trace, **left_out, usable=np.ones(len(trace), bool),  # type: ignore[arg-type]
+                   filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace), outputs=tuple(chosen),
+                   notes=(*trace.notes, *notes))
+
+
+def _find_incomplete(trace: Trace) -> Flags:
+    """Rows in which Com, XJ or Cor was not recorded.
+
+    Where rows are resampled or moved onto those of another run, only the rows without XJ count as incomplete: Com and
+    Cor are then those that were filled in.
+    """
+    return np.isnan(trace.com) | np.isnan(trace.xj) | np.isnan(trace.cor)
+
+
+def _find_new_current(cor: Floats, rows: int) -> int | None:
+    """Which of so many rows brings a new current, 0 for the first; None if more than one does."""
+    new = np.flatnonzero(np.diff(cor) != 0.0) + 1
+    counts = np.bincount(new % rows, minlength=rows)
+    return int(counts.argmax()) if len(new) and counts.max() > 0.95 * len(new) else None
+
+
+def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
+    """Every so many rows, from row `phase` on."""
+    columns: dict[str, Any] = {name: getattr(trace, name)[phase::rows] for name in PER_ROW}
+    columns["incomplete"] = np.isnan(columns["xj"])
+    return replace(trace, **columns, period=trace.period * rows)
+
+
+def _spread_rows(trace: Trace, cycles: int) -> Trace:
+    """Each row as one of so many cycles, nothing recorded in the others."""
+    n = (len(trace) - 1) * cycles + 1
+    period = trace.period / cycles
+    columns: dict[str, Any] = {}  # Any, as `replace` cannot tell them from other fields
+    for name in ("com", "cor", "load", *OUTPUTS):
+        columns[name] = np.full(n, np.nan)
+        columns[name][::cycles] = getattr(trace, name)
+    return replace(trace, **columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
+                   phase=np.repeat(trace.phase, cycles)[:n], usable=np.ones(n, bool), filled=np.zeros(n, bool),
+                   incomplete=np.isnan(columns["xj"]))
+
+
+def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.3, abrupt: float = 0.1) -> Trace:
+    """Com, Cor and load without gaps; rows flagged that no replay can be compared with.
+
+    Args:
+        rows: the recording on the controller's cycles.
+        trace: as it was recorded.
+        source: its name in error messages.
+        recovery: s after a gap, until an anchored replay is back on the recording.
+        abrupt: share of the largest current; a gap across which the current changes by more cannot be filled.
+    """
+    cor, unknown = bridge_gaps(rows.cor, max(BRIDGED_ROWS, round(trace.period / rows.period)))
+    missing = np.isnan(rows.cor)
+    change = np.abs(hold_next(rows.cor) - hold_last(rows.cor))
+    unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.cor)))
+    usable = rows.usable & ~_extend_flags(unknown, round(recovery / rows.period))
+    notes = []
+    lost = int(np.isnan(trace.cor).sum())
+    if lost:
+        notes.append(f"the current is missing in {lost} of {len(trace)} rows; "
+                     f"{(~usable).sum() * rows.period:.2g} s of the trace could not be replayed")
+    for name in rows.outputs:
+        frozen = _find_frozen(getattr(rows, name), rows.com if name == "xj" else rows.xj)
+        if frozen.any():
+            first = float(rows.t[int(np.argmax(frozen))])
+            seconds = float(frozen.sum()) * rows.period
+            notes.append(f"{name} is frozen for {seconds:.2f} s, first at {first:.2f} s: left out there")
+            usable &= ~frozen
+    if _starts_in_motion(rows):
+        start = round(recovery / rows.period)
+        notes.append(f"the ram already moves in the first row: the first {start * rows.period:g} s are not judged")
+        usable[:start] = False
+    if usable.sum() < FEWEST_ROWS:
+        raise InputError(source, "cor", f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
+    return replace(rows, cor=cor, com=_fill_demand(rows.com), load=hold_last(rows.load), usable=usable, filled=missing,
+                   notes=(*rows.notes, *notes))
+
+
+def _fill_demand(com: Floats, step: float = 2e-4) -> Floats:
+    """Com where it is missing: on straight lines, but held before a change by more than `step` m: a step."""
+    rows, missing = np.arange(len(com)), np.isnan(com)
+    before, behind = hold_last(com), hold_next(com)
+    line = np.interp(rows, rows[~missing], com[~missing])
+    return np.where(missing & (np.abs(behind - before) > step), before, line)
+
+
+def _extend_flags(flagged: Flags, rows: int) -> Flags:
+    """The flagged rows, and so many after each."""
+    edges = np.cumsum(flagged)
+    before = np.concatenate([np.zeros(min(rows, len(edges)), int), edges[:-rows]]) if rows else edges
+    out: Flags = (edges - before) > 0
+    return out | flagged
+
+
+def _find_frozen(x: Floats, mover: Floats, longest: int = 200, moved: float = 1e-3, jump: float = 5.0) -> Flags:
+    """Rows in which `x` repeats one value while `mover` goes on, and then jumps, or never changes again.
+
+    A ram at rest under a coarse converter also repeats its value, but goes on by the converter's steps.
+
+    Args:
+        x: the signal.
+        mover: m; moves it if it is alive.
+        longest: equal rows that a live signal may have.
+        moved: m that the mover goes on, for a signal that never changes again.
+        jump: steps, in usual ones, that a signal makes when it comes back.
+    """
+    out = np.zeros(len(x), bool)
+    steps = np.abs(np.diff(x))
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0.0]))
+    for first, stop in zip(starts, [*starts[1:], len(x)], strict=True):
+        if stop - first < longest or np.isnan(mover[first:stop]).all():
+            continue
+        way = float(np.nanmax(mover[first:stop]) - np.nanmin(mover[first:stop]))
+        if stop == len(x):
+            out[first:stop] = way > moved
+        else:
+            out[first:stop] = way > STILL and steps[stop - 1] > jump * usual
+    return out
+
+
+def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
+    """Whether the ram moves faster than `fast` m/s in the first row: replays start at rest.
+
+    The speed is that of a parabola through the first `rows` positions.
+    """
+    first = trace.xj[:rows]
+    if np.isnan(first).any():
+        return False
+    k = np.arange(rows)
+    parabola = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))
+    return abs(float(parabola[1] @ first) / trace.period) > fast
+
+
+class Repeat(NamedTuple):
+    """A prepared repeat and its place: its row k corresponds to row k + `late` of the first run."""
+
+    trace: Trace
+    late: int
+
+
+def find_repeat(first: Trace, trace: Trace, model: Model, number: int, same_share: float = 0.98) -> Repeat:
+    """Prepare a repeat of the prepared run `first`, and find its place by its command.
+
+    Args:
+        first: the prepared run.
+        trace: the repeat as it was recorded.
+        model: as for `first`.
+        number: of the repeat, for error messages.
+        same_share: share of the rows in which both commands must be the same.
+
+    Raises:
+        InputError: another command, other cycles, or no signal in common.
+    """
+    source = f"--repeat {trace.provenance.get('source', number)}"
+    outputs = [name for name in first.outputs if name in trace.signals]
+    if not outputs:
+        raise InputError(source, ", ".join(first.outputs), "a signal that the trace has too")
+    ways = [way for way in read_cycles(trace, model, outputs, source) if way.period == first.period]
+    if not ways:
+        raise InputError(source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
+    repeat = ways[0]
+    for late in (0, _find_first_move(first.com) - _find_first_move(repeat.com)):
+        if _measure_agreement(first.com, repeat.com, late) >= same_share:
+            return Repeat(repeat, late)
+    raise InputError(source, "com", "the command of the trace it repeats; another command is no repeat")
+
+
+def _find_first_move(com: Floats) -> int:
+    return int(np.argmax(np.abs(com - com[0]) > SAME_COMMAND_POSITION))
+
+
+def _measure_agreement(a: Floats, b: Floats, late: int, overlap: float = 0.5) -> float:
+    """The share of the common rows in which b, `late` rows later, is a; 0 if these are less than `overlap` of a."""
+    first, last = max(0, late), min(len(a), len(b) + late)
+    if last - first < overlap * len(a):
+        return 0.0
+    return float(np.mean(np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION))
+
+
+def align_columns(columns: Mapping[str, Floats], late: int, rows: int) -> dict[str, Floats]:
+    """A repeat's columns on the `rows` of the first run, NaN where it has none."""
+    out = {}
+    for name, column in columns.items():
+        out[name] = np.full(rows, np.nan)
+        first, last = max(0, late), min(rows, len(column) + late)
+        out[name][first:last] = column[first - late:last - late]
+    return out
+
+
+def align_repeat(repeat: Repeat, rows: int) -> Trace:
+    """A repeat on the `rows` of the first run; before its own first row the ram rests, and nothing was measured."""
+    trace = repeat.trace
+    wanted = np.arange(rows) - repeat.late
+    place = np.clip(wanted, 0, len(trace) - 1)
+    columns: dict[str, Any] = {name: getattr(trace, name)[place] for name in PER_ROW}
+    usable = (wanted == place) & trace.usable[place]
+    return replace(trace, **columns | {"usable": usable, "incomplete": np.isnan(columns["xj"]) | ~usable})

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, scaled_bounds
-from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogProblem
-from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.unidentifiable import remove_slope
+from fdi.estimation.replay import hold_inputs
+from fdi.estimation.unidentifiable import LogFree, LogFrictionRatio, LogProblem, remove_slope
 from fdi.estimation.unknowns import silence_readings
 from fdi.identification.free_parameters import get_systematic_sd
 from fdi.identification.global_fit import find_flat, scale_values

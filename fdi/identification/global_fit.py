@@ -14,12 +14,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.final_rounds import descend_valley, guess_covariance, start_fit
-from fdi.estimation.fit import Fit
+from fdi.estimation.fit import Fit, evolve_fit, follow_population
 from fdi.estimation.likelihood import Free, compute_misfit, scale_noise, scaled_bounds
-from fdi.estimation.logarithms import LogFree, LogFrictionRatio, LogProblem, compute_values
-from fdi.estimation.population import evolve_fit, follow_population
-from fdi.estimation.unidentifiable import find_flat_directions
+from fdi.estimation.unidentifiable import (
+    LogFree,
+    LogFrictionRatio,
+    LogProblem,
+    compute_values,
+    descend_valley,
+    find_flat_directions,
+    guess_covariance,
+    start_fit,
+)
 from fdi.progress import Progress, ignore_progress
 from plant.threads import map_in_threads
 

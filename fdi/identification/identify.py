@@ -1,32 +1,31 @@
 """The nominal model of a user's actuator: its parameters from measured runs, and what these runs cannot tell.
 
 The data sheet says where each parameter is about (`free_parameters`). Regressions on the signals give first values
-(`closed_form`), a fit that begins far away goes on from there (`global_fit`), and the last rounds have fine steps and
-the noise that is left. A parameter whose interval stays wide is not identifiable from these runs: it keeps the data
-sheet's value, and `experiments` says which run would show it. Held-out runs judge the result.
+(`estimate_by_regressions`), a fit that begins far away goes on from there (`global_fit`), and the last rounds have fine
+steps and the noise that is left. A parameter whose interval stays wide is not identifiable from these runs: it keeps
+the data sheet's value, and `experiments` says which run would show it. Held-out runs judge the result.
 """
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi.discovery.runs import Source
+from fdi.discovery.update_model import Provenance, format_model_file
 from fdi.estimation import noise as noises
-from fdi.estimation.final_rounds import start_fit
-from fdi.estimation.fit import Fit
+from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_typical_rms, limit_friction_values
-from fdi.estimation.logarithms import LogFrictionRatio, LogProblem, compute_values
 from fdi.estimation.long_recordings import can_be_cut, choose_excerpt, cut_excerpt, is_long
 from fdi.estimation.noise import sensor_floors
-from fdi.estimation.replay import find_undecided_rows
+from fdi.estimation.replay import differentiate, find_undecided_rows
+from fdi.estimation.unidentifiable import LogFrictionRatio, LogProblem, compute_values, start_fit
 from fdi.estimation.unknowns import silence_readings
-from fdi.identification.closed_form import estimate_by_regressions
-from fdi.identification.controller import ControllerGains, read_controller
 from fdi.identification.experiments import Advice, advise_experiments
 from fdi.identification.free_parameters import Range, get_systematic_sd, list_unknowns
 from fdi.identification.global_fit import (
@@ -38,7 +37,9 @@ from fdi.identification.global_fit import (
     scale_values,
     search_other_valleys,
 )
+from fdi.output import replace_text
 from fdi.progress import Progress, ignore_progress
+from fdi.sources import name_software
 from fdi.thresholds import (
     FITTED_RUN_WORST,
     HELD_OUT_UNDECIDED_SHARE,
@@ -438,3 +439,269 @@ def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], 
     advice = advise_experiments(model, free, problem, None, [r.name for r in ranges])
     return Identification("CANNOT_TELL", reason, model, model, estimates, None, (), tuple(advice), errors, floor,
                           tuple(runs), residuals, tuple(sources), tuple(notes))
+
+
+def write_identified_model(found: Identification, path: str | Path, command: str = "", date: str = "") -> Path | None:
+    """Write the model file; return where the file that was there before is now, None if there was none.
+
+    Args:
+        found: the identification.
+        path: the file.
+        command: what the user typed.
+        date: of today, as text.
+
+    Raises:
+        InputError: a file that cannot be written.
+    """
+    return replace_text(path, format_identified_model(found, command, date))
+
+
+def format_identified_model(found: Identification, command: str = "", date: str = "") -> str:
+    """The text of the model file."""
+    intervals = {e.name: Value(e.value, e.low, e.high, e.unit) for e in found.estimates if e.is_identifiable}
+    errors = found.errors
+    origin: dict[str, str | list[str]] = {
+        "verdict": found.verdict, "date": date,
+        "runs": [e.source.file for e in errors if not e.is_held_out],
+        "runs_sha256": [e.source.sha256 for e in errors if not e.is_held_out],
+        "holdouts": [e.source.file for e in errors if e.is_held_out],
+        "holdouts_sha256": [e.source.sha256 for e in errors if e.is_held_out],
+        "not_identifiable": [e.name for e in found.estimates if not e.is_identifiable]}
+    known = Provenance(name_software(), (command,) if command else (), floor=found.floor, signals=tuple(found.floor),
+                       identification=origin)
+    text = format_model_file(found.model, intervals, known)
+    return _mark_unseen(text, {e.name: f"{e.low:.3g} .. {e.high:.3g}" for e in found.estimates
+                               if not e.is_identifiable})
+
+
+def _mark_unseen(text: str, unseen: Mapping[str, str]) -> str:
+    """The text with a remark beside each parameter that the runs do not show."""
+    group, lines = "", []
+    for line in text.splitlines():
+        if line.startswith("["):
+            group = line.strip("[]").removeprefix("design.")
+        name = f"{group}.{line.partition(' = ')[0]}"
+        if name in unseen:
+            line += f"{',' if '#' in line else '  #'} not identifiable from the runs, {unseen[name]}"
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+GAIN, LIMIT = "controller.proportional_gain", "controller.current_limit"
+
+
+class ControllerGains(NamedTuple):
+    """The proportional law, answer = gain * error up to a limit, and how well it holds."""
+
+    gain: float  # A/m
+    limit: float | None  # A; None where the answer never stayed at its largest value
+    exact: float  # share of the rows in which it holds
+
+    @property
+    def is_proportional(self) -> bool:
+        """Whether this is the law: else the gains of the model are left alone."""
+        return self.exact > 0.95
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameters of the model, SI; none if this is not the law."""
+        if not self.is_proportional:
+            return {}
+        return {GAIN: self.gain} | ({} if self.limit is None else {LIMIT: self.limit})
+
+
+def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows: int = 20) -> ControllerGains | None:
+    """The law of the controller that was at work in some runs; None where its error or its answer is always zero.
+
+    Args:
+        runs: with Com, XJ and Cor.
+        tolerance: of an answer, as a share of the largest one, up to which the law holds.
+        fewest_rows: at the largest answer, from which on that is the limit.
+    """
+    error = np.concatenate([t.com - t.xj for t in runs])
+    answer = np.concatenate([t.cor for t in runs])
+    known = np.isfinite(error) & np.isfinite(answer)
+    error, answer = error[known], answer[known]
+    largest = float(np.abs(answer).max(initial=0.0))
+    inside = (np.abs(answer) < 0.99 * largest) & (np.abs(error) > 0.0) & (np.abs(answer) > 0.0)
+    if not inside.any():
+        return None
+    ratio = answer[inside] / error[inside]
+    weight = np.abs(error[inside])
+    order = np.argsort(ratio)
+    middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+    gain = float(ratio[order][middle])
+    left = np.abs(answer - np.clip(gain * error, -largest, largest))
+    at_limit = int((np.abs(answer) > (1.0 - 1e-9) * largest).sum())
+    return ControllerGains(gain, largest if at_limit >= fewest_rows else None,
+                           float((left <= tolerance * largest).mean()))
+
+
+Flags = NDArray[np.bool_]
+
+SMOOTHED = 25  # rows of the parabola that gives speed and acceleration
+MOVING = 1e-3  # m/s, above which the ram's friction is the dynamic one
+STALLED_ROWS = 20  # at a limit, in a row or not, that show it
+
+
+def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozenset[str] = frozenset()
+                            ) -> dict[str, float]:
+    """Parameters that the runs show without a replay, SI; those that need a signal nobody measured are left out.
+
+    Args:
+        runs: prepared for replay; of one actuator.
+        model: with the values of the data sheet, for what the regressions cannot tell.
+        known: parameters that are not free, so that others make up for them.
+    """
+    found: dict[str, float] = {}
+    stroke = _estimate_stroke(runs)
+    if stroke > 0.98 * model["jack.travel"] or _dwells(np.concatenate([t.xj for t in runs]), stroke):
+        found["jack.travel"] = stroke
+    if all("p12" in t.outputs for t in runs):
+        pressure = np.concatenate([t.mask_unusable("p12") for t in runs])
+        highest = _find_limit(pressure)
+        if highest > model["supply.pressure"] or _dwells(pressure, highest):
+            found["supply.pressure"] = highest
+    if all("xs" in t.outputs for t in runs):
+        found |= _estimate_spool(runs, model)
+    p = {**model.values, **found}
+    if all({"xs", "p12"} <= set(t.outputs) for t in runs):
+        found |= _estimate_jack(runs, p, "jack.area" not in known)
+    elif all("xs" in t.outputs for t in runs):
+        gain = _regress([_smooth_speed(t) for t in runs], [[t.mask_unusable("xs")] for t in runs])
+        if gain is not None and gain[0] > 0.0:
+            found["valve.flow_gain"] = gain[0] * p["jack.area"]
+    else:
+        gain = _regress([_smooth_speed(t) for t in runs], [[_delay(t.cor, 4)] for t in runs], largest=0.5)
+        if gain is not None and gain[0] > 0.0:
+            opening = p["torque_motor.gain"] / p["feedback_spring.stiffness"]
+            found["valve.flow_gain"] = gain[0] * p["jack.area"] / opening
+    return {name: value for name, value in found.items() if np.isfinite(value) and value > 0.0}
+
+
+def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
+    """Stiffness of the feedback spring, pilot flow gain, and both travels, from current and spool.
+
+    XS settles at GM I/KSF; with the flapper at its stop its speed is GQF XFM/ASV.
+    """
+    found: dict[str, float] = {}
+    size = 61
+    every = np.concatenate([t.mask_unusable("xs") for t in runs])
+    free = 0.6 * _find_limit(every)
+    level = [_average(t.mask_unusable("xs"), size) for t in runs]
+    level = [np.where(_average((np.abs(t.xs) > free).astype(float), size) > 0.0, np.nan, x)
+             for t, x in zip(runs, level, strict=True)]
+    drive = [_average(t.cor, size) for t in runs]
+    gain = _regress(level, [[d] for d in drive])
+    if gain is None or gain[0] <= 0.0:
+        return found
+    ratio = model["feedback_spring.stiffness"] / model["torque_motor.gain"] * gain[0]  # KSF/GM of the model over own
+    found["feedback_spring.stiffness"] = model["feedback_spring.stiffness"] / np.sqrt(ratio)
+    found["torque_motor.gain"] = model["torque_motor.gain"] * np.sqrt(ratio)
+    largest = max(float(np.nanmax(np.abs(t.mask_unusable("xs")))) for t in runs)
+    if largest > 0.98 * model["spool.travel"] or _dwells(every, _find_limit(every)):
+        found["spool.travel"] = _find_limit(every)
+    speeds = [np.abs(differentiate(_fill(t.mask_unusable("xs")), 5, 1)) / t.period for t in runs]
+    highest = _find_limit(np.concatenate(speeds))
+    found["pilot.flow_gain"] = highest * model["spool.end_area"] / model["flapper.travel"]
+    return found
+
+
+def _estimate_jack(runs: Sequence[Trace], p: Mapping[str, float], is_area_free: bool) -> dict[str, float]:
+    """Flow gain, leakage, area, mass, damping and friction from spool, pressure, position and load."""
+    found: dict[str, float] = {}
+    speed = [_smooth_speed(t) for t in runs]
+    acceleration = [differentiate(_fill(t.mask_unusable("xj")), SMOOTHED, 2) / t.period**2 for t in runs]
+    spool = [_average(t.mask_unusable("xs"), 9) for t in runs]
+    pressure = [_average(t.mask_unusable("p12"), 9) for t in runs]
+    away = [np.where((np.abs(t.xj) < 0.97 * p["jack.travel"]) & (np.abs(q) < 0.8 * p["supply.pressure"]), 1.0, np.nan)
+            for t, q in zip(runs, pressure, strict=True)]
+    flow = _regress([v * w for v, w in zip(speed, away, strict=True)],
+                    [[x, -q] for x, q in zip(spool, pressure, strict=True)])
+    moving = [np.where((np.abs(v) > MOVING) & (np.abs(a) < 20.0), w, np.nan)
+              for v, a, w in zip(speed, acceleration, away, strict=True)]
+    load = [t.load for t in runs]
+    is_loaded = float(np.ptp(np.concatenate(load))) > 0.0
+    columns = [[a, v, np.sign(v), *([f] if is_loaded else [])]
+               for a, v, f in zip(acceleration, speed, load, strict=True)]
+    force = _regress([q * w for q, w in zip(pressure, moving, strict=True)], columns)
+    area = p["jack.area"]
+    if force is not None:
+        if is_loaded and is_area_free and force[3] > 0.0:
+            found["jack.area"] = area = 1.0 / force[3]
+        names = ("jack.mass", "jack.damping", "jack.dynamic_friction")
+        found |= {name: area * x for name, x in zip(names, force[:3], strict=True) if x > 0.0}
+        if "jack.dynamic_friction" in found:
+            ratio = p["jack.static_friction"] / p["jack.dynamic_friction"]
+            found["jack.static_friction"] = ratio * found["jack.dynamic_friction"]
+    if flow is not None and flow[0] > 0.0:
+        found["valve.flow_gain"] = flow[0] * area
+        leakage = flow[1] * area - found["valve.flow_gain"] / p["valve.pressure_gain"]
+        if leakage > 0.0:
+            found["jack.leakage"] = leakage
+    return found
+
+
+def _estimate_stroke(runs: Sequence[Trace]) -> float:
+    """Half the stroke, m, as far as the ram went: the level at which it stayed, not a single noisy sample."""
+    return _find_limit(np.concatenate([t.xj for t in runs]))
+
+
+def _find_limit(x: Floats) -> float:
+    """The largest magnitude that some samples reach, so that noise does not set it."""
+    size = np.sort(np.abs(x[~np.isnan(x)]))
+    return float(np.median(size[-STALLED_ROWS:])) if len(size) else 0.0
+
+
+def _dwells(x: Floats, limit: float, share: float = 2e-3, rows: int = 5 * STALLED_ROWS) -> bool:
+    """Whether a signal stays at its limit."""
+    return int((np.abs(x) > (1.0 - share) * limit).sum()) >= rows
+
+
+def _smooth_speed(trace: Trace) -> Floats:
+    speed: Floats = differentiate(_fill(trace.mask_unusable("xj")), SMOOTHED, 1) / trace.period
+    return speed
+
+
+def _fill(x: Floats) -> Floats:
+    rows, there = np.arange(len(x)), ~np.isnan(x)
+    return np.interp(rows, rows[there], x[there]) if there.any() else np.zeros(len(x))
+
+
+def _average(x: Floats, size: int) -> Floats:
+    mean: Floats = np.convolve(np.pad(_fill(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
+    return mean
+
+
+def _delay(x: Floats, rows: int) -> Floats:
+    return np.concatenate([np.full(rows, x[0]), x[:-rows]])
+
+
+def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: float = 1.0, rounds: int = 6
+             ) -> Floats | None:
+    """Coefficients of y (n,) on columns, all runs together, by least squares in which outliers count little.
+
+    Rows whose first column is beyond `largest` times its maximum are left out, as all that saturates there. None if the
+    rows do not tell the columns apart.
+    """
+    target = np.concatenate(y)
+    table = np.column_stack([np.concatenate(c) for c in zip(*columns, strict=True)])
+    there = np.isfinite(target) & np.isfinite(table).all(axis=1)
+    if largest < 1.0 and there.any():
+        there &= np.abs(table[:, 0]) < largest * np.abs(table[there, 0]).max()
+    target, table = target[there], table[there]
+    scale = np.sqrt((table**2).mean(axis=0)) if len(table) > 100 else np.zeros(table.shape[1])
+    if not (scale > 0.0).all():
+        return None
+    weight = np.ones(len(target))
+    found = np.zeros(table.shape[1])
+    for _ in range(rounds):
+        rows = (table / scale) * weight[:, None]
+        found, _, rank, _ = np.linalg.lstsq(rows, target * weight, rcond=1e-6)
+        if rank < len(scale):
+            return None
+        left = np.abs(target - (table / scale) @ found)
+        usual = 1.5 * float(np.median(left)) + 1e-300
+        weight = np.sqrt(np.minimum(1.0, usual / np.maximum(left, 1e-300)))
+    coefficients: Floats = found / scale
+    return coefficients

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from fdi.prognosis.growth_laws import evaluate_shapes
-from fdi.prognosis.regression import NOISES, WANDERS, Posterior
+from fdi.prognosis.regression import NOISES, WANDERS, Posterior, evaluate_shapes
 from fdi.thresholds import NEVER_FACTOR, PACE_FREEDOM, PACE_SCALE, TREND_PATHS
 
 Floats = NDArray[np.float64]

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fdi.diagnosis.bands import Event
-from fdi.diagnosis.beside import Beside, Explanation
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
+from fdi.diagnosis.joint_search import Beside, Explanation
 from fdi.diagnosis.precursors import format_precursor
 from fdi.report.numbers import NO_NUMBER, SIGNAL_NAMES, format_digits, format_interval, format_ratio, join_words
 from fdi.report.report import (

@@ -1,26 +1,32 @@
 """The report of `rig diff`: runs side by side - signals, checks, timing, nodes and models."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import zlib
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fdi.comparison.matched_checks import MatchedCheck
-from fdi.comparison.run_differences import RunDifferences, RunPair, SignalDifference
-from fdi.report import diff_figures
-from fdi.report.numbers import SIGNAL_NAMES, count_nouns, format_digits, format_percent, format_ratio, join_words
-from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
-from fdi.report.run_verdict import read_verdict
-from fdi.report.several_runs import (
-    describe_models,
-    describe_nodes,
-    describe_timing,
-    select_changed,
-    tabulate_facts,
-    tabulate_matched_checks,
+import numpy as np
+
+from fdi.comparison.run_differences import MatchedCheck, RunDifferences, RunPair, SignalDifference
+from fdi.report.drawing import ABOVE, COMMAND, GREEN, LEVELS, shade_sections, start_figure, thin_line, to_svg
+from fdi.report.numbers import (
+    SIGNAL_NAMES,
+    choose_unit,
+    count_nouns,
+    format_digits,
+    format_percent,
+    format_ratio,
+    join_words,
 )
-from fdi.thresholds import RUN_DIFFERENCE_RATIO
-from fdi.trace.trace import Check
+from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Report, Section, Table
+from fdi.report.run_report import format_limits, read_verdict
+from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
+from fdi.trace.trace import Check, Trace
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def build_diff_report(found: RunDifferences, files: Sequence[tuple[str, str]] = ()) -> Report:
@@ -87,7 +93,7 @@ def _tabulate_runs(found: RunDifferences) -> Table:
 
 
 def _show_signals(found: RunDifferences) -> list[Item]:
-    units = diff_figures.choose_difference_units(found)
+    units = choose_difference_units(found)
     columns = [Column("run"), Column("signal"), Column("unit"), Column("RMS difference", align="right"),
                Column("largest", align="right"), Column("at", "s", "right"), Column("noise, A", align="right"),
                Column("noise, run", align="right"), Column("times the noise", align="right"),
@@ -111,7 +117,7 @@ def _show_signals(found: RunDifferences) -> list[Item]:
                f"{format_digits(RUN_DIFFERENCE_RATIO, 2)} times the noise of both runs, noise explains a difference.")
     figure = Figure("Each signal of all runs, and below it the difference from A. Green: two noise floors of both runs "
                     "on either side of zero. The circle marks the largest difference. Shaded: ramps (blue) and dynamic "
-                    "sections (violet) of the command.", partial(diff_figures.draw_differences, found))
+                    "sections (violet) of the command.", partial(draw_differences, found))
     return [Table(columns, rows, caption), *lines, figure]
 
 
@@ -174,3 +180,170 @@ def _collect_check(check: MatchedCheck) -> dict[str, Any]:
             "limits_differ": check.has_other_limits,
             **{field: [pick(result, field) for result in check.results] for field in fields}}
 
+
+COLOURS = ("#1f6feb", "#d9730d", "#bf3989", "#0f8b8d", "#8250df", "#57606a")  # of the runs, the reference first
+
+
+def choose_difference_units(found: RunDifferences) -> dict[str, tuple[float, str]]:
+    """SI value and name of the unit in which the differences of each signal are tabulated and drawn."""
+    largest: dict[str, tuple[str, float]] = {}
+    for pair in found.pairs:
+        for s in pair.signals:
+            largest[s.name] = s.unit, max(abs(s.largest), largest.get(s.name, ("", 0.0))[1])
+    return {name: choose_unit(unit, size) for name, (unit, size) in largest.items()}
+
+
+def draw_differences(found: RunDifferences) -> str:
+    """Command and position, then each signal of all runs, and its difference from the reference below it."""
+    units = choose_difference_units(found)
+    heights = [1.1] + [1.2, 1.1] * len(units)
+    with start_figure(0.8 + sum(heights)) as figure:
+        axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+        reference = found.runs[0].trace
+        axes[0].plot(*thin_line(reference.t, reference.com * 1e3), color=COMMAND, lw=1.6, label="Com A")
+        for pair, colour in zip(found.pairs, COLOURS[1:] * len(found.pairs), strict=False):
+            if not pair.has_same_command:
+                other = pair.run.trace
+                axes[0].plot(*thin_line(other.t + pair.offset, other.com * 1e3), color=colour, lw=0.9,
+                             label=f"Com {pair.run.label}")
+        axes[0].set_ylabel("Com [mm]")
+        for i, name in enumerate(units):
+            _draw_signal(axes[1 + 2 * i], found, name)
+            _draw_difference(axes[2 + 2 * i], found, name, units[name])
+        axes[min(1, len(axes) - 1)].legend(ncols=len(found.runs), **ABOVE)
+        for ax in axes:
+            shade_sections(ax, reference)
+        axes[-1].set_xlabel("time of A [s]")
+        axes[-1].set_xlim(float(reference.t[0]), float(reference.t[-1]) + reference.period)
+        figure.align_ylabels()
+        return to_svg(figure, "differences")
+
+
+def _draw_signal(ax: Axes, found: RunDifferences, name: str) -> None:
+    unit, scale = LEVELS[name]
+    offsets = [0.0, *(pair.offset for pair in found.pairs)]
+    for i, (run, offset) in enumerate(zip(found.runs, offsets, strict=True)):
+        if name in run.trace.signals:
+            ax.plot(*thin_line(run.trace.t + offset, run.trace.column(name) * scale), color=COLOURS[i % len(COLOURS)],
+                    lw=1.3 if i == 0 else 0.8, label=run.label)
+    ax.set_ylabel(f"{SIGNAL_NAMES[name]} [{unit}]")
+
+
+def _draw_difference(ax: Axes, found: RunDifferences, name: str, unit: tuple[float, str]) -> None:
+    scale, word = unit
+    band = 0.0
+    for i, pair in enumerate(found.pairs, start=1):
+        signal: SignalDifference | None = next((s for s in pair.signals if s.name == name), None)
+        if signal is not None:
+            band = max(band, NOISE_BAND_RATIO * math.hypot(*signal.noise) / scale)
+            ax.plot(*thin_line(pair.t, pair.differences[name] / scale), color=COLOURS[i % len(COLOURS)], lw=0.7,
+                    label=f"{pair.run.label} - A")
+            ax.plot([signal.t], [signal.largest / scale], "o", ms=4, mfc="none", color=COLOURS[i % len(COLOURS)])
+    ax.axhspan(-band, band, color=GREEN, alpha=0.25, lw=0)
+    ax.set_ylabel(f"difference\n{SIGNAL_NAMES[name]} [{word}]")
+
+
+MISSING = Cell("-", "muted")
+TIMINGS = (("SYNC lateness", "lateness"), ("controller's response", "response"), ("bench's own work", "work"))
+
+
+def tabulate_matched_checks(labels: Sequence[str], checks: Sequence[MatchedCheck], medium: Medium = Medium.BOTH,
+                            caption: str = "") -> Table:
+    """A row for each check: name, limits, the value of each run, and the verdicts, marked where they changed.
+
+    Args:
+        labels: a short name of each run, in the order of the results.
+        checks: the matched checks.
+        medium: where the table is shown.
+        caption: what to see in it.
+    """
+    columns = [Column("check"), Column("limits", align="right"), Column("unit"),
+               *(Column(label, align="right") for label in labels), Column(" -> ".join(labels)), Column("")]
+    rows: list[list[Cell | str]] = []
+    for check in checks:
+        first = check.first
+        limits = "differ" if check.has_other_limits else format_limits(first.low, first.high)
+        rows.append([check.name, limits, "" if first.unit == "1" else first.unit,
+                     *(_format_value(result) for result in check.results), _join_verdicts(check.results),
+                     Cell("changed", "bad", True) if check.is_changed else ""])
+    return Table(columns, rows, caption, medium=medium)
+
+
+def _format_value(check: Check | None) -> Cell | str:
+    if check is None:
+        return MISSING
+    return Cell("not measurable", "muted") if math.isnan(check.value) else f"{check.value:.4g}"
+
+
+def _join_verdicts(results: Sequence[Check | None]) -> Cell:
+    words = [_name_verdict(check) for check in results]
+    text = " -> ".join(words) if len(set(words)) > 1 else words[0]
+    if "FAIL" in words:
+        return Cell(text, "bad")
+    return Cell(text, "good" if "pass" in words else "muted")
+
+
+def _name_verdict(check: Check | None) -> str:
+    if check is None:
+        return "-"
+    return "pass" if check.passed else "FAIL"
+
+
+def tabulate_facts(heading: str, labels: Sequence[str], facts: Mapping[str, Sequence[str]],
+                   medium: Medium = Medium.BOTH, caption: str = "") -> Table | None:
+    """A row for each fact, with the text of each run; bold where the runs differ. None if there is no row to show."""
+    rows: list[list[Cell | str]] = []
+    for name, texts in facts.items():
+        differs = len(set(texts)) > 1
+        if any(texts):
+            shown = [text[:12] for text in texts] if name == "commit" else texts  # as git abbreviates it
+            rows.append([name, *(Cell(text, is_strong=differs) if text else MISSING for text in shown)])
+    columns = [Column(heading), *(Column(label) for label in labels)]
+    return Table(columns, rows, caption, medium=medium) if rows else None
+
+
+def select_changed(facts: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+    """The facts that two runs or more have, and in which they differ."""
+    return {name: texts for name, texts in facts.items() if sum(map(bool, texts)) > 1 and len(set(texts)) > 1}
+
+
+def describe_timing(traces: Sequence[Trace]) -> dict[str, list[str]]:
+    """Percentiles of lateness, response and work, and overruns, of each run; "" where a run has none."""
+    out: dict[str, list[str]] = {"kind of timing": [trace.provenance.get("timing.kind", "") for trace in traces]}
+    for words, field in TIMINGS:
+        out[f"{words}, p50 / p99 / max"] = [_format_percentiles(getattr(trace.timing, field)) for trace in traces]
+    out["overruns"] = [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}" if len(trace.timing.t) else ""
+                       for trace in traces]
+    return out
+
+
+def _format_percentiles(values: Any) -> str:
+    known = values[~np.isnan(values)] * 1e6
+    if not len(known) or not known.any():
+        return ""
+    return f"{np.percentile(known, 50):.0f} / {np.percentile(known, 99):.0f} / {known.max():.0f} us"
+
+
+def describe_nodes(traces: Sequence[Trace]) -> dict[str, list[str]]:
+    """Identity of each node (CiA 301, objects 0x1000, 0x1008 to 0x100A, 0x1018), bus, machine and software versions."""
+    fields = ("name", "hardware", "software", "vendor", "product", "revision", "serial")
+    texts = {"controller": "controller",
+             **{f"node {node}, {field}": f"node{node}.{field}" for node in (2, 3) for field in fields},
+             "bus": "bus", "pace": "pace", "host": "host", "started": "started", "eha-rig": "version.eha-rig",
+             "commit": "git.commit"}
+    return {name: [trace.provenance.get(key, "") for trace in traces] for name, key in texts.items()}
+
+
+def describe_models(traces: Sequence[Trace]) -> dict[str, list[str]]:
+    """Sequence, model, seed, and what differs from nominal (--set, effects, faults) of each run."""
+    texts = {"sequence": "sequence", "model": "model", "differs from nominal": "differences.text", "seed": "seed"}
+    out = {name: [trace.provenance.get(key, "") for trace in traces] for name, key in texts.items()}
+    for kind, start in (("sequence file", "sequence/"), ("effect files", "effects/"), ("model file", "model.toml")):
+        out[kind] = [_describe_files(trace, start) for trace in traces]
+    return out
+
+
+def _describe_files(trace: Trace, start: str) -> str:
+    """Names of attached files with a checksum, which tells files of one name apart."""
+    return ", ".join(f"{name.rpartition('/')[2]} (CRC {zlib.crc32(data):08x})"
+                     for name, data in sorted(trace.attachments.items()) if name.startswith(start))

@@ -8,8 +8,8 @@ from pathlib import Path
 from fdi.report.numbers import SIGNAL_NAMES, choose_unit, count_nouns, format_digits
 from fdi.report.report import Cell, Column, Line, Report, Section, Table
 from fdi.trace.importing.conversion import Imported, ImportedSignal
+from fdi.trace.importing.formats import Measurement
 from fdi.trace.importing.guess import GuessedMap
-from fdi.trace.importing.measurement import Measurement
 from fdi.trace.signals import SIGNALS
 
 MISSING = {"p12": "the forces on the ram are not judged by themselves",

@@ -1,10 +1,11 @@
 """The report of a run: verdict, checks, signals over time, cycle timing, events, NMT states, provenance."""
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from fdi.report.report import (
     Section,
     Table,
 )
-from fdi.report.run_verdict import read_verdict
 from fdi.trace.trace import Check, Event, Trace
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
@@ -176,9 +176,9 @@ def _draw_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
 
 def _draw_failed_check(trace: Trace, check: Check, number: int) -> Figure:
     def draw() -> str:
-        from fdi.report import check_figures
+        from fdi.report import run_figures
 
-        return check_figures.draw_failed_check(trace, check, f"check{number}")
+        return run_figures.draw_failed_check(trace, check, f"check{number}")
 
     unit = "" if check.unit == "1" else f" {check.unit}"
     measured = check.detail if math.isnan(check.value) else f"{_format_value(check)}{unit} measured"
@@ -302,3 +302,44 @@ def _list_provenance(trace: Trace) -> list[Item]:
     items: list[Item] = [Table([Column(""), Column("")], rows, is_list=True)] if rows else []
     return [*items, *(Listing(data.decode("utf-8", "replace"), f"{name} ({len(data)} bytes)")
                       for name, data in sorted(trace.attachments.items()))]
+
+
+class Verdict(NamedTuple):
+    """The result of a run."""
+
+    word: str  # PASS, FAIL, INVALID_TIMING, ABORTED; NOT_JUDGED without checks
+    why: str  # the reason; empty if the run passed
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.why}" if self.why else self.word
+
+
+def read_verdict(trace: Trace) -> Verdict:
+    """The verdict in the log of the run; of a trace without one (recovered, CSV) that of its checks."""
+    notes = trace.provenance
+    failed = [check.name for check in trace.checks if not check.passed]
+    word, why = notes.get("verdict.verdict") or _judge_checks(trace), notes.get("verdict.why", "")
+    if word == "INVALID_TIMING" and notes.get("verdict.timing"):
+        return Verdict(word, notes["verdict.timing"])
+    if word == "INVALID_TIMING":  # logs of earlier versions
+        late = notes.get("verdict.overruns") or str(int(trace.timing.overrun.sum()))
+        limit = ""
+        with contextlib.suppress(KeyError, ValueError):  # a log of another program may lack it
+            limit = f", more than {100 * float(notes['max_overruns']):g} %"
+        lateness = f"the bench itself was late: {late} overruns in {len(trace)} cycles{limit}"
+        return Verdict(word, f"{lateness}; {why}" if why else lateness)
+    if word == "FAIL" and not why and failed:
+        return Verdict(word, f"{len(failed)} of {len(trace.checks)} checks failed: {_list_names(failed)}")
+    if word == "FAIL" and not why:
+        return Verdict(word, "the checks passed, but the run did not end as the sequence says")
+    return Verdict(word, why)
+
+
+def _judge_checks(trace: Trace) -> str:
+    if not trace.checks:
+        return "NOT_JUDGED"
+    return "PASS" if all(check.passed for check in trace.checks) else "FAIL"
+
+
+def _list_names(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

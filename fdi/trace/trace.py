@@ -110,7 +110,7 @@ class Trace:
     Columns have shape (n,) and SI units; a signal that was not measured is NaN throughout. t = 0 is where
     the main phase starts.
 
-    A trace that was prepared for replay (fdi.estimation.preparation) has Com, Cor and load without gaps, names the
+    A trace that was prepared for replay (fdi.estimation.replay) has Com, Cor and load without gaps, names the
     `outputs` that replays are compared with, and flags the rows for which that cannot be done.
     """
 

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.geometric_mean import estimate_geometric_mean
+from fdi.estimation.binomial import estimate_geometric_mean
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
 from fdi.report.report import Cell, Column, Item, Line, Mood, Report, Section, Table

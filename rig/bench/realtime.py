@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
+from fdi.report.numbers import format_digits
+from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
 from plant.errors import InputError, RigError
 from rig.bench.responders import run_c_responder, run_emulator
-from rig.bench.stopwatch import find_gcc
+from rig.bench.stopwatch import GET_GCC, find_gcc
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link
+from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.network.raw_bus import can_open, open_raw_bus
-from rig.network.wire import LinkWire
 from rig.recorder import Recorder, Signals, Timing
 from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
-from rig.run.history import History
-from rig.run.loop import CycleInput, CycleLoop, Loop
+from rig.run.loop import CycleInput, CycleLoop, History, Loop
 from rig.run.priority import (
     LOOP_PRIORITY,
     list_cpus,
@@ -226,3 +226,64 @@ def parse_histogram(text: str) -> NDArray[np.float64]:
             bins.append((int(words[0]), int(words[1])))
     latencies, counts = np.array([*bins, (most, overflows)]).T
     return np.repeat(latencies, counts) * 1e-6
+
+
+_NAMES = {
+    "lateness": {CYCLICTEST: "cyclictest", COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)",
+                 PYTHON: "rig, cycle in Python"},
+    "feedback_response": {COMPILED: "plant emulator, compiled", IN_C: "responder in C",
+                          PYTHON: "plant emulator in Python"},
+    "execution": {COMPILED: "rig, compiled cycle", IN_C: "rig, compiled cycle (C answers)"},
+}
+_NAMES["valve_response"] = _NAMES["feedback_response"]
+_TITLES = {
+    "lateness": ("SYNC lateness", "How long after its due time SYNC was sent; for cyclictest, how late it woke up. The "
+                                  "compiled cycle wakes 80 us early and watches the clock."),
+    "feedback_response": ("SYNC to feedback", "From SYNC until the kernel received the feedback frame."),
+    "valve_response": ("SYNC to valve state", "From SYNC until the kernel received the valve state."),
+    "execution": ("Execution", "Time that the rig's cycle takes: collecting answers, command, SYNC; without waiting."),
+}
+_SHARES = (("p50", "p50"), ("p99", "p99"), ("p99_9", "p99.9"), ("max", "max"))
+
+
+def build_realtime_report(figures: Mapping[str, Any]) -> Report:
+    """Report on the figures of `rig.bench.realtime.measure_realtime`, which are its `data`."""
+    met = sum(target["is_met"] for target in figures["targets"])
+    priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
+    return Report(
+        command="bench", title="realtime",
+        sentence=f"{met} of {len(figures['targets'])} targets are met on {figures['bus']}.",
+        sections=[Section("Targets", [_tabulate_targets(figures["targets"])]),
+                  *(Section(title, [_tabulate_times(figures["times_us"][quantity], _NAMES[quantity], caption)])
+                    for quantity, (title, caption) in _TITLES.items()),
+                  Section("Conditions", [
+                      Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks, 1 ms "
+                                       f"a cycle, {figures['cpus']} CPUs, {priority}"),
+                      *(Line(f"no answer, {name}", f"{count} of {figures['cycles'][name]} cycles")
+                        for name, count in figures["lost"].items() if count),
+                      *_list_missing(figures["missing"])])],
+        data=figures)
+
+
+def _list_missing(missing: list[str]) -> list[Item]:
+    get = {"cyclictest": GET_CYCLICTEST, "gcc": GET_GCC}
+    return [Line(name, f"skipped: it is not installed; to get it: {get[name]}") for name in missing]
+
+
+def _tabulate_targets(targets: list[dict[str, Any]]) -> Table:
+    rows: list[list[Cell | str]] = []
+    for target in targets:
+        failed = "not measured" if target["value"] is None else "NOT met"
+        word = Cell("met", "good") if target["is_met"] else Cell(failed, "bad")
+        measured = "" if target["value"] is None else format_digits(target["value"])
+        rows.append([target["name"], measured, f"<= {target['limit']:g}", target["unit"], word])
+    columns = [Column("target"), Column("measured", align="right"), Column("limit", align="right"), Column("unit"),
+               Column("")]
+    return Table(columns, rows, "Ratios are those of the percentiles over all blocks.")
+
+
+def _tabulate_times(times: Mapping[str, Mapping[str, float]], names: Mapping[str, str], caption: str) -> Table:
+    columns = [Column(""), *(Column(title, "us", "right") for _, title in _SHARES)]
+    rows = [[name, *(f"{times[key][share]:.1f}" for share, _ in _SHARES)] for key, name in names.items()
+            if times.get(key)]
+    return Table(columns, rows, caption)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.simulated_units import sample_sensor_noise
+from fdi.diagnosis.learn_bands import sample_sensor_noise
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.report.report import Cell, Column, Report, Section, Table

@@ -18,10 +18,9 @@ from rig.bench.stopwatch import find_gcc
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link
+from rig.network.link import Link, serve_node
 from rig.network.node_objects import PLANT
 from rig.network.raw_bus import open_raw_bus
-from rig.network.wire import serve_node
 from rig.nodes.emulator import Emulator
 from rig.run.priority import LOOP_PRIORITY, list_cpus, raise_priority
 

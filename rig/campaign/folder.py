@@ -1,7 +1,7 @@
 """The folder of a campaign.
 
     campaign.json      the matrix, and a hash of the code; a folder belongs to one campaign
-    finished.jsonl     one row per finished case (see `rig.campaign.row_file`)
+    finished.jsonl     one row per finished case (see `rig.campaign.batch`)
     results.parquet    all rows in the matrix's order; replaced as a whole
 """
 from __future__ import annotations
@@ -14,8 +14,8 @@ from types import TracebackType
 from typing import Any
 
 from plant.errors import InputError
+from rig.campaign.batch import Row, RowFile, read_rows
 from rig.campaign.matrix import Matrix, restore_matrix
-from rig.campaign.row_file import Row, RowFile, read_rows
 
 MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
 PART = ".part"

@@ -18,10 +18,9 @@ from plant import Model
 from plant.errors import RigError
 from plant.model import parse_model
 from plant.threads import count_threads
-from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch
+from rig.campaign.batch import Batch, BatchProgress, Row, Workers, run_batch
 from rig.campaign.folder import CampaignFolder, import_pyarrow
 from rig.campaign.matrix import Case, Matrix
-from rig.campaign.row_file import Row
 from rig.campaign.units import simulate_case
 from rig.network.clock import WallClock
 

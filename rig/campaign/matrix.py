@@ -22,7 +22,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi.prognosis.gather import list_traces
+from fdi.prognosis.unit_trend import list_traces
 from plant.effects import Effect
 from plant.errors import InputError, suggest_name
 from plant.model import Model, find_effect

@@ -3,11 +3,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from fdi.diagnosis.faults import FAULTS, Fault
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, to_svg
@@ -26,6 +22,9 @@ from fdi.report.report import (
 )
 from rig.campaign.batch import BatchProgress
 from rig.campaign.summary import name_size
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def describe_progress(progress: BatchProgress) -> str:
@@ -174,6 +173,9 @@ def draw_detection_curves(part: Mapping[str, Any]) -> str:
 
     `part` is the element of `summarise_campaign(...)["tolerances"]` for one tolerance.
     """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
     with rc_context(STYLE):
         figure = Figure(figsize=(10, 3.6), layout="constrained")
         axes = figure.subplots(1, len(FAULTS), sharey=True)

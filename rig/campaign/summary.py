@@ -11,9 +11,9 @@ import numpy as np
 
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Fault, Level, classify_size
 from fdi.estimation.binomial import Share, measure_share
+from rig.campaign.batch import Row
 from rig.campaign.judge import CANNOT_TELL, FAILED, OK, REFUSED
 from rig.campaign.matrix import HEALTHY, label_plant
-from rig.campaign.row_file import Row
 
 OFF_GRID = label_plant({"filter_clogging": 0.17, "spool_friction": 45.0})
 """The paper's second worked case, which no cell of a 21 x 21 grid hits."""

@@ -12,7 +12,7 @@ from rig.cli import options
 from rig.cli.answer import choose_file
 
 if TYPE_CHECKING:
-    from fdi.discovery.model_file import Provenance
+    from fdi.discovery.update_model import Provenance
     from plant import Model
 
 
@@ -36,7 +36,7 @@ def load_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     Raises:
         InputError: a file or a value that cannot be used, or a model file with code that --trust does not allow.
     """
-    from fdi.discovery.model_file import Provenance, load_model_file
+    from fdi.discovery.update_model import Provenance, load_model_file
 
     options.load_chosen_effects(args, args.model)
     if args.model and Path(args.model).is_file():

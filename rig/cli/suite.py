@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rig.run.job_choice import JobChoice
+    from rig.run.job import JobChoice
     from rig.suite.suite import CaseResult, Suite
 
 

@@ -18,8 +18,8 @@ from rig.conformance.data_sheet import (
     VISIBLE_STRING,
     DataSheet,
     Variable,
+    is_restricted,
 )
-from rig.conformance.identifiers import is_restricted
 from rig.conformance.target import Target
 
 # Data type and access of objects of the communication profile, CiA 301, 7.5.2.

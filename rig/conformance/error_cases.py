@@ -4,8 +4,7 @@ from __future__ import annotations
 from functools import partial
 
 from rig.conformance.conformance_case import CaseNotApplicable, case, join_labels, require, require_applicable
-from rig.conformance.data_sheet import Pdo
-from rig.conformance.identifiers import list_restricted_ends
+from rig.conformance.data_sheet import Pdo, list_restricted_ends
 from rig.conformance.pdo_cases import INVALID, operational, read_mapped, send_short
 from rig.conformance.target import (
     COMMANDS,

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rig.conformance.conformance_case import CaseSkipped, case, join_labels, require, require_applicable
-from rig.conformance.data_sheet import Pdo, Variable
-from rig.conformance.identifiers import list_restricted_ends
+from rig.conformance.data_sheet import Pdo, Variable, list_restricted_ends
 from rig.conformance.target import (
     NO_OBJECT,
     OPERATIONAL,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from rig.conformance.conformance_case import CaseFailed, CaseNotApplicable, CaseSkipped
 from rig.conformance.data_sheet import DataSheet, Number, Variable
 from rig.network.frame import Frame
-from rig.network.wire import Wire
+from rig.network.link import Wire
 
 MS = 1_000_000  # ns
 START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130

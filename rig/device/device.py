@@ -4,9 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rig.device.cob_id import check_switchable, check_sync
-from rig.device.consumer_entry import check_consumer_entry
-from rig.device.dictionary import Dictionary, Value
+from rig.device.dictionary import Dictionary, Value, check_consumer_entry, check_switchable, check_sync
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
 from rig.device.nmt import Nmt
 from rig.device.pdo import Pdos
@@ -14,7 +12,7 @@ from rig.device.sdo import Abort, SdoAbort, SdoServer
 from rig.device.sync import SyncConsumer
 from rig.network.frame import Frame, Send
 from rig.network.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from rig.network.nmt_states import NmtState
+from rig.network.node_objects import NmtState
 
 Handler = Callable[[Frame], None]
 _COMMUNICATING = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)  # states in which SDO, SYNC and EMCY exist

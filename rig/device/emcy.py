@@ -5,8 +5,7 @@ import struct
 from collections.abc import Callable
 from enum import IntEnum, IntFlag
 
-from rig.device.cob_id import INVALID
-from rig.device.dictionary import Dictionary
+from rig.device.dictionary import INVALID, Dictionary
 
 _FRAME = struct.Struct("<HB5s")
 REGISTER, HISTORY, COB_ID = 0x1001, 0x1003, 0x1014

@@ -4,7 +4,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rig.network.frame import Frame
-from rig.network.nmt_states import NmtCommand, NmtState
+from rig.network.node_objects import NmtCommand, NmtState
 
 _TARGET = {
     NmtCommand.START: NmtState.OPERATIONAL,

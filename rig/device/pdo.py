@@ -8,8 +8,7 @@ import struct
 from collections.abc import Callable
 
 from plant.errors import InputError
-from rig.device.cob_id import INVALID, check_switchable
-from rig.device.dictionary import Dictionary, Value
+from rig.device.dictionary import INVALID, Dictionary, Value, check_switchable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
 from rig.network.frame import Frame, Send

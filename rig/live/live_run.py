@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from plant import Columns
 from plant.segments import RATE
-from rig.live.dead_node import find_dead_node
 from rig.live.feed import COLUMNS, Message
-from rig.network.node_objects import CONTROLLER, PLANT, RIG
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.sequences import Sequence
 from rig.sequences.checks import Check
-from rig.sequences.run_data import MAIN, RunData
+from rig.sequences.measures import MAIN, RunData
 
 PHASES = ("set-up", "main", "clean-up")
 _COLUMN = {name: number for number, name in enumerate(COLUMNS)}
@@ -199,3 +198,11 @@ def _find_window(check: Check, sections: dict[str, slice], duration: float) -> t
         return round(check.window[0] * RATE), round(check.window[1] * RATE)
     rows = sections.get(check.window)
     return (rows.start, rows.stop) if rows else (0, round(duration * RATE))
+
+
+def find_dead_node(level: str, kind: str, text: str) -> int:
+    """The node that an event reports as dead: its process ended, or its heartbeat stopped; else 0."""
+    for node, name in NAMES.items():
+        if level == "ERROR" and kind in ("process", "heartbeat") and text.startswith(f"node {node} {name}"):
+            return node
+    return 0

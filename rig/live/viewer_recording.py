@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 from rig.live.feed import COLUMNS, Message
 from rig.live.live_run import CheckState, LivePlan, LiveRun
 from rig.network.node_objects import NAMES
-from rig.view.recording import (
+from rig.view.rerun_log import (
+    ACTIVE,
+    PLOTS,
+    SECTIONS,
+    STATES,
+    arrange_run,
+    name_fault_lane,
+    name_node_lane,
+    read_fault_event,
+)
+from rig.view.viewer import (
     FAIL,
     MEASURED,
     NEUTRAL,
@@ -21,16 +31,6 @@ from rig.view.recording import (
     make_plot_view,
     send_lane_style,
     send_line_style,
-)
-from rig.view.rerun_log import (
-    ACTIVE,
-    PLOTS,
-    SECTIONS,
-    STATES,
-    arrange_run,
-    name_fault_lane,
-    name_node_lane,
-    read_fault_event,
 )
 
 _SENT = {"position/command": ("com", 1e3), "position/ram": ("xj", 1e3), "current/current": ("cor", 1e3),

@@ -1,8 +1,16 @@
 """Numbers and application objects of the three nodes, which the rig writes and the nodes obey."""
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Callable
+from enum import IntEnum
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError
 from plant.model import Model
 
 RIG, CONTROLLER, PLANT = 1, 2, 3  # node-IDs
@@ -24,3 +32,129 @@ class Gains(NamedTuple):
 def read_gains(model: Model) -> Gains:
     """What a model's [controller] says."""
     return Gains(*(model[f"controller.{field}"] for field in Gains._fields))
+
+
+class NmtState(IntEnum):
+    """States as the heartbeat carries them."""
+
+    INITIALISING = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class NmtCommand(IntEnum):
+    """Command specifiers of the frame 0x000."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class Identity(NamedTuple):
+    """The identity of a node; None for an object that it does not have."""
+
+    device_type: int | None = None  # 0x1000
+    name: str | None = None  # 0x1008, manufacturer device name
+    hardware: str | None = None  # 0x1009, manufacturer hardware version
+    software: str | None = None  # 0x100A, manufacturer software version
+    vendor: int | None = None  # 0x1018 sub 1, vendor-ID
+    product: int | None = None  # 0x1018 sub 2, product code
+    revision: int | None = None  # 0x1018 sub 3, revision number
+    serial: int | None = None  # 0x1018 sub 4, serial number
+
+    def __str__(self) -> str:
+        """The objects that the node has, in one line."""
+        words = []
+        for key, value in self._asdict().items():
+            if value is not None:
+                label = key.replace("_", " ")
+                words.append(f"{label} 0x{value:08X}" if isinstance(value, int) else f"{label} {value!r}")
+        return ", ".join(words) or "no identity objects"
+
+
+_OBJECTS = {"device_type": (0x1000, 0), "name": (0x1008, 0), "hardware": (0x1009, 0), "software": (0x100A, 0),
+            "vendor": (0x1018, 1), "product": (0x1018, 2), "revision": (0x1018, 3), "serial": (0x1018, 4)}
+_TEXTS = ("name", "hardware", "software")
+
+
+def read_identity(upload: Callable[[int, int], bytes | None]) -> Identity:
+    """The identity of a node; `upload(index, sub)` gives an object's bytes, None where the node has no such object."""
+    found = {key: upload(*place) for key, place in _OBJECTS.items()}
+    texts = {key: _decode_text(data) for key, data in found.items() if data is not None and key in _TEXTS}
+    numbers = {key: int.from_bytes(data[:4], "little") for key, data in found.items()
+               if data is not None and key not in _TEXTS}
+    return Identity(**texts, **numbers)  # type: ignore[arg-type]  # the keys are the fields, with their types
+
+
+def _decode_text(data: bytes, longest: int = 64) -> str:
+    """A VISIBLE_STRING, at most `longest` characters; one that is no printable ASCII becomes a question mark."""
+    text = data.rstrip(b"\0 ")[:longest].decode("ascii", "replace")
+    return "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)
+
+
+RING = 1 << 17  # cycles that are kept: the last two minutes
+_HEAD = struct.Struct("<4sIq")  # version, number of cycles, time of the first SYNC in ns
+_VERSION = b"ECR1"
+_US = 1000  # ns
+_LARGEST = 16 * RING * 6  # bytes after decompression
+
+Times = NDArray[np.int64]
+
+
+class CycleRecord(NamedTuple):
+    """One entry a cycle, in order, each (n,). Times in ns of CLOCK_MONOTONIC, kept to a microsecond.
+
+    `flags` are those of the valve state frame (`codec.Flags`). In a cycle without the frames `sent` is when they would
+    have been sent.
+    """
+
+    cycle: Times  # as in the valve state frame, but not cut to 16 bits
+    sync: Times  # the kernel received SYNC
+    start: Times  # the emulator began the cycle: the difference to `sync` is its wake-up latency
+    sent: Times  # feedback and valve state were handed to the kernel
+    done: Times  # the plant had moved: the emulator was ready for the next SYNC
+    flags: Times
+
+
+def encode_cycle_record(record: CycleRecord) -> bytes:
+    """The bytes of object 0x2212: a head, then the differences from cycle to cycle as bytes of like weight, compressed.
+
+    Empty without a cycle.
+    """
+    if not len(record.cycle):
+        return b""
+    columns = np.array([record.cycle, (record.sync - record.sync[0]) // _US, *(
+        (times - record.sync) // _US for times in (record.start, record.sent, record.done)), record.flags])
+    columns = np.clip(columns, -2**31, 2**31 - 1)
+    changes = np.diff(columns[:2], axis=1, prepend=columns[:2, :1])
+    changes[0, 0] = columns[0, 0]
+    # The period of SYNC and the times after it vary by a few us: most upper bytes are zero, and compress to nothing.
+    body = np.concatenate([changes, columns[2:]]).astype("<i4").view(np.uint8).reshape(6, -1, 4)
+    planes = np.ascontiguousarray(body.transpose(0, 2, 1)).tobytes()
+    return _HEAD.pack(_VERSION, len(record.cycle), int(record.sync[0])) + zlib.compress(planes, 6)
+
+
+def decode_cycle_record(data: bytes) -> CycleRecord:
+    """What `encode_cycle_record` packed; of an emulator without a record (b"") one without cycles.
+
+    Raises:
+        InputError: other bytes.
+    """
+    if not data:
+        return CycleRecord(*(np.zeros(0, np.int64) for _ in CycleRecord._fields))
+    try:
+        version, count, first = _HEAD.unpack_from(data)
+        if version != _VERSION:
+            raise ValueError(f"version {version!r}")
+        planes = zlib.decompressobj().decompress(data[_HEAD.size:], _LARGEST)
+        body = np.frombuffer(planes, np.uint8).reshape(6, 4, count)
+    except (struct.error, zlib.error, ValueError) as error:
+        raise InputError("object 0x2212", "", f"a cycle record of version {_VERSION.decode()} ({error})") from error
+    values = np.ascontiguousarray(body.transpose(0, 2, 1)).view("<i4").reshape(6, count).astype(np.int64)
+    cycle, since = np.cumsum(values[:2], axis=1)
+    sync = first + since * _US
+    start, sent, done = (sync + times * _US for times in values[2:5])
+    return CycleRecord(cycle, sync, start, sent, done, values[5])

@@ -46,7 +46,7 @@ from plant.compile import LibraryFunction, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
 from rig.network.bus import parse_spec, require_interface
-from rig.network.turn import GIVE, TAKE, TURN_LIMIT_NS, Turn
+from rig.network.udp import GIVE, TAKE, TURN_LIMIT_NS, Turn
 
 # status of receive_frame
 TIMEOUT, FRAME, WOKEN = 0, 1, 2

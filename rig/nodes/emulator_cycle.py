@@ -24,7 +24,7 @@ from plant.model import STEPS
 from plant.run import PRESSURE, SENSED, SPOOL
 from plant.segments import RATE
 from plant.solve import NOISES
-from rig.network.cycle_record import RING
+from rig.network.node_objects import RING
 from rig.network.raw_bus import (
     FRAME,
     NEVER,
@@ -40,9 +40,7 @@ from rig.network.raw_bus import (
     sleep_until,
     split_words,
 )
-from rig.sequences.faults import Schedule
-from rig.sequences.frame_faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
-from rig.sequences.injection import AddedSignal
+from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, AddedSignal, Schedule, change_frame
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead

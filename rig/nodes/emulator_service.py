@@ -28,9 +28,8 @@ from plant.run import load_stored_advance, report_law_errors
 from plant.solve import NOISES, read_flat_sensors
 from rig.device import Device, EmcyCode, ErrorRegister, NmtState
 from rig.network import codec
-from rig.network.cycle_record import RING, CycleRecord, encode_cycle_record
 from rig.network.frame import Frame, Send
-from rig.network.node_objects import COUNTERS, CYCLE_RECORD, PLANT, SCENARIO
+from rig.network.node_objects import COUNTERS, CYCLE_RECORD, PLANT, RING, SCENARIO, CycleRecord, encode_cycle_record
 from rig.network.raw_bus import RawBus, make_closed_port
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import accept_scenario

@@ -9,8 +9,7 @@ import numpy as np
 
 from plant import InputError, Model
 from plant.segments import Array
-from rig.sequences.fault_parameters import require_sensible
-from rig.sequences.faults import Plan
+from rig.sequences.faults import Plan, require_sensible
 
 FORCE_RESOLUTION = 1e-3  # N per count: loads travel as whole numbers, because those compress to next to nothing
 LARGEST_DOWNLOAD = 1 << 20  # bytes in one SDO download, as the node's server has it

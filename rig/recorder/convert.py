@@ -3,15 +3,18 @@ from __future__ import annotations
 
 import math
 import time
+from array import array
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from fdi.output import require_writable, write_whole
+from fdi.trace.importing.formats import Channel
 from fdi.trace.importing.import_map import ImportMap
 from fdi.trace.mcap_log import open_log
 from fdi.trace.sensor_dynamics import write_sensors
@@ -19,13 +22,13 @@ from fdi.trace.trace import Trace
 from plant.errors import InputError
 from rig.network import codec
 from rig.network.frame import Frame
-from rig.network.nmt_states import NmtState as State
-from rig.recorder.provenance import collect_provenance
-from rig.recorder.schema import Event, NmtState, Record, Signals
+from rig.network.node_objects import NmtState as State
+from rig.recorder.schema import Event, NmtState, Record, Signals, collect_provenance
 from rig.recorder.writer import Recorder
 
 if TYPE_CHECKING:
     import can
+
 
 RAW_SUFFIXES = (".log", ".blf", ".asc", ".trc")
 NAN = math.nan
@@ -254,3 +257,65 @@ def _wait_for_writer(recorder: Recorder, item: int) -> None:
     if item % 10_000 == 0:
         while recorder.waiting > 100_000:
             time.sleep(0.01)
+
+
+@dataclass(frozen=True)
+class CanMeasurement:
+    """A CAN log and the messages of its DBC; channels are named by message and signal, with a dot."""
+
+    path: Path
+    format: str
+    units: Mapping[str, str]
+    messages: Mapping[tuple[int, bool], Any]  # (identifier, is extended) to the message of the DBC
+    has_times: bool = True
+
+    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
+        """The signals and their times since the first frame of the log. Frames that are too short are left out.
+
+        Raises:
+            InputError: a log that cannot be read, or without a frame of one of the signals.
+        """
+        wanted: dict[str, list[str]] = {}
+        for name in names:
+            message, _, signal = name.rpartition(".")
+            wanted.setdefault(message, []).append(signal)
+        values = {name: array("d") for name in names}
+        times = {name: array("d") for name in names}
+        first: float | None = None
+        for frame in list_can_messages(self.path):
+            first = frame.timestamp if first is None else first
+            known = self.messages.get((frame.arbitration_id, frame.is_extended_id))
+            if known is None or known.name not in wanted or len(frame.data) < known.length:
+                continue
+            found = known.decode(bytes(frame.data), decode_choices=False)
+            for signal in wanted[known.name]:
+                if signal in found:  # of a multiplexed message, those of this frame
+                    name = f"{known.name}.{signal}"
+                    values[name].append(float(found[signal]))
+                    times[name].append(frame.timestamp - first)
+        for name, column in values.items():
+            if not column:
+                raise InputError(self.path, name, "at least one frame of this message")
+        return {name: Channel(np.frombuffer(values[name]), np.frombuffer(times[name])) for name in names}
+
+
+def open_can_log(path: Path, dbc: Path) -> CanMeasurement:
+    """A CAN log with the signals of a DBC.
+
+    Raises:
+        InputError: a DBC that cannot be read or has no signals.
+    """
+    import cantools
+
+    try:
+        base: Any = cantools.database.load_file(str(dbc))
+    except OSError as error:
+        raise InputError(dbc, "--dbc", f"a readable file ({error.strerror})") from error
+    except (cantools.Error, ValueError) as error:
+        reason = str(error).splitlines()
+        raise InputError(dbc, "--dbc", f"a DBC file ({reason[0] if reason else type(error).__name__})") from error
+    messages = {(m.frame_id, m.is_extended_frame): m for m in getattr(base, "messages", ())}
+    units = {f"{m.name}.{s.name}": s.unit or "" for m in messages.values() for s in m.signals}
+    if not units:
+        raise InputError(dbc, "--dbc", "a DBC file with at least one signal")
+    return CanMeasurement(path, f"CAN log, {dbc.name}", units, messages)

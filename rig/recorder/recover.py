@@ -14,11 +14,10 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schem
 from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
-from fdi.trace.chunk import BoundedFile, unpack_chunk
-from fdi.trace.mcap_log import read_declarations, scan_messages
+from fdi.trace.mcap_log import BoundedFile, read_declarations, scan_messages, unpack_chunk
 from plant.errors import InputError
 from plant.unpacking import UnpackingError, limit_unpacked_size
-from rig.recorder.container import McapFile
+from rig.recorder.writer import McapFile
 
 _DAMAGE = (McapError, struct.error, ValueError, EOFError)
 

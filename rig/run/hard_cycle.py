@@ -27,7 +27,7 @@ from rig.network.raw_bus import (
     split_halves,
     split_words,
 )
-from rig.sequences.frame_faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
+from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 
 DONE, WAITING = 0, 1  # what the functions return; negative: status of the bus (raw_bus.FAILED, NO_TURN)
 XJ_CAME, XS_CAME, COR_CAME = 1, 2, 4  # bits of ANSWERS

@@ -22,10 +22,10 @@ from plant.compile import compile_function
 from plant.errors import RigError
 from rig.network import codec
 from rig.network.frame import Frame
+from rig.network.link import LinkWire
 from rig.network.master import Master
 from rig.network.node_objects import PLANT
 from rig.network.raw_bus import RawBus, can_open, make_closed_port, open_raw_bus
-from rig.network.wire import LinkWire
 from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop

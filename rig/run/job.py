@@ -1,24 +1,37 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 from __future__ import annotations
 
+import atexit
+import contextlib
+import fcntl
+import os
+import shutil
+import stat
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import dbc
-from fdi.foreign_code import Announce, ForeignCode, print_on_standard_error, require_trust
+from fdi.foreign_code import (
+    Announce,
+    ForeignCode,
+    load_effects_of_model,
+    print_on_standard_error,
+    require_different_names,
+    require_trust,
+)
 from fdi.trace.trace import Trace
-from plant import InputError, Model
+from plant import InputError, Model, load_model
 from plant.effects import load_effects
-from plant.model import parse_model
+from plant.model import find_quantity, parse_model
 from plant.parameters import parse_toml
 from plant.segments import RATE
 from rig.nodes.scenario import Scenario
 from rig.run.choices import CONTROLLERS, PACES, PLANTS
-from rig.run.effect_folder import make_effect_folder
-from rig.sequences import Sequence
+from rig.sequences import Sequence, load_sequence
 
 _REQUIRED_SETTINGS = {"seed", "bus", "pace", "controller", "plant", "max_overruns"}
 _EFFECT_FOLDER, _SEQUENCE_FOLDER = "effects/", "sequence/"  # folders of the attachments
@@ -164,3 +177,132 @@ def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
         file.write_bytes(code.content)
         load_effects(file, code.content)
     return files
+
+
+_PREFIX = "eha-rig-effects-"
+
+
+def make_effect_folder() -> Path:
+    """A new folder in the system's folder for temporary files, which the end of this process removes.
+
+    A killed process leaves its folder behind; the next one that makes a folder removes it.
+    """
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+    _lock(folder)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    # Another process may just have made one, and be about to lock it: a minute is enough for that.
+    remove_left_folders(folder.parent, folder.stat().st_mtime - 60.0)
+    return folder
+
+
+def remove_left_folders(where: Path, before: float) -> None:
+    """Remove this user's effect folders that no process holds a lock on and that are older than `before`, s (epoch)."""
+    for folder in where.glob(_PREFIX + "*"):
+        with contextlib.suppress(OSError):  # somebody else removes it, or it is in use
+            facts = folder.lstat()
+            is_own = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid()
+            if is_own and facts.st_mtime < before:
+                lock = _lock(folder)
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(lock)
+
+
+def _lock(folder: Path) -> int:
+    """Lock a folder until the descriptor returned is closed or this process ends. Raises OSError if it is locked."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+class JobChoice(NamedTuple):
+    """What a user chooses of a run; None: as the sequence says, or the default."""
+
+    sequence: str = "preflight"  # a file, or the name of a shipped one
+    model: str | None = None  # a file, or the name of a shipped one
+    changes: Mapping[str, str | float] = {}  # "GROUP.FIELD" to value, SI
+    seed: int = 0
+    effects: tuple[Path, ...] = ()  # files of the user's own effects
+    bus: str = "embedded"
+    pace: str | None = None
+    controller: str | None = None
+    plant: str | None = None
+    max_overruns: float | None = None
+    is_diagnosed: bool = False  # whether `rig fdi` judges the servovalve after the run
+
+
+def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: bool = False,
+              announce: Announce = print_on_standard_error) -> Job:
+    """The job that a user chose; his model and changes override the sequence's own.
+
+    Args:
+        choice: what he chose.
+        built: the sequence, if it is not to be read from the file that he chose.
+        is_trusted: whether effect files that a model file names may run.
+        announce: gets a line about each of these before it runs.
+
+    Raises:
+        InputError: a sequence, model, effect or value that cannot be used.
+    """
+    require_different_names(choice.effects)
+    for file in choice.effects:
+        load_effects(file)
+    sequence = load_sequence(choice.sequence) if built is None else built
+    name = choice.model or sequence.model.name
+    brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
+    require_different_names((*choice.effects, *brought))
+    model = load_model(name).replace(sequence.model.overrides, sequence.name).replace(choice.changes)
+    require_bench_cycle(model, "--set")
+    foreign = [name for name in model.list_changes() if name.startswith("controller.")]
+    if choice.controller == "external" and foreign:
+        raise InputError("--set", foreign[0], "no gains beside --controller external: that firmware has its own")
+    job = Job(sequence=sequence, model=model, seed=choice.seed, effects=(*choice.effects, *brought), bus=choice.bus,
+              max_overruns=sequence.timing.share)
+    return replace_settings(job, pace=choice.pace, controller=choice.controller, plant=choice.plant,
+                            max_overruns=choice.max_overruns)
+
+
+class Differences(NamedTuple):
+    """What differs from the nominal unit in a test without faults."""
+
+    model: str  # its name, if it is not the nominal model; else ""
+    parameters: dict[str, float]  # SI, those that are not nominal, and all of the model's effects
+    effects: tuple[str, ...]  # of the model
+    effect_files: tuple[str, ...]  # the user's own
+    faults: tuple[str, ...]  # of the sequence, with their times
+
+    def describe(self) -> str:
+        """All differences in one line; "nothing" if there are none."""
+        parts = [f"model {self.model}"] if self.model else []
+        parts += [_describe_parameter(name, value) for name, value in self.parameters.items()]
+        parts += [f"effect {name}" for name in self.effects if not any(key.startswith(f"{name}.")
+                                                                       for key in self.parameters)]
+        parts += [f"effects of {name}" for name in self.effect_files]
+        parts += [f"fault {text}" for text in self.faults]
+        return "; ".join(parts) or "nothing"
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry `differences` of verdict.json."""
+        return {**self._asdict(), "text": self.describe()}
+
+
+def find_differences(job: Job) -> Differences:
+    """What of a job differs from the nominal test."""
+    model = job.model
+    faults = []
+    for fault in job.sequence.faults:
+        until = "" if fault.end is None else f" to {fault.end:g} s"
+        faults.append(f"{fault.label!r} from {fault.start:g} s{until}")
+    return Differences(model="" if model.name == "eha" else model.name, parameters=model.list_changes(),
+                       effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
+                       faults=tuple(faults))
+
+
+def _describe_parameter(name: str, value: float) -> str:
+    quantity = find_quantity(name)
+    word = next((word for word, number in quantity.words.items() if number == value), None)
+    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
+    return f"{name} = {word}" if word else f"{name} = {value:g}{unit}"

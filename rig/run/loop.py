@@ -9,10 +9,14 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 from __future__ import annotations
 
 import heapq
+from array import array
 from collections.abc import Callable
 from math import nan
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
+from plant.segments import Array
 from rig.network import codec
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
@@ -256,3 +260,29 @@ class CycleLoop:
         if self._open is not None:
             complete, self._open = self._open, None
             self._log.cycle(*complete)
+
+
+_FIELDS = ("phase", "com", "xj", "cor", "p12", "xs", "load", "flags", "lateness", "response",
+           "feedback_response", "valve_response", "execution", "control", "status")
+
+
+class History:
+    """The complete cycles of a run. A field by name is a column, (cycles,) SI; missing samples are NaN."""
+
+    def __init__(self) -> None:
+        self._numbers = array("d")
+
+    def __len__(self) -> int:
+        return len(self._numbers) // len(_FIELDS)
+
+    def add(self, row: Signals, timing: Timing) -> None:
+        """Append one cycle."""
+        self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
+                              timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
+                              timing.execution, row.control, row.status))
+
+    def column(self, name: str, phase: int | None = None) -> Array:
+        """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
+        table = np.frombuffer(self._numbers).reshape(-1, len(_FIELDS))
+        column: Array = table[:, _FIELDS.index(name)]
+        return column.copy() if phase is None else column[table[:, 0] == phase]  # no view: it would pin the buffer

@@ -4,26 +4,26 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isnan
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi.output import write_text
+from fdi.progress import Progress
 from fdi.report.json import to_plain
+from fdi.trace.trace import Trace
+from plant.errors import InputError
+from plant.model import Model
 from plant.segments import RATE, Array
-from rig.network.identity import Identity
-from rig.network.node_objects import NAMES, PLANT
+from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
-from rig.run.differences import find_differences
-from rig.run.history import History
-from rig.run.job import Job
-from rig.run.limits import LimitReached
-from rig.run.loop import Loop
-from rig.run.servovalve import has_fault
+from rig.run.job import Job, find_differences
+from rig.run.loop import History, Loop
 from rig.run.session import SessionEvent
 from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import HEARTBEAT
@@ -270,3 +270,91 @@ def _compute_percentiles(seconds: Array) -> dict[str, float | None]:
         return dict.fromkeys(("p50", "p99", "p99_9", "max"))
     p50, p99, p99_9 = np.percentile(values, (50, 99, 99.9))
     return {"p50": round(p50, 1), "p99": round(p99, 1), "p99_9": round(p99_9, 1), "max": round(float(values.max()), 1)}
+
+
+NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
+
+
+class LimitReached(NamedTuple):
+    """A limit that a run reached."""
+
+    parameter: str  # of the model: the limit
+    signal: str
+    limit: float  # SI; reached on either side of zero
+    t: float  # s of main, when it was reached first
+    seconds: float  # how long the signal was there, in all
+
+    def describe(self) -> str:
+        """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
+        scale, unit = (1e3, "mA") if self.signal == "cor" else (1e3, "mm")
+        return (f"{WORDS[self.signal]} ({scale * self.limit:.3g} {unit}) for {1e3 * self.seconds:.0f} ms, "
+                f"first at t = {self.t:.3f} s")
+
+
+WORDS = {"xj": "ram at its stop", "xs": "spool at its stop", "cor": "current at its limit"}
+
+
+def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:
+    """The limits that the signals of a run reached.
+
+    Args:
+        column: gives a signal of all cycles, SI; NaN for missing samples.
+        model: its travels, current limit, cycle and sensor noise.
+        zero: the cycle in which main starts.
+    """
+    margins = {
+        "xj": ("jack.travel", NEAR_A_STOP * model["sensors.position_noise"]),
+        "xs": ("spool.travel", NEAR_A_STOP * model["sensors.spool_noise"]),
+        "cor": ("controller.current_limit", 2e-8),  # A: two counts of the drive frame
+    }
+    period, found = model["controller.period"], []
+    for signal, (parameter, margin) in margins.items():
+        limit = model.values.get(parameter)
+        if limit is None:  # another plant
+            continue
+        rows = np.flatnonzero(np.abs(column(signal)) >= limit - margin)
+        if len(rows):
+            found.append(LimitReached(parameter, signal, limit, (int(rows[0]) - zero) * period, len(rows) * period))
+    return tuple(found)
+
+
+FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that fail a run
+
+
+def diagnose_servovalve(trace: Trace, progress: Progress, workers: int = 2) -> dict[str, Any]:
+    """The answer of `rig fdi --json` on the main phase of a run, against the nominal unit.
+
+    A phase that cannot be judged, for example a short one, gives CANNOT_TELL with the reason. `workers`: threads.
+    """
+    from fdi.diagnosis.diagnosis import diagnose  # here: loads the compiler, which other runs do not need
+    from fdi.report.diagnosis_report import collect_data
+    from fdi.report.json import to_plain
+
+    try:
+        diagnosis = diagnose(trace, progress=progress, source=trace.provenance["source"], workers=workers)
+    except InputError as error:
+        return {"verdict": "CANNOT_TELL", "sentence": f"not judged: {error}"}
+    return dict(to_plain(collect_data(diagnosis)))
+
+
+def has_fault(answer: Mapping[str, Any]) -> bool:
+    """Whether a diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
+    return answer.get("verdict") in FDI_FAILS
+
+
+def describe_faults(answer: Mapping[str, Any], *levels: str) -> str:
+    """Level and size of both faults with its interval, in words; with `levels` only of faults at one of these.
+
+    "" if there is none, or the trace could not be judged.
+    """
+    if not answer.get("level"):
+        return ""
+    from fdi.report.diagnosis_report import list_found_faults
+
+    return "; ".join(f"{found.name} {found.level}, {found.size}" for found in list_found_faults(answer)
+                     if not levels or found.level in levels)
+
+
+def describe_finding(answer: Mapping[str, Any]) -> str:
+    """What a diagnosis found beyond acceptable, in a few words: the faults with their sizes, else its verdict."""
+    return f"rig fdi: {describe_faults(answer, 'maintenance', 'non-nominal') or answer['verdict']}"

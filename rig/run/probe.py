@@ -17,8 +17,7 @@ from plant.model import Model
 from plant.segments import RATE
 from rig.network.codec import Control
 from rig.nodes.scenario import Scenario
-from rig.run.history import History
-from rig.run.loop import CycleInput
+from rig.run.loop import CycleInput, History
 from rig.sequences.faults import Plan, Schedule
 from rig.sequences.protocol import Mask, Rows
 

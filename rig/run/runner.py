@@ -16,17 +16,15 @@ from plant import Actuator, Columns, InputError
 from plant.segments import Array
 from rig.network.clock import WallClock
 from rig.network.codec import Flags
-from rig.network.cycle_record import CycleRecord
+from rig.network.node_objects import CycleRecord
 from rig.network.raw_bus import can_open
 from rig.recorder import Check, Record, Recorder
-from rig.recorder.provenance import collect_provenance, read_epoch_ns
+from rig.recorder.schema import collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, CycleRecords, Mask, attribute, find_injected
-from rig.run.differences import find_differences
 from rig.run.hard_loop import compile_cycle
-from rig.run.history import History
-from rig.run.job import Job
-from rig.run.limits import find_limits
-from rig.run.outcome import Outcome, summarise_timing
+from rig.run.job import Job, find_differences
+from rig.run.loop import History
+from rig.run.outcome import Outcome, describe_faults, find_limits, summarise_timing
 from rig.run.participants import open_participants
 from rig.run.priority import (
     LOOP_PRIORITY,
@@ -36,9 +34,7 @@ from rig.run.priority import (
     raise_priority,
     suspend_garbage_collection,
 )
-from rig.run.servovalve import describe_faults
 from rig.run.session import MAIN, Session
-from rig.run.soft_time import explain_soft_time
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.faults import Schedule
 from rig.sequences.protocol import judge_protocol
@@ -254,3 +250,10 @@ def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
                  low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, after=check.after,
                  above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement))
+
+
+def explain_soft_time(job: Job) -> str:
+    """One sentence that says why the cycles of a real-time run are Python; empty if they are compiled."""
+    if not job.realtime or can_open(job.bus):
+        return ""
+    return f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"

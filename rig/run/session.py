@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import bisect
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Container, Mapping
 from itertools import filterfalse
+from math import isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -23,23 +24,18 @@ from rig.device.emcy import EmcyCode
 from rig.network import codec
 from rig.network.clock import WallClock
 from rig.network.codec import Control
-from rig.network.cycle_record import CycleRecord
 from rig.network.frame import Frame
-from rig.network.identity import Identity
+from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT, HEARTBEAT_LIMIT, PATIENT, Master
-from rig.network.nmt_states import NmtState
-from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG, Gains, read_gains
-from rig.network.wire import EmbeddedWire
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG, CycleRecord, Gains, Identity, NmtState, read_gains
 from rig.nodes.scenario import FORCE_RESOLUTION, Scenario
 from rig.recorder import Event, Recorder, Signals, Timing
 from rig.recorder import NmtState as NmtRecord
 from rig.run.attribution import Mask, Trouble, find_injected, find_start_problem
 from rig.run.hard_loop import open_loop
-from rig.run.history import History
 from rig.run.job import Job
-from rig.run.loop import CycleInput, Loop
-from rig.run.overruns import OverrunWatch
-from rig.run.participants import FRAME_TIMEOUT, Participants
+from rig.run.loop import CycleInput, History, Loop
+from rig.run.participants import FRAME_TIMEOUT, Participants, describe_exit
 from rig.run.probe import (
     AFTER,
     ATTEMPTS,
@@ -60,12 +56,11 @@ from rig.run.probe import (
     read_rows,
     select_last,
 )
-from rig.run.processes import describe_exit
-from rig.run.silence import SilenceWatch
+from rig.sequences.checks import GuardWatch
 from rig.sequences.faults import Schedule
-from rig.sequences.guards import GuardWatch
+from rig.sequences.measures import DriveFrames
 from rig.sequences.protocol import Emergency, Heartbeat, ProtocolRecord, Rows
-from rig.sequences.run_data import DriveFrames
+from rig.sequences.timing import TimingPolicy
 
 SETUP, MAIN, CLEANUP = 0, 1, 2
 PHASES = ("setup", "main", "cleanup")
@@ -629,3 +624,64 @@ class Session:
         """The time of a cycle, by default now, s of main; negative before main."""
         now = self.loop.k if self.loop and not self._is_probing else 0
         return ((now if cycle is None else cycle) - self._plan.start) / RATE
+
+
+class OverrunWatch:
+    """Counts overruns in a row, cycle by cycle. `problem` says when there were too many; empty before that.
+
+    A cycle is an overrun if its SYNC was sent late or the plant's frames came late or not at all. It counts once, or as
+    many times as SYNC was whole periods late. Cycles in which the sequence itself disturbs these frames do not count,
+    and do not end a row of overruns.
+    """
+
+    def __init__(self, policy: TimingPolicy, period: float, injected: Container[int] = ()) -> None:
+        """`period` is the length of a cycle in s; `injected`: cycles whose SYNC or plant frames a fault disturbs."""
+        self._most = policy.most_in_a_row if policy.overruns == "abort" else None
+        self._policy, self._period, self._injected = policy, period, injected
+        self._in_a_row = 0
+        self.problem = ""
+
+    def add(self, timing: Timing) -> None:
+        """Take in a complete cycle."""
+        if self._most is None or self.problem or timing.cycle * self._period < self._policy.grace:
+            return
+        if timing.cycle in self._injected:
+            return
+        is_fed = timing.feedback_response <= self._policy.feedback and not isnan(timing.valve_response)
+        is_late = timing.lateness > self._policy.sync or not is_fed
+        self._in_a_row = self._in_a_row + max(1, int(timing.lateness / self._period)) if is_late else 0
+        if self._in_a_row > self._most:
+            self.problem = (f"the bench was late: {self._in_a_row} overruns in a row up to cycle {timing.cycle}, "
+                            f"{self._most} are accepted")
+
+
+class SilenceWatch:
+    """Adds up for each node how long the rig has listened without a heartbeat of it.
+
+    A look that comes late counts for `step` at most: then the rig stood still, and perhaps the node with it.
+    """
+
+    def __init__(self, limit_ns: int, step_ns: int = 100_000_000) -> None:
+        """`limit_ns`: silence after which a node counts as gone if it does not take part in the cycles either."""
+        self._limit, self._step = limit_ns, step_ns
+        self._looked_ns = 0
+        self._heard_ns: dict[int, int] = {}
+        self._silent_ns: dict[int, int] = {}
+
+    def look(self, now_ns: int, heard_ns: Mapping[int, int]) -> None:
+        """Take note of the last heartbeats.
+
+        Args:
+            now_ns: time.
+            heard_ns: when the last heartbeat of each node came that is to be watched.
+        """
+        passed = min(now_ns - self._looked_ns, self._step)
+        self._looked_ns = now_ns
+        self._silent_ns = {node: self._silent_ns.get(node, 0) + passed if heard == self._heard_ns.get(node) else 0
+                           for node, heard in heard_ns.items()}
+        self._heard_ns = dict(heard_ns)
+
+    def find_silent(self, answering: Collection[int] = ()) -> dict[int, float]:
+        """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s."""
+        return {node: silent * 1e-9 for node, silent in self._silent_ns.items()
+                if silent >= self._limit and node not in answering}

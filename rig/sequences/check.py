@@ -8,9 +8,7 @@ from typing import Annotated, ClassVar, NamedTuple
 
 from plant.errors import InputError
 from plant.segments import LONGEST, RATE, Second
-from rig.sequences.measures import NotMeasurable
-from rig.sequences.run_data import MAIN, RunData
-from rig.sequences.units import UNIT_OF_SIGNAL, find_scale
+from rig.sequences.measures import MAIN, UNIT_OF_SIGNAL, NotMeasurable, RunData, find_scale
 
 InUnit = Annotated[float, "the check's unit"]
 LATEST_TIME = 1e6  # s, later than any run ends

@@ -7,8 +7,9 @@ the main phase; a fault ends when main ends, so that clean-up runs on a healthy 
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from math import ceil
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -16,12 +17,12 @@ from numpy.typing import NDArray
 
 from plant.effects import CATALOGUE
 from plant.errors import InputError
-from plant.model import find_quantity
-from plant.parameters import parse_value
+from plant.model import Model, find_quantity
+from plant.parameters import check_combinations, parse_value
 from plant.quantity import Quantity
 from plant.segments import RATE, Second
 from rig.sequences import tables
-from rig.sequences.injection import AddedSignal, StuckSignal, choose_frames
+from rig.sequences.tables import Place
 
 Sensor = Literal["xj", "p12", "xs"]
 FrameName = Literal["feedback", "valve_state", "drive", "command", "sync"]
@@ -589,3 +590,138 @@ def _require_size(value: float) -> None:
 def _require(holds: bool, key: str, expected: str) -> None:
     if not holds:
         raise InputError("fault", key, expected)
+
+
+SENT_NORMALLY = 0
+DROP, DELAY, DOUBLE, CORRUPT, CUT = (ACTION_CODES[kind] for kind in (Drop, Delay, Double, Corrupt, Cut))
+
+
+def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int, int]:
+    """Length and payload of a frame after a fault that corrupts or cuts it; after any other code they are unchanged.
+
+    `data`: first byte lowest, bytes beyond `length` zero, as in raw_bus.py.
+    """
+    if code == CORRUPT:
+        data ^= argument
+    elif code == CUT:
+        length = min(length, argument)
+    if length < 8:
+        data &= (1 << 8 * length) - 1
+    return length, data
+
+
+class AddedSignal:
+    """An additive sensor fault: `values`, one per cycle, are added from cycle `first` on."""
+
+    def __init__(self, first: int, values: list[float]) -> None:
+        self.first, self.values = first, values
+
+    def __call__(self, cycle: int, value: float) -> float:
+        k = cycle - self.first
+        return value + self.values[k] if 0 <= k < len(self.values) else value
+
+
+class StuckSignal:
+    """A sensor that is stuck during `cycles`, at `value` or, without one, at its last reading."""
+
+    def __init__(self, cycles: range, value: float | None) -> None:
+        self.cycles, self.value = cycles, value
+        self._last_read = 0.0
+
+    def __call__(self, cycle: int, value: float) -> float:
+        if cycle in self.cycles:
+            return self._last_read if self.value is None else self.value
+        self._last_read = value
+        return value
+
+
+def choose_frames(cycles: int, every: int, count: int | None, probability: float, rng: np.random.Generator) -> bytes:
+    """One byte a cycle, 1 where a frame is hit: every `every`-th with a probability; up to the last if counted."""
+    hit = (np.arange(cycles) % every == 0) & (rng.random(cycles) < probability)
+    if count is not None and hit.sum() >= count:
+        hit = hit[:np.flatnonzero(hit)[count - 1] + 1]
+    return bytes(hit.tobytes())
+
+
+Known = Callable[[str], object]  # raises InputError for a name that no parameter has
+
+
+def check_overrides(overrides: Mapping[str, float | str], place: Place, known: Known) -> bool:
+    """Names and, where `known` gives their meaning, values; refusals at their lines. True: all meanings are known."""
+    whole = True
+    for name, value in overrides.items():
+        here = place.at(*name.split("."))  # where `overrides.spool.travel` stands in the file
+        here = here if here.keys in place.lines else place.at(name)
+        quantity = _find_meaning(name, here, known)
+        whole &= quantity is not None
+        if quantity is not None:
+            try:
+                parse_value("", "", quantity, value)
+            except InputError as error:
+                raise here.refuse(error.expected) from error
+    return whole
+
+
+def check_faults(plan: Plan, place: Place, known: Known) -> bool:
+    """The same for the parameters that faults change."""
+    whole = True
+    for i, fault in enumerate(plan.faults):
+        if isinstance(fault, Parameter):
+            quantity = _find_meaning(fault.parameter, place.at(i, "parameter"), known)
+            whole &= quantity is not None
+            if quantity is not None:
+                try:
+                    fault.find_target(quantity)
+                except InputError as error:
+                    raise place.at(i, error.field).refuse(error.expected) from error
+    return whole
+
+
+def check_together(plan: Plan, model: Model, place: Place) -> None:
+    """No fault may make a parameter contradict another one of `model` at the time; refusals at its line."""
+    try:
+        require_sensible(plan, model)
+    except Contradiction as error:
+        raise place.at(error.fault).refuse(error.said) from error
+
+
+class Contradiction(InputError):
+    """Two parameters that no actuator can have together, brought about by the fault of that number."""
+
+    def __init__(self, fault: int, label: str, time: float, error: InputError) -> None:
+        self.fault = fault
+        self.said = f"{error.field} {error.expected} at {time:g} s of main"
+        super().__init__("faults", label, self.said)
+
+
+def require_sensible(plan: Plan, model: Model) -> None:
+    """Refuse faults whose parameters contradict each other or the model's own (plant.parameters.check_combinations).
+
+    Raises:
+        Contradiction: it names the fault.
+    """
+    changing = [(i, fault) for i, fault in enumerate(plan.faults) if isinstance(fault, Parameter)]
+    if not changing:
+        return
+    schedule = Schedule(plan, model.with_effects(fault.parameter.partition(".")[0] for _, fault in changing).values)
+    for i, fault in changing:
+        for cycle in _list_extreme_cycles(plan, fault):
+            try:
+                check_combinations("faults", schedule.list_parameters(cycle))
+            except InputError as error:
+                raise Contradiction(i, fault.label, (cycle - plan.start) / RATE, error) from error
+
+
+def _list_extreme_cycles(plan: Plan, fault: Parameter) -> tuple[int, ...]:
+    """The cycles in which a ramped parameter may be extreme: first, end of the ramp, last, and the one after."""
+    first, last = plan.find_cycles(fault)
+    end = max(first, last - 1)
+    return first, min(first + ceil(min(fault.ramp, LATEST_START) * RATE), end), end, last
+
+
+def _find_meaning(name: str, place: Place, known: Known) -> Quantity | None:
+    try:
+        quantity: Any = known(name)
+    except InputError as error:
+        raise place.refuse(f"{error.expected}, not {name!r}") from error
+    return quantity if isinstance(quantity, Quantity) else None

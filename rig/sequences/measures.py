@@ -7,9 +7,16 @@ and leaves 1.1 um rms of the noise.
 """
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.errors import InputError
 from plant.segments import RATE, Array
+from rig.sequences import tables
 
 MEDIAN_SAMPLES = 5  # samples
 SPEED_SPAN = 20  # cycles between the two samples of a speed: 2 um rms of position noise become 0.14 mm/s rms
@@ -136,3 +143,132 @@ def find_crossing(signal: Array, above: float | None, below: float | None) -> fl
     if not len(in_a_row):
         raise NotMeasurable("the level was never passed")
     return float(in_a_row[0]) / RATE
+
+
+SI_OF_UNIT: dict[str, tuple[str, float]] = {  # unit: (SI unit, how many of those it is)
+    "m": ("m", 1.0), "mm": ("m", 1e-3), "um": ("m", 1e-6),
+    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3),
+    "s": ("s", 1.0), "ms": ("s", 1e-3),
+    "Pa": ("Pa", 1.0), "bar": ("Pa", 1e5), "MPa": ("Pa", 1e6),
+    "N": ("N", 1.0), "kN": ("N", 1e3),
+    "A": ("A", 1.0), "mA": ("A", 1e-3),
+    "%": ("%", 1.0), "deg": ("deg", 1.0), "1": ("1", 1.0),
+}
+UNIT_OF_SIGNAL = {"com": "m", "xj": "m", "error": "m", "speed": "m/s", "cor": "A", "p12": "Pa", "xs": "m", "load": "N"}
+
+
+def find_scale(unit: str, si: str) -> float:
+    """How many of the SI unit `si` one `unit` is; InputError at the key `unit` if it measures something else."""
+    fitting = [name for name, (base, _) in SI_OF_UNIT.items() if base == si]
+    if unit not in fitting:
+        raise InputError("unit", "unit", tables.list_choices(unit, fitting))
+    return SI_OF_UNIT[unit][1]
+
+
+MAIN = "main"  # the window that is all of the main phase
+
+
+class TraceLike(Protocol):
+    """The columns of a run, each (n,) and SI; row k is cycle k of main. Also cor, p12, xs, load. NaN, None: absent."""
+
+    @property
+    def t(self) -> Array: ...
+    @property
+    def com(self) -> Array: ...
+    @property
+    def xj(self) -> Array: ...
+
+
+class EventLike(Protocol):
+    """An event at `t` seconds of the main phase."""
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def text(self) -> str: ...
+
+
+class DriveFrames(NamedTuple):
+    """All drive frames of a run, whatever their cycle number, as columns; only recorded if faults act on the bus."""
+
+    t: Array  # s of main
+    current: Array  # A
+    status: NDArray[np.int64]  # status word
+
+    def select_between(self, t0: float, t1: float) -> DriveFrames:
+        """Those with t0 <= t < t1."""
+        chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
+        return DriveFrames(self.t[chosen], self.current[chosen], self.status[chosen])
+
+
+NO_DRIVES = DriveFrames(np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True)
+class RunData:
+    """The data of a run that checks use: trace, sections, events, and when each fault started (s of main, by label)."""
+
+    trace: TraceLike
+    sections: Mapping[str, slice] = field(default_factory=dict)
+    events: Sequence[EventLike] = ()
+    starts: Mapping[str, float] = field(default_factory=dict)
+    drives: DriveFrames = NO_DRIVES
+
+    def find_start(self, after: str | float) -> float:
+        """A time, s of main, given as such or as the label of the fault that begins then.
+
+        Raises:
+            NotMeasurable: there is no such fault.
+        """
+        t = after if isinstance(after, float) else self.starts.get(after)
+        if t is None:
+            raise NotMeasurable(f"there was no fault {after!r}")
+        return t
+
+    def find_rows(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
+        """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""
+        rows = len(self.trace.t)
+        if isinstance(window, tuple):
+            first, last = round(window[0] * RATE), round(window[1] * RATE)
+        elif window == MAIN:
+            first, last = 0, rows
+        elif window in self.sections:
+            first, last = self.sections[window].start, self.sections[window].stop
+        else:
+            raise NotMeasurable(f"there is no section {window!r}")
+        if last > rows:
+            raise NotMeasurable(f"the run ended at {rows / RATE:g} s, the window at {last / RATE:g} s")
+        first += round(skip * RATE)
+        if first >= last:
+            raise NotMeasurable("the window is empty")
+        return slice(first, last)
+
+    def read_signal(self, name: str, span: slice, largest_missing_share: float = 0.01) -> Array:
+        """A signal's samples in a span, few missing ones bridged by straight lines; NotMeasurable without it."""
+        if name == "error":
+            return self.read_signal("com", span) - self.read_signal("xj", span)
+        if name == "speed":
+            return compute_speed(self.read_signal("xj", span))
+        column = getattr(self.trace, name, None)
+        if column is None:
+            raise NotMeasurable(f"{name} was not measured")
+        return bridge_gaps(np.asarray(column, float)[span], name, largest_missing_share)
+
+    def count_missing(self, name: str, span: slice) -> int:
+        """How many samples of a signal were bridged."""
+        column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), None)
+        return 0 if column is None else int(np.isnan(np.asarray(column, float)[span]).sum())
+
+    def read_step(self, span: slice) -> tuple[Array, Array, float]:
+        """Position and demand in a span, and the demand before it (at the very start: where the ram is)."""
+        position = self.read_signal("xj", span)
+        before = float(self.trace.com[span.start - 1] if span.start else position[0])
+        return position, self.read_signal("com", span), before
+
+    def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
+        """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
+        words = set(event.lower().split())
+        found = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))
+        return sorted(found, key=lambda e: e.t)

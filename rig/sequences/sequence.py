@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -20,17 +20,55 @@ from plant.model import Model, find_quantity
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
-from rig.sequences.checks import Check, ResponseWithin, ShutOff
-from rig.sequences.fault_parameters import Known, check_faults, check_overrides, check_together
-from rig.sequences.faults import Fault, Parameter, Plan
-from rig.sequences.guards import Guard
+from rig.sequences.checks import Check, Guard, ResponseWithin, ShutOff
+from rig.sequences.faults import Fault, Known, Parameter, Plan, check_faults, check_overrides, check_together
+from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
-from rig.sequences.python_parts import VALUES_OF_PART, PythonCheck, PythonPart, PythonSegment, Step
-from rig.sequences.required_firmware import RequiredFirmware
-from rig.sequences.run_data import MAIN
+from rig.sequences.python_parts import (
+    VALUES_OF_PART,
+    PythonCheck,
+    PythonPart,
+    PythonSegment,
+    Step,
+    UserModules,
+    require_function_name,
+)
 from rig.sequences.tables import Place
 from rig.sequences.timing import TimingPolicy
-from rig.sequences.user_code import UserModules, require_function_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequiredFirmware:
+    """What the controller must say about itself; a key that is left out is not compared."""
+
+    device_type: int | None = None  # 0x1000
+    name: str | None = None  # 0x1008
+    hardware: str | None = None  # 0x1009
+    software: str | None = None  # 0x100A
+    vendor: int | None = None  # 0x1018 sub 1
+    product: int | None = None  # 0x1018 sub 2
+    revision: int | None = None  # 0x1018 sub 3
+    serial: int | None = None  # 0x1018 sub 4
+
+    def __post_init__(self) -> None:
+        for key, value in asdict(self).items():
+            if isinstance(value, int) and not 0 <= value <= 0xFFFFFFFF:
+                raise InputError("firmware", key, f"a number from 0 to 0xFFFFFFFF, not {value}")
+
+    def find_difference(self, identity: Mapping[str, object]) -> tuple[str, str]:
+        """The first key in which a controller's identity differs and how, in words; two empty texts if none does."""
+        for key, required in asdict(self).items():
+            found = identity.get(key)
+            if required is not None and found != required:
+                return key, f"{_format(required)}, but the controller has {_format(found)}"
+        return "", ""
+
+
+def _format(value: object) -> str:
+    if value is None:
+        return "no such object"
+    return f"0x{value:08X}" if isinstance(value, int) else repr(value)
+
 
 ReadFile = Callable[[str], bytes]
 

@@ -14,9 +14,8 @@ from plant.run import Columns
 from plant.segments import RATE, Array
 from rig.nodes.scenario import require_servovalve
 from rig.run.job import Job
-from rig.run.limits import LimitReached, find_limits
-from rig.sequences.checks import CheckResult, evaluate_checks
-from rig.sequences.fault_parameters import require_sensible
+from rig.run.outcome import LimitReached, find_limits
+from rig.sequences.checks import CheckResult, Guard, evaluate_checks
 from rig.sequences.faults import (
     BusOff,
     Corrupted,
@@ -34,8 +33,8 @@ from rig.sequences.faults import (
     Short,
     Silent,
     Stuck,
+    require_sensible,
 )
-from rig.sequences.guards import Guard
 from rig.sequences.sequence import Sequence as TestSequence
 
 OF_EVENTS = ("response_within", "shut_off", "recovers", "event_occurs", "event_never")  # without a bus no events

@@ -12,7 +12,7 @@ from fdi.report.json import to_plain
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table
 from fdi.report.run_report import format_limits
 from plant.segments import RATE, Array
-from rig.run.differences import find_differences
+from rig.run.job import find_differences
 from rig.suite.dry_run import SHOWN_UNITS, Demand, DryRun
 
 if TYPE_CHECKING:

@@ -15,9 +15,8 @@ from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table
 from fdi.report.run_report import MOODS as RUN_MOODS
 from fdi.report.run_report import format_limits
 from rig import junit
-from rig.run.job_choice import JobChoice
-from rig.run.outcome import Outcome
-from rig.run.servovalve import describe_faults
+from rig.run.job import JobChoice
+from rig.run.outcome import Outcome, describe_faults
 from rig.sequences.checks import CheckResult
 from rig.suite.suite import NO_VERDICT, Case, CaseResult, PlannedCheck, Suite, find_verdict, make_result
 

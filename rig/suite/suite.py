@@ -17,14 +17,12 @@ from typing import Annotated, Any, NamedTuple
 from fdi.progress import Progress, ignore_progress
 from fdi.report.run_report import write_run_page
 from plant.errors import InputError, RigError
-from rig.campaign.worker_processes import run_in_processes
+from rig.campaign.batch import run_in_processes
 from rig.network.clock import WallClock
-from rig.run.differences import find_differences
-from rig.run.job_choice import JobChoice, build_job
-from rig.run.outcome import Outcome
+from rig.run.job import JobChoice, build_job, find_differences
+from rig.run.outcome import Outcome, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
-from rig.run.servovalve import describe_finding, diagnose_servovalve, has_fault
 from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import load_sequence
 from rig.sequences.tables import Place, build_dataclass, parse_table

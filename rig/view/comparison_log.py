@@ -15,7 +15,8 @@ from fdi.report.compare_report import describe_verdict
 from fdi.report.drawing import LEVELS, choose_drawn_unit
 from fdi.report.numbers import SIGNAL_NAMES, format_ratio, format_signal
 from fdi.thresholds import NOISE_BAND_RATIO, SIGNAL_ERROR_RATIO
-from rig.view.recording import (
+from rig.view.rerun_log import SECTIONS, make_command_lane
+from rig.view.viewer import (
     COMMAND,
     FAIL,
     MEASURED,
@@ -36,7 +37,6 @@ from rig.view.recording import (
     send_lane,
     send_line,
 )
-from rig.view.rerun_log import SECTIONS, make_command_lane
 
 if TYPE_CHECKING:
     import rerun as rr

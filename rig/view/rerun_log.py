@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from fdi.report.run_verdict import read_verdict
+from fdi.report.run_report import read_verdict
 from fdi.trace.sections import Section
 from fdi.trace.trace import MAIN, Check, Trace
 from rig.network.node_objects import NAMES
-from rig.sequences.units import SI_OF_UNIT
-from rig.view.recording import (
+from rig.sequences.measures import SI_OF_UNIT
+from rig.view.viewer import (
     COMMAND,
     FAIL,
     LIMIT,

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from fdi.comparison.run_differences import Run, RunDifferences
-from fdi.report.diff_figures import choose_difference_units
-from fdi.report.diff_report import describe_differences
+from fdi.report.diff_report import choose_difference_units, describe_differences
 from fdi.report.drawing import LEVELS
 from fdi.report.numbers import SIGNAL_NAMES, format_amount, format_ratio, join_words
-from fdi.report.run_verdict import read_verdict
+from fdi.report.run_report import read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO
-from rig.view.recording import (
+from rig.view.rerun_log import ACTIVE, SECTIONS, VERDICTS, list_fault_states, make_command_lane
+from rig.view.viewer import (
     COMMAND,
     FAIL,
     NEUTRAL,
@@ -34,7 +34,6 @@ from rig.view.recording import (
     send_lane,
     send_line,
 )
-from rig.view.rerun_log import ACTIVE, SECTIONS, VERDICTS, list_fault_states, make_command_lane
 
 REFERENCE, NOISE = COMMAND, 0x7FD46BFF
 COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation

@@ -19,8 +19,7 @@ from typing import Any
 
 from fdi.sources import hash_sources, import_function
 from plant.errors import InputError
-from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch
-from rig.campaign.row_file import Row, RowFile
+from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, run_batch
 from rig.network.clock import WallClock
 from studies.hidden_effects import cases, truth
 

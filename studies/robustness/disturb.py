@@ -34,8 +34,7 @@ from rig.network.clock import WallClock
 from rig.network.codec import Flags
 from rig.network.frame import Frame
 from rig.network.link import Link
-from rig.network.turn import find_key
-from rig.network.udp import PORT
+from rig.network.udp import PORT, find_key
 from rig.recorder.recover import recover_log
 
 PROCESSES = ("rig", "controller", "plant")
@@ -369,7 +368,7 @@ def find_processes(group: str) -> list[tuple[int, str]]:
 
 
 def has_semaphores(group: str) -> bool:
-    """Whether the turn to send on a group still has its semaphores (rig/network/turn.py)."""
+    """Whether the turn to send on a group still has its semaphores (rig/network/udp.py)."""
     key = find_key(group, PORT)
     lines = Path("/proc/sysvipc/sem").read_text().splitlines()[1:]
     return any(int(line.split()[0]) == key for line in lines)

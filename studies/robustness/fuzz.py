@@ -15,13 +15,12 @@ from rig.network import codec
 from rig.network.bus import EmbeddedBus
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Node, Send
+from rig.network.link import EmbeddedWire
 from rig.network.master import BusError
-from rig.network.wire import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.run.job import Job
-from rig.run.participants import Participants
-from rig.run.processes import NodeProcesses
+from rig.run.participants import NodeProcesses, Participants
 from rig.run.runner import attribute_run, judge_run, open_recorder
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence

@@ -16,8 +16,8 @@ from fdi.report.terminal import format_report
 from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import Trace
 from plant.errors import RigError
-from rig.recorder.container import McapFile
 from rig.recorder.recover import recover_log
+from rig.recorder.writer import McapFile
 from rig.run.job import read_job
 
 _SIZES = (0, 1, 2**31, 2**32 - 1, 2**32, 2**40, 2**63, 2**64 - 1, 6 * 10**9)

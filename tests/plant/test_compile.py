@@ -167,6 +167,26 @@ def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_cache_folder() == tmp_path / f"eha-rig-{os.getuid()}"
 
 
+COUNT_COMPILATIONS = """
+from plant.compile import compile_function
+
+def add_one(x):
+    return x + 1.0
+
+compiled = compile_function(add_one)
+assert compiled(1.0) == 2.0
+print(sum(compiled.stats.cache_misses.values()))
+"""
+
+
+def test_one_process_compiles_and_the_others_load_it(tmp_path: Path) -> None:
+    (tmp_path / "count.py").write_text(COUNT_COMPILATIONS)
+    environment = os.environ | {"EHA_RIG_CACHE": str(tmp_path / "code")}
+    processes = [subprocess.Popen([sys.executable, str(tmp_path / "count.py")], env=environment, text=True,
+                                  stdout=subprocess.PIPE) for _ in range(3)]
+    assert sorted(process.communicate()[0].strip() for process in processes) == ["0", "0", "1"]
+
+
 def test_a_live_change_names_what_is_missing() -> None:
     with pytest.raises(InputError, match=r"jack\.moss"):
         Actuator(Model()).set("jack.moss", 1.0)

@@ -14,10 +14,10 @@ from rig.conformance.data_sheet import DataSheet
 from rig.conformance.run_cases import Outcome, choose_cases, run_cases
 from rig.conformance.target import Options, Target
 from rig.device import Abort, Device, NmtState, SdoAbort
-from rig.device.cob_id import INVALID
+from rig.device.dictionary import INVALID
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.wire import EmbeddedWire
+from rig.network.link import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 

@@ -12,9 +12,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 
-from fdi.trace.chunk import unpack_chunk
-from fdi.trace.mcap_log import open_log, scan_messages
-from rig.recorder.container import McapFile, encode_records
+from fdi.trace.mcap_log import open_log, scan_messages, unpack_chunk
+from rig.recorder.writer import McapFile, encode_records
 
 
 def change_log(source: Path, out: Path, attachments: Mapping[str, bytes] | None = None,

@@ -10,19 +10,16 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.discovery.balance import EDGE, Balance, States, compute_balances
 from fdi.discovery.explain import Explanation
-from fdi.discovery.laws.dependence import Dependence, find_dependences
-from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
-from fdi.discovery.laws.regression import THINNED, Proposal, evaluate_columns, propose_terms, select_rows
-from fdi.discovery.laws.terms import Term, find_states
-from fdi.discovery.scan import absorb_shift, prepare_slope
-from fdi.discovery.search import Hypothesis, Search
+from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, name_parameter, registered_library
+from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
+from fdi.discovery.search import Hypothesis, Search, absorb_shift, prepare_slope
 from fdi.estimation.fit import Fit, Value, continue_fit, form_normal_equations, linearise, step_within_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
 from fdi.estimation.unknowns import silence_readings
@@ -36,6 +33,7 @@ from fdi.thresholds import (
     GAIN_TIE,
     INTERVAL_95_SD,
     PATTERN_VISIBLE_RATIO,
+    UNIT_TOLERANCE,
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.trace import Trace
@@ -486,3 +484,263 @@ def evaluate_law(law: Law, place: str, at: Mapping[str, Floats]) -> Floats:
             values = {f: law.values[f].value for f in term.fields}
             total += values[term.name] * evaluate_columns(term, values, at)[:, 0]
     return total
+
+
+Places = NDArray[np.int64]
+
+FOLDS = 10  # contiguous blocks of a run; each is predicted from the others
+SHIFTS = 199  # of the residual against the states, for the null
+SINGLE_BINS, PAIR_BINS = 12, 6
+FINE_BINS = 40  # of the position alone: a wave along the stroke is short
+
+
+class Dependence(NamedTuple):
+    """A state, or a pair of them, with the share of the missing quantity's variance that it predicts."""
+
+    states: tuple[str, ...]
+    share: float  # in blocks of the run that its curve was not made from
+    holdout: float | None  # on the held-out run, by the curve of the run; None without one
+    p_value: float  # probability that any of all states and pairs does as well by chance
+
+
+def find_dependences(y: Floats, states: Mapping[str, Floats], holdout: tuple[Floats, Mapping[str, Floats]] | None,
+                     seed: int = 0, most: int = 6) -> list[Dependence]:
+    """The states and pairs that predict `y` (n,) best, best first.
+
+    The null shifts `y` along the run by random times, which keeps its own correlation in time and breaks that with the
+    states. The best share of all states and pairs under each shift makes the p-values: they hold for all at once.
+
+    Args:
+        y: what is missing, over time.
+        states: (n,) each.
+        holdout: the same of the held-out run.
+        seed: of the random shifts.
+        most: how many to return.
+    """
+    names = [name for name, x in states.items() if np.ptp(x) > 0.0]
+    n = len(y)
+    rng = np.random.default_rng(seed)
+    shifts = rng.integers(n // 20, n - n // 20, SHIFTS)
+    moved = np.column_stack([y, *(np.roll(y, int(k)) for k in shifts)])
+    fold = np.minimum(np.arange(n) * FOLDS // n, FOLDS - 1)
+    kinds = (SINGLE_BINS, PAIR_BINS, FINE_BINS)
+    edges = {name: {bins: _cut_range(states[name], bins) for bins in kinds} for name in names}
+    choices = [(name,) for name in names] + list(combinations(names, 2))
+    shares = np.array([_predict_folds(_find_bins(c, states, edges), fold, moved) for c in choices])
+    best_by_chance = shares[:, 1:].max(axis=0)
+    own = dict(zip(choices, shares[:, 0].tolist(), strict=True))
+    least_gain = 0.03  # share that a pair must add to the better one of its states
+    found = [c for c in choices if len(c) == 1 or own[c] > max(own[c[:1]], own[c[1:]]) + least_gain]
+    ranked = sorted(found, key=lambda c: -own[c])[:most]
+    return [Dependence(c, own[c], _predict_holdout(c, y, states, holdout, edges),
+                       float((1 + np.sum(best_by_chance >= own[c])) / (1 + SHIFTS))) for c in ranked]
+
+
+def _cut_range(x: Floats, bins: int) -> Floats:
+    """Inner edges of bins that hold about equally many samples."""
+    return np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)[1:-1]))
+
+
+def _find_bins(choice: Sequence[str], states: Mapping[str, Floats], edges: Mapping[str, Mapping[int, Floats]]
+               ) -> Places:
+    if len(choice) > 1:
+        bins = PAIR_BINS
+    else:
+        bins = FINE_BINS if choice[0] == "position" else SINGLE_BINS
+    place = np.zeros(len(states[choice[0]]), np.int64)
+    for name in choice:
+        place = place * bins + np.searchsorted(edges[name][bins], states[name], side="right")
+    return place
+
+
+def _predict_folds(place: Places, fold: Places, y: Floats) -> Floats:
+    """Share of the variance of each column of `y` (n, k) that bin means of the other folds predict."""
+    from scipy.sparse import csr_array
+
+    bins = int(place.max()) + 1
+    group = place * FOLDS + fold
+    pick = csr_array((np.ones(len(place)), (group, np.arange(len(place)))), shape=(bins * FOLDS, len(place)))
+    own = (pick @ y).reshape(bins, FOLDS, -1)
+    count = np.bincount(group, minlength=bins * FOLDS).reshape(bins, FOLDS, 1)
+    mean = (own.sum(axis=1, keepdims=True) - own) / (count.sum(axis=1, keepdims=True) - count + 5.0)  # shrunk to zero
+    error = (y**2).sum(axis=0) - (2.0 * mean * own - mean**2 * count).sum(axis=(0, 1))
+    share: Floats = 1.0 - error / np.maximum((y**2).sum(axis=0), 1e-300)
+    return share
+
+
+def _predict_holdout(choice: Sequence[str], y: Floats, states: Mapping[str, Floats],
+                     holdout: tuple[Floats, Mapping[str, Floats]] | None,
+                     edges: Mapping[str, Mapping[int, Floats]]) -> float | None:
+    if holdout is None:
+        return None
+    unseen, at = holdout
+    place, there = _find_bins(choice, states, edges), _find_bins(choice, at, edges)
+    bins = max(int(place.max()), int(there.max())) + 1
+    mean = np.bincount(place, y, bins) / (np.bincount(place, minlength=bins) + 5.0)
+    return 1.0 - float(np.sum((unseen - mean[there]) ** 2)) / max(float(np.sum(unseen**2)), 1e-300)
+
+
+THINNED = 3  # every so many rows: smoothing has made neighbours alike
+SCALES = (0.02, 0.05, 0.1, 0.2, 0.4)  # of a scale, times the largest state
+TURNS = np.geomspace(1.0, 60.0, 240)  # of a wave over the range of the position
+FUNCTIONS: Mapping[str, Any] = {
+    "sin": np.sin, "exp": np.exp, "tanh": np.tanh, "sqrt": np.sqrt, "abs": np.abs, "pi": np.pi, "max": np.maximum,
+    "min": np.minimum, "__builtins__": {}}
+
+
+class Proposal(NamedTuple):
+    """A term with parameters that the regression gives it, and the share of what is missing that it predicts."""
+
+    term: Term
+    values: Mapping[str, float]  # by field
+    share: float  # in blocks that its coefficient was not made from
+
+
+class Rows(NamedTuple):
+    """The rows of a balance that a regression uses."""
+
+    missing: Floats  # (n,)
+    states: Mapping[str, Floats]  # (n,) each
+    nuisance: Floats  # (n, k): what tolerances of one unit make of them, each for one tolerance
+    noise: float
+
+
+def select_rows(balance: Balance, states: States, values: Mapping[str, float]) -> Rows:
+    """Rows in which the balance says something: not the ends, and for a force only those in which the ram slides."""
+    inner = np.arange(EDGE, len(balance.missing) - EDGE, THINNED)
+    inner = inner[balance.smooth[inner]]
+    if balance.place == "force":
+        inner = inner[np.abs(states.speed[inner]) > 2.0 * CREEP]
+    missing = balance.missing[inner]
+    if len(missing):
+        missing = np.clip(missing, *np.percentile(missing, [0.5, 99.5]))
+    at = {name: getattr(states, name)[inner] for name in states._fields}
+    return Rows(missing, at, _list_nuisance(balance.place, at, values), balance.noise)
+
+
+def _list_nuisance(place: str, at: Mapping[str, Floats], p: Mapping[str, float]) -> Floats:
+    """What one tolerance of each parameter adds to a balance, (n, k)."""
+    if place == "force":
+        parts = [p["jack.area"] * at["pressure"], p["jack.damping"] * at["speed"],
+                 p["jack.dynamic_friction"] * at["direction"], p["jack.mass"] * at["acceleration"]]
+    elif "pump.displacement" in p:
+        parts = [p["pump.displacement"] * at["current"], p["jack.area"] * at["speed"]]
+    elif place == "flow":
+        conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
+        parts = [p["valve.flow_gain"] * at["spool"], conductance * at["pressure"], p["jack.area"] * at["speed"]]
+    else:
+        parts = [at["current"], p["feedback_spring.stiffness"] / p["torque_motor.gain"] * at["spool"]]
+    return UNIT_TOLERANCE * np.column_stack(parts)
+
+
+def propose_terms(place: str, rows: Rows, present: Sequence[Term] = ()) -> list[Proposal]:
+    """Every term of a balance on its own, beside the tolerances, best first; without those that are `present`."""
+    if len(rows.missing) < 20 * FOLDS:
+        return []
+    terms = [t for t in TERMS if t.place == place and t not in present]
+    remover = _Remover(rows)
+    found = [p for p in (_fit_term(t, rows, remover) for t in terms) if p is not None]
+    return sorted(found, key=lambda p: -p.share)
+
+
+class _Remover:
+    """Takes out of columns what tolerances of a usual size can make up for."""
+
+    def __init__(self, rows: Rows) -> None:
+        wide = rows.nuisance
+        # neighbours are alike, so noise averages out over fewer rows than there are
+        variance = rows.noise**2 * ACCELERATION_WINDOW / THINNED + 1e-300
+        self._wide = wide
+        self._inverse = np.linalg.inv(wide.T @ wide + variance * np.eye(wide.shape[1]))
+        self.y = self.remove(rows.missing[:, None])[:, 0]
+
+    def remove(self, columns: Floats) -> Floats:
+        left: Floats = columns - self._wide @ (self._inverse @ (self._wide.T @ columns))
+        return left
+
+
+def _fit_term(term: Term, rows: Rows, remover: _Remover) -> Proposal | None:
+    trials = list_shapes(term, rows.states, remover.y)
+    best: tuple[float, dict[str, float]] | None = None
+    for shape in trials:
+        columns = remover.remove(evaluate_columns(term, shape, rows.states))
+        if not np.isfinite(columns).all() or np.ptp(columns, axis=0).max() == 0.0:
+            continue
+        size = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
+        share, c = _predict_blocks(columns / size, remover.y)
+        c = c / size
+        if best is None or share > best[0]:
+            values = {term.name: float(c[0]), **shape}
+            if term.is_wave:
+                values[term.name] = float(np.hypot(*c))
+                values[f"{term.name}_phase"] = float(np.arctan2(c[1], c[0]))
+            best = share, values
+    if best is None or best[1][term.name] == 0.0:
+        return None
+    return Proposal(term, best[1], best[0])
+
+
+def _predict_blocks(columns: Floats, y: Floats) -> tuple[float, Floats]:
+    """Share of `y` (n,) that the columns (n, k) predict in blocks left out of their fit, and the fit to all, (k,)."""
+    n = len(y)
+    blocks = list(zip(np.array_split(columns, FOLDS), np.array_split(y, FOLDS), strict=True))
+    grams = np.array([block.T @ block for block, _ in blocks])
+    sides = np.array([block.T @ part for block, part in blocks])
+    gram, side, small = grams.sum(axis=0), sides.sum(axis=0), 1e-6 * n * np.eye(columns.shape[1])
+    error = float(y @ y)
+    for g, s in zip(grams, sides, strict=True):
+        c = np.linalg.solve(gram - g + small, side - s)
+        error += float(c @ g @ c - 2.0 * c @ s)
+    return 1.0 - error / max(float(y @ y), 1e-300), np.linalg.solve(gram + small, side)
+
+
+def list_shapes(term: Term, states: Mapping[str, Floats], y: Floats) -> list[dict[str, float]]:
+    """Trial values of a term's shape, by field; one empty trial for a term without. Frequencies are lines of `y`."""
+    if term.shape is None:
+        return [{}]
+    x = states[term.shape.state]
+    field = f"{term.name}_{term.shape.name}"
+    if term.shape.kind == "scale":
+        largest = float(np.percentile(np.abs(x), 99.0))
+        return [{field: share * largest} for share in SCALES if share * largest > 0.0]
+    span = float(np.ptp(x))
+    if span <= 0.0:
+        return []
+    if term.shape.kind == "period":
+        return [{field: span / turns} for turns in TURNS.tolist()]
+    return [{field: hertz} for hertz in find_lines(y, x, span)]
+
+
+def find_lines(y: Floats, t: Floats, span: float, highest: float = 120.0, most: int = 4) -> list[float]:
+    """The strongest frequencies of `y` (n,) at the times `t` (n,), Hz: a regular grid, from which some may be missing.
+
+    A periodogram with zeros where a time is missing: its lines are where those of Lomb and Scargle are, 1000 times as
+    fast.
+    """
+    step = float(np.median(np.diff(t)))
+    places = np.rint((t - t[0]) / step).astype(int)
+    regular = np.zeros(2 * (int(places.max()) + 1))  # twice as long: two frequencies a line
+    np.add.at(regular, places, y - y.mean())
+    hertz, power, found = np.fft.rfftfreq(len(regular), step), np.abs(np.fft.rfft(regular)) ** 2, []
+    power[(hertz < 1.0 / span) | (hertz > highest)] = 0.0
+    for _ in range(most):
+        line = hertz[int(np.argmax(power))]
+        found.append(float(line))
+        power[np.abs(hertz - line) < 2.0 / span] = 0.0
+    return found
+
+
+def evaluate_columns(term: Term, values: Mapping[str, float], states: Mapping[str, Floats]) -> Floats:
+    """The term without its coefficient, (n, 1), in the unit of its balance over that of the coefficient.
+
+    A wave without a phase in `values` gives two columns, its sine and its cosine.
+    """
+    phases = [0.0, 0.5 * np.pi] if term.is_wave and f"{term.name}_phase" not in values else [None]
+    times = {"1": 1.0, "speed": states["speed"], "pressure": states["pressure"], "direction": states["direction"]}
+    columns = []
+    for phase in phases:
+        named = dict(values) if phase is None else {**values, f"{term.name}_phase": phase}
+        text = term.format_factor({field: repr(value) for field, value in named.items()})
+        factor = eval(text, dict(FUNCTIONS), dict(states))  # a formula of `terms.TERMS`
+        columns.append(np.broadcast_to(factor * times[PARTS[term.part][1]], states["time"].shape))
+    return np.column_stack(columns)

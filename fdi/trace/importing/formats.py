@@ -1,21 +1,30 @@
 """Opening a recording by the suffix of its name: text tables, MF4, MAT, Parquet, and traces of this software."""
 from __future__ import annotations
 
+import codecs
+import csv
+import gzip
 import importlib
-from collections.abc import Collection, Iterator, Mapping
+import io
+import itertools
+import math
+import re
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.importing.measurement import ArrayMeasurement, Channel, Measurement
-from fdi.trace.importing.text_table import open_text_table, split_unit
+from fdi.trace.csv_table import open_text, report_unreadable
+from fdi.trace.importing.import_map import OTHER_UNITS, find_unit
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant.errors import InputError, suggest_name
 
 Floats = NDArray[np.float64]
 
@@ -186,3 +195,358 @@ def _open_parquet(path: Path) -> Measurement:
         said = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
         units[column.name] = "s" if str(column.type).startswith("timestamp") else said or split_unit(column.name)[1]
     return ParquetMeasurement(path, "Parquet", units, file)
+
+
+ENCODINGS = "UTF-8, UTF-16 or Latin-1"  # that text tables may have
+SEPARATORS = (";", "\t", "|", ",", " ")
+COMMENTS = ("#", "%", "//", "!")
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "#n/a", "nil"}
+SAMPLE_LINES = 200  # of a file, from which its layout is found
+
+
+class Layout(NamedTuple):
+    """How a text table is written."""
+
+    encoding: str
+    separator: str  # " ": any white space
+    decimal: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    name_line: int  # 0: the file has no names
+    first_line: int  # of the numbers
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A text table whose layout is known; its numbers are read when asked for."""
+
+    path: Path
+    layout: Layout
+    has_times: bool = False
+
+    @property
+    def format(self) -> str:
+        """Separator, decimal sign and line of the names, for people."""
+        separator = {"\t": "tabulator", " ": "white space"}.get(self.layout.separator, f"'{self.layout.separator}'")
+        decimal = ", decimal comma" if self.layout.decimal == "," else ""
+        names = f"names in line {self.layout.name_line}" if self.layout.name_line else "no names"
+        return f"CSV, separator {separator}{decimal}, {names}"
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Column to unit, from a line of units or from brackets behind the name."""
+        return dict(zip(self.layout.names, self.layout.units, strict=True))
+
+    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
+        """The columns, (rows,) each. The file is read line by line: memory holds the chosen columns alone.
+
+        Raises:
+            InputError: a field that is no number or date, or a row of another length; it names the line.
+        """
+        places = [(self.layout.names.index(name), name) for name in dict.fromkeys(names)]
+        columns = {name: array("d") for _, name in places}
+        parse_number = _make_number_parser(self.layout.decimal)
+        appends = [(i, name, columns[name].append, _parse_date if name in dates else parse_number)
+                   for i, name in places]
+        width = len(self.layout.names)
+        with report_unreadable(self.path, ENCODINGS), _open(self.path, self.layout.encoding) as stream:
+            for line, fields in _split_rows(stream, self.layout):
+                if len(fields) != width and not _is_padded(fields, width):
+                    raise InputError(f"{self.path}: line {line}", "", f"{width} fields, not {len(fields)}")
+                for i, name, append, parse in appends:
+                    try:
+                        append(parse(fields[i]))
+                    except ValueError:
+                        kind = "a date and time (ISO 8601)" if name in dates else "a finite number or an empty field"
+                        raise InputError(f"{self.path}: line {line}", name, f"{kind}, not {fields[i]!r}") from None
+        if not len(next(iter(columns.values()), array("d"))):
+            raise InputError(self.path, "", "at least one row of numbers")
+        return {name: Channel(np.frombuffer(column)) for name, column in columns.items()}
+
+
+def open_text_table(path: Path, separator: str | None = None, decimal: str | None = None,
+                    name_line: int | None = None) -> TextTable:
+    """A text table; what is not given is found in its first lines.
+
+    Raises:
+        InputError: a file that cannot be read or holds no table of numbers.
+    """
+    with report_unreadable(path, ENCODINGS):
+        encoding = _find_encoding(path)
+        with _open(path, encoding) as stream:
+            lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
+    separator, decimal = _find_separators(path, lines, separator, decimal)
+    rows = [_split_line(line, separator) for line in lines]
+    parse = _make_number_parser(decimal)
+    width = _find_width(rows, lines, parse)
+    first = next((i for i, row in enumerate(rows) if not _is_comment(lines[i]) and _is_data(row, width, parse)
+                  and i != (name_line or 0) - 1), None)
+    if first is None:
+        raise InputError(path, "", "a table with rows of numbers in its first 200 lines")
+    names, units, line = _find_names(path, rows, lines, first, width, name_line)
+    return TextTable(path, Layout(encoding, separator, decimal, names, units, line, first + 1))
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A name and the unit in brackets, or behind a slash or underscore, at its end; "" if there is none.
+
+    >>> split_unit("Kolbenweg [mm]"), split_unit("p12_bar"), split_unit("state")
+    (('Kolbenweg', 'mm'), ('p12', 'bar'), ('state', ''))
+    """
+    found = re.fullmatch(r"(.*?)\s*[\[(<{]\s*([^\])>}]*)\s*[\])>}]\s*", name)
+    if found:
+        return found[1].strip(), found[2].strip()
+    found = re.fullmatch(r"(.+?)\s*[/_ ]\s*([A-Za-zµμ%]+)", name)
+    if found and _is_unit(found[2]) and found[2] not in ("a", "n", "v", "in", "S", "h"):
+        return found[1].strip(), found[2]
+    return name.strip(), ""
+
+
+def _is_unit(text: str) -> bool:
+    return find_unit(text) is not None or text in OTHER_UNITS
+
+
+def _find_encoding(path: Path) -> str:
+    """By the byte order mark, else UTF-8 if the first 64 KiB are, else Latin-1."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as stream:
+        start = stream.read(65536)
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    if b"\0" in start:
+        raise InputError(path, "", "a text file; it holds zero bytes")
+    try:
+        codecs.getincrementaldecoder("utf-8-sig")().decode(start)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
+
+
+def _open(path: Path, encoding: str) -> io.TextIOBase:
+    if path.suffix == ".gz":
+        return open_text(path) if encoding == "utf-8-sig" else _reopen_gzip(path, encoding)
+    return path.open(encoding=encoding, newline="")
+
+
+def _reopen_gzip(path: Path, encoding: str) -> io.TextIOBase:
+    stream = open_text(path)
+    assert isinstance(stream, io.TextIOWrapper)
+    stream.reconfigure(encoding=encoding)
+    return stream
+
+
+def _is_comment(line: str) -> bool:
+    return not line.strip() or line.lstrip().startswith(COMMENTS)
+
+
+def _split_line(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [field.strip() for field in line.split(separator)]
+    return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+
+
+def _split_rows(stream: io.TextIOBase, layout: Layout) -> Iterator[tuple[int, list[str]]]:
+    """Line number and fields of each row of numbers."""
+    for line, text in enumerate(stream, 1):
+        if line >= layout.first_line and not _is_comment(text):
+            yield line, _split_line(text.rstrip("\r\n"), layout.separator)
+
+
+def _is_padded(fields: list[str], width: int) -> bool:
+    """Whether a row has only empty fields more, as behind a last separator."""
+    return len(fields) > width and not any(fields[width:])
+
+
+def _make_number_parser(decimal: str) -> Callable[[str], float]:
+    """Text to number, NaN for a missing one; raises ValueError for any other text and for infinity."""
+    def parse(text: str) -> float:
+        try:
+            value = float(text if decimal == "." else text.replace(",", "."))
+        except ValueError:
+            if text.lower() in MISSING:
+                return math.nan
+            raise
+        if math.isinf(value) or "_" in text:
+            raise ValueError
+        return value
+
+    def parse_comma(text: str) -> float:
+        if "." in text:
+            raise ValueError
+        return parse(text)
+
+    return parse if decimal == "." else parse_comma
+
+
+def _parse_date(text: str) -> float:
+    """Seconds of an ISO date and time; a zone is left out."""
+    text = re.sub(r"(Z|[+-]\d\d:?\d\d)$", "", text.strip()).replace(",", ".")
+    value = np.datetime64(text.replace(" ", "T"), "ns")
+    if np.isnat(value):
+        raise ValueError
+    # relative to 2020, so that a double resolves 0.1 us
+    return float((value - np.datetime64("2020-01-01", "ns")).astype(np.int64)) / 1e9
+
+
+def _is_number(text: str, parse: Callable[[str], float]) -> bool:
+    try:
+        return not math.isnan(parse(text))
+    except ValueError:
+        return False
+
+
+def _find_separators(path: Path, lines: list[str], separator: str | None, decimal: str | None) -> tuple[str, str]:
+    """The pair under which most fields are numbers."""
+    best, found = 0.0, (separator or ",", decimal or ".")
+    body = [line for line in lines if not _is_comment(line)]
+    for sep in (separator,) if separator else SEPARATORS:
+        rows = [_split_line(line, sep) for line in body]
+        widths = Counter(map(len, rows))
+        width = widths.most_common(1)[0][0] if widths else 0
+        for dec in (decimal,) if decimal else (".", ","):
+            if dec == sep or width < 2:
+                continue
+            parse = _make_number_parser(dec)
+            cells = [cell for row in rows if len(row) == width and any(_is_number(cell, parse) for cell in row)
+                     for cell in row]
+            share = sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)
+            score = len(cells) * share**3
+            if score > best:
+                best, found = score, (sep, dec)
+    if not best:
+        raise InputError(path, "", "a table with at least two columns of numbers")
+    return found
+
+
+def _find_width(rows: list[list[str]], lines: list[str], parse: Callable[[str], float]) -> int:
+    """Columns of the rows of numbers, without those behind a last separator."""
+    numbers = [row for row, line in zip(rows, lines, strict=True)
+               if not _is_comment(line) and any(_is_number(cell, parse) for cell in row)]
+    width = Counter(map(len, numbers)).most_common(1)[0][0] if numbers else 0
+    alike = [row for row in rows if len(row) == width]
+    while width and not any(row[width - 1] for row in alike):
+        width -= 1
+    return width
+
+
+def _is_data(row: list[str], width: int, parse: Callable[[str], float]) -> bool:
+    numbers = sum(_is_number(cell, parse) for cell in row)
+    words = sum(not _is_number(cell, parse) and cell.lower() not in MISSING for cell in row)
+    return len(_trim(row, width)) == width and numbers > words
+
+
+def _find_names(path: Path, rows: list[list[str]], lines: list[str], first: int, width: int,
+                name_line: int | None) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Names, units, and the line of the names: the text lines just above the numbers."""
+    above = [i for i in range(first) if len(_trim(rows[i], width)) == width
+             and not (_is_comment(lines[i]) and i + 1 != name_line)]
+    if name_line is not None:
+        if name_line - 1 not in above:
+            raise InputError(f"{path}: line {name_line}", "names", f"{width} names above the first row of numbers, "
+                                                                   f"line {first + 1}")
+        above = [i for i in above if i >= name_line - 1]
+    elif len(above) > 2 or (len(above) == 2 and not _is_unit_line(rows[above[-1]])):
+        above = above[-2:] if _is_unit_line(rows[above[-1]]) else above[-1:]
+    if not above:
+        comment = _find_names_in_comment(lines, first, width)
+        names = comment or [f"column {i + 1}" for i in range(width)]
+        return _make_unique(names), tuple(split_unit(name)[1] for name in names), 0
+    names = [name or f"column {i + 1}" for i, name in enumerate(_trim(rows[above[0]], width))]
+    units = [split_unit(name)[1] for name in names]
+    if len(above) > 1 and _is_unit_line(rows[above[1]]):
+        units = [own.strip("[]() ") or unit for own, unit in zip(_trim(rows[above[1]], width), units, strict=True)]
+    return _make_unique(names), tuple(units), above[0] + 1
+
+
+def _find_names_in_comment(lines: list[str], first: int, width: int) -> list[str]:
+    """Names in the last comment line above the numbers, as `# t, x, p`."""
+    for line in reversed(lines[:first]):
+        text = line.strip().lstrip("#%!/ ")
+        for separator in SEPARATORS:
+            names = _split_line(text, separator)
+            if len(names) == width and all(names):
+                return names
+    return []
+
+
+def _trim(row: list[str], width: int) -> list[str]:
+    return row[:width] if _is_padded(row, width) else row
+
+
+def _is_unit_line(row: list[str]) -> bool:
+    cells = [cell.strip("[]() ") for cell in row]
+    known = sum(_is_unit(cell) for cell in cells if cell and cell != "-")
+    return known > 0 and known >= 0.5 * sum(bool(cell) and cell != "-" for cell in cells)
+
+
+def _make_unique(names: list[str]) -> tuple[str, ...]:
+    """The names, a second one of the same name with " #2" behind it."""
+    seen: Counter[str] = Counter()
+    out = []
+    for name in names:
+        seen[name] += 1
+        out.append(name if seen[name] == 1 else f"{name} #{seen[name]}")
+    return tuple(out)
+
+
+class Channel(NamedTuple):
+    """A channel's samples, NaN where one is missing; times (s) where the file gives each channel its own."""
+
+    values: Floats
+    t: Floats | None = None
+
+
+class Measurement(Protocol):
+    """An open recording of another logger."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+
+    @property
+    def format(self) -> str:
+        """For people: "CSV, separator ';', decimal comma, names in line 3"."""
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Channel to unit as the file has it, "" if it has none; all channels, in the file's order."""
+
+    @property
+    def has_times(self) -> bool:
+        """Whether each channel has times of its own."""
+
+    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
+        """The channels of these names; `dates` are calendar times and become seconds from the first one on.
+
+        Raises:
+            InputError: a value that is no number, naming its place.
+        """
+
+
+@dataclass(frozen=True)
+class ArrayMeasurement:
+    """A recording that is in memory as arrays."""
+
+    path: Path
+    format: str
+    units: Mapping[str, str]
+    channels: Mapping[str, Channel]
+    has_times: bool = False
+
+    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
+        """The channels of these names."""
+        return {name: self.channels[name] for name in names}
+
+
+def require_channel(measurement: Measurement, name: str, where: object, field: str) -> None:
+    """Refuse a name that is no channel of the recording.
+
+    Raises:
+        InputError: it names the field of the map and the nearest channel.
+    """
+    if name not in measurement.units:
+        shown = list(measurement.units)[:12]
+        more = ", .." if len(measurement.units) > len(shown) else ""
+        raise InputError(where, field, f"a column of {measurement.path.name} ({', '.join(shown)}{more}), "
+                                       f"not {name!r}{suggest_name(name, measurement.units)}")

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
-from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES
-from fdi.trace.importing.measurement import Channel, Measurement
-from fdi.trace.importing.text_table import TextTable, split_unit
-from fdi.trace.importing.units import UNITS, convert_to_si, find_unit
-from fdi.trace.resolution import find_comb
+from fdi.trace.importing.formats import Channel, Measurement, TextTable, split_unit
+from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES, UNITS, convert_to_si, find_unit
+from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
 from plant.parameters import load_nominal_values

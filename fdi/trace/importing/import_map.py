@@ -5,10 +5,13 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from fdi.trace.importing.units import Unit, require_unit
+import numpy as np
+from numpy.typing import NDArray
+
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, suggest_name
@@ -277,3 +280,120 @@ def _parse_sensor(table: _Table, scaling: Scaling) -> tuple[SensorDynamics, tupl
     sensor = SensorDynamics(moving_mean=float(mean), centred=centred, lag=float(lag or 0.0),
                             quantum=float(quantum or 0.0) * float(scaling.unit.factor))
     return sensor, tuple((float(a), float(b)) for a, b in dead)
+
+
+Floats = NDArray[np.float64]
+
+
+class Unit(NamedTuple):
+    """A unit: the SI unit of its quantity and how many of those it is."""
+
+    si: str
+    factor: Fraction
+
+
+def _list_units(si: str, **factors: str | int) -> dict[str, Unit]:
+    return {name: Unit(si, Fraction(factor)) for name, factor in factors.items()}
+
+
+UNITS: Mapping[str, Unit] = {
+    **_list_units("m", m=1, cm="1/100", mm="1/1000", um="1/1000000", nm="1/1000000000", inch="0.0254", mil="0.0000254"),
+    **_list_units("Pa", Pa=1, hPa=100, kPa=1000, MPa=1000000, GPa=1000000000, mbar=100, bar=100000,
+                  psi="6894.757293168361"),
+    **_list_units("A", A=1, mA="1/1000", uA="1/1000000"),
+    **_list_units("N", N=1, kN=1000, MN=1000000, daN=10, lbf="4.4482216152605"),
+    **_list_units("s", s=1, ms="1/1000", us="1/1000000", ns="1/1000000000", min=60, h=3600),
+}
+SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "μA": "uA", "in": "inch", "sec": "s",
+             "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
+             "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
+             "PSI": "psi", "Volt": "V", "v": "V", "micron": "um", "metre": "m", "meter": "m"}
+OTHER_UNITS = ("V", "mV", "counts", "%")  # what a logger may write that needs scale and offset
+
+
+def find_unit(name: str) -> Unit | None:
+    """The unit of this name or spelling; None if it is not known."""
+    return UNITS.get(SPELLINGS.get(name.strip(), name.strip()))
+
+
+def require_unit(name: str, si: str, where: object, field: str) -> Unit:
+    """The unit `name`, which must measure what `si` measures.
+
+    Raises:
+        InputError: an unknown unit, or one of another quantity.
+    """
+    unit = find_unit(name)
+    fitting = [known for known, u in UNITS.items() if u.si == si]
+    if unit is None and name in OTHER_UNITS:
+        raise InputError(where, field, f"the unit that scale and offset lead to, such as {fitting[0]} ({name} is raw: "
+                                       f"value = sign * (scale * raw + offset) in `unit`)")
+    if unit is None or unit.si != si:
+        raise InputError(where, field, f"one of {', '.join(fitting)}, not {name!r}{suggest_name(name, fitting)}")
+    return unit
+
+
+def convert_to_si(values: Floats, unit: Unit) -> Floats:
+    """Values in SI units.
+
+    A factor below 1 is a division by a whole number: 12.3456 mm becomes the float nearest to 0.0123456 m.
+
+    >>> convert_to_si(np.array([12.3456]), UNITS["mm"]).tolist()
+    [0.0123456]
+    """
+    if unit.factor < 1 and unit.factor.numerator == 1:
+        return values / float(unit.factor.denominator)
+    return values * float(unit.factor)
+
+
+def compute_times(base: TimeBase, samples: int, column: Floats | None, where: object, field: str) -> Floats:
+    """Times (s) of so many samples; `column` holds the values of the base's source.
+
+    Raises:
+        InputError: times that are missing, stand still or go backwards, and counts that are no whole numbers.
+    """
+    if column is None:
+        assert base.rate is not None  # a base without source has a rate
+        return np.arange(samples) / base.rate
+    missing = np.isnan(column)
+    if missing.any():
+        raise InputError(where, field, f"a time in every row; row {int(missing.argmax()) + 1} has none")
+    if base.bits is not None and base.rate is not None:
+        return unwrap_counter(column, base.bits, where, field) / base.rate
+    t = column - column[0] if base.unit is None else convert_to_si(column, base.unit)
+    require_growth(t, where, field)
+    return t
+
+
+def unwrap_counter(counts: Floats, bits: int, where: object, field: str) -> Floats:
+    """Counts since the first sample, of a counter that starts again at 2**bits.
+
+    >>> unwrap_counter(np.array([254.0, 255.0, 0.0, 3.0]), 8, "x", "n").tolist()
+    [0.0, 1.0, 2.0, 5.0]
+
+    Raises:
+        InputError: counts that are no whole numbers below 2**bits, or that repeat.
+    """
+    size = 2.0**bits
+    bad = (counts != np.floor(counts)) | (counts < 0) | (counts >= size)
+    if bad.any():
+        row = int(bad.argmax())
+        raise InputError(where, field, f"whole numbers from 0 to {size - 1:.0f} ({bits} bits); "
+                                       f"row {row + 1} has {counts[row]:g}")
+    steps = np.diff(counts) % size
+    if (steps == 0).any():
+        row = int((steps == 0).argmax()) + 2
+        raise InputError(where, field, f"a counter that goes on in every row; row {row} repeats {counts[row - 1]:g}")
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def require_growth(t: Floats, where: object, field: str) -> None:
+    """Refuse times that do not grow.
+
+    Raises:
+        InputError: it names the row and both times.
+    """
+    grows = np.diff(t) > 0.0
+    if not grows.all():
+        row = int(np.argmin(grows)) + 1
+        raise InputError(where, field, f"times that grow; row {row + 1} has {t[row]:.9g} s after {t[row - 1]:.9g} s "
+                                       "(a counter that wraps needs bits and rate)")

@@ -21,7 +21,7 @@ def run_command(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from fdi.discovery.update_model import add_effects, find_runs, write_model_file
-    from fdi.report.model_report import build_model_report
+    from fdi.report.explain_report import build_model_report
     from rig.cli.answer import Places, choose_file, show_answer, write_answer
     from rig.cli.progress_bar import show_progress
 

@@ -40,8 +40,7 @@ def run_command(args: argparse.Namespace) -> int:
     if args.what == "recordings":
         return _measure_recordings(args)
     from fdi.output import write_text
-    from rig.bench.plant import measure_accuracy, run_benchmarks
-    from rig.bench.plant_report import build_plant_report
+    from rig.bench.plant import build_plant_report, measure_accuracy, run_benchmarks
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
     from rig.sequences import load_sequence
@@ -84,8 +83,7 @@ def _run_realtime(args: argparse.Namespace) -> int:
         InputError: a bus that compiled code cannot use, or a time or number of blocks that is too small.
     """
     from fdi.output import write_text
-    from rig.bench.realtime import measure_realtime
-    from rig.bench.realtime_report import build_realtime_report
+    from rig.bench.realtime import build_realtime_report, measure_realtime
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
 

@@ -19,7 +19,7 @@ def run_command(args: argparse.Namespace) -> int:
 
     from rig.cli.answer import choose_places, show_answer, write_answer
     from rig.cli.progress_bar import show_progress
-    from rig.run.job_choice import JobChoice, build_job
+    from rig.run.job import JobChoice, build_job
     from rig.suite.dry_run import make_dry_run
     from rig.suite.dry_run_report import build_dry_run_report
 

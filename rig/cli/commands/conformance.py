@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rig.network.wire import Wire
+    from rig.network.link import Wire
 
 OWN_NODES = {"controller": 2, "plant": 3, "c": 2}  # c: the controller in C, rig/firmware
 
@@ -37,9 +37,8 @@ def run_command(args: argparse.Namespace) -> int:
     from plant.errors import InputError
     from rig.cli.answer import choose_file, show_answer
     from rig.cli.progress_bar import show_progress
-    from rig.conformance.conformance_report import Subject, build_conformance_report, write_junit
     from rig.conformance.data_sheet import DataSheet
-    from rig.conformance.run_cases import choose_cases, run_cases
+    from rig.conformance.run_cases import Subject, build_conformance_report, choose_cases, run_cases, write_junit
     from rig.conformance.target import Options, Target
     from rig.network.bus import choose_bus
 
@@ -118,8 +117,7 @@ def open_wire(node: str, bus: str) -> Iterator[Wire]:
     from plant.errors import InputError
     from rig.network.bus import open_can
     from rig.network.clock import VirtualClock, WallClock
-    from rig.network.link import Link
-    from rig.network.wire import EmbeddedWire, LinkWire
+    from rig.network.link import EmbeddedWire, Link, LinkWire
     from rig.run.participants import EMBEDDED_NAMES
 
     if bus.partition(":")[0] in EMBEDDED_NAMES:
@@ -152,8 +150,7 @@ def _start_node(name: str, bus: str, wire: Wire) -> Iterator[None]:
 
     from plant.errors import RigError
     from rig.firmware.build import build_controller
-    from rig.run.participants import require_firmware_bus
-    from rig.run.processes import NodeProcesses
+    from rig.run.participants import NodeProcesses, require_firmware_bus
 
     if name not in OWN_NODES:
         yield

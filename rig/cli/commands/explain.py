@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rig.cli import discovery_options, options
 
 if TYPE_CHECKING:
-    from fdi.discovery.candidates import Answer
+    from fdi.discovery.explain_runs import Answer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

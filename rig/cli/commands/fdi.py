@@ -84,9 +84,9 @@ def load_bands(args: argparse.Namespace) -> Bands | None:
     """The bands of --bands; None for the software's own."""
     if args.bands is None:
         return None
-    from fdi.diagnosis import bands_file
+    from fdi.diagnosis import bands
 
-    return bands_file.load_bands(Path(args.bands))
+    return bands.load_bands(Path(args.bands))
 
 
 def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:

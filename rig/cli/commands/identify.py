@@ -29,10 +29,8 @@ def run_command(args: argparse.Namespace) -> int:
 
     A model that does not explain the runs (UNEXPLAINED) is written only with --out.
     """
-    from fdi.identification.free_parameters import read_free_parameters
-    from fdi.identification.identify import identify_model
-    from fdi.identification.model_text import write_identified_model
-    from fdi.identification.runs import read_identification_runs
+    from fdi.identification.free_parameters import read_free_parameters, read_identification_runs
+    from fdi.identification.identify import identify_model, write_identified_model
     from fdi.report.identify_report import build_identification_report
     from rig.cli.answer import Places, choose_file, show_answer, write_answer
     from rig.cli.progress_bar import show_progress

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from plant.errors import InputError
 
 if TYPE_CHECKING:
+    from fdi.trace.importing.formats import Measurement
     from fdi.trace.importing.import_map import ImportMap
-    from fdi.trace.importing.measurement import Measurement
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,7 +117,7 @@ def _open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | Non
     from rig.recorder.convert import RAW_SUFFIXES
 
     if source.suffix in RAW_SUFFIXES:
-        from rig.recorder.can_measurement import open_can_log
+        from rig.recorder.convert import open_can_log
 
         return open_can_log(source, Path(args.dbc) if args.dbc else dbc.DBC)
     if chosen is None:

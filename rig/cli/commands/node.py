@@ -49,9 +49,8 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.answer import show_answer
     from rig.network.bus import choose_bus, open_can
     from rig.network.clock import WallClock
-    from rig.network.link import Link
+    from rig.network.link import Link, serve_node
     from rig.network.raw_bus import can_open
-    from rig.network.wire import serve_node
     from rig.run.participants import EMBEDDED_NAMES
     from rig.run.priority import LOOP_PRIORITY, lock_memory, raise_priority
 

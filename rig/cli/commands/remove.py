@@ -20,8 +20,8 @@ def run_command(args: argparse.Namespace) -> int:
     """The model goes to --out (default: the file of --model, in place)."""
     from dataclasses import replace
 
-    from fdi.discovery.update_model import find_runs, remove_effect, write_model_file
-    from fdi.report.model_report import build_model_report
+    from fdi.discovery.update_model import find_runs, remove_effect_and_refit, write_model_file
+    from fdi.report.explain_report import build_model_report
     from plant import InputError
     from rig.cli.answer import Places, choose_file, show_answer, write_answer
     from rig.cli.progress_bar import show_progress
@@ -40,7 +40,8 @@ def run_command(args: argparse.Namespace) -> int:
             progress("reading", 0.0)
             runs = find_runs(model, known, trace, args.repeat, args.holdout, discovery_options.list_signals(args))
         known = replace(known, effect_files=discovery_options.list_effect_files(args, known))
-        update = remove_effect(effects[0], runs, model, known, discovery_options.format_command_line(), progress)
+        words = discovery_options.format_command_line()
+        update = remove_effect_and_refit(effects[0], runs, model, known, words, progress)
         report = build_model_report(update, path, write_model_file(update, path), page)
         write_answer(report, Places(page, None))
     show_answer(report, args)

@@ -14,10 +14,9 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
-    from rig.live.viewer_place import ViewerPlace
+    from rig.live.live_process import ViewerPlace
     from rig.recorder import Record
-    from rig.run.job import Job
-    from rig.run.job_choice import JobChoice
+    from rig.run.job import Job, JobChoice
     from rig.run.outcome import Outcome
     from rig.run.runner import Observe
 
@@ -66,13 +65,12 @@ def run_command(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
-    from rig.live.viewer_place import find_viewer_place
+    from rig.live.live_process import find_viewer_place
     from rig.network.clock import WallClock
-    from rig.run.job import replace_settings
-    from rig.run.job_choice import build_job
+    from rig.run.job import build_job, replace_settings
+    from rig.run.outcome import diagnose_servovalve
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
-    from rig.run.servovalve import diagnose_servovalve
 
     args.live, args.sequence = split_live(args.live, args.sequence)
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
@@ -181,9 +179,8 @@ def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> It
     if not is_live:
         yield announce_dead_node
         return
-    from rig.live.dead_node import find_dead_node
     from rig.live.live_process import show_live
-    from rig.live.live_run import make_live_plan
+    from rig.live.live_run import find_dead_node, make_live_plan
     from rig.recorder import Event
 
     deaths: list[Event] = []
@@ -202,7 +199,7 @@ def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> It
 
 def announce_dead_node(t_ns: int, record: Record) -> None:
     """Print a line on standard error, at once, when a node has died."""
-    from rig.live.dead_node import find_dead_node
+    from rig.live.live_run import find_dead_node
     from rig.recorder import Event
 
     if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
@@ -241,7 +238,7 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     Its last line repeats a verdict other than a plain PASS: the headline may have scrolled out of sight.
     """
     from fdi.report.report import Line, Medium, Section
-    from rig.run.differences import find_differences
+    from rig.run.job import find_differences
 
     timing = outcome.timing
     if outcome.job.realtime:
@@ -285,7 +282,7 @@ def build_choice(args: argparse.Namespace) -> JobChoice:
     Raises:
         InputError: a --set that is not GROUP.FIELD=VALUE.
     """
-    from rig.run.job_choice import JobChoice
+    from rig.run.job import JobChoice
 
     return JobChoice(sequence=[*args.sequence, "preflight"][0], model=args.model,
                      changes=options.parse_changes(args.set), seed=args.seed or 0, effects=tuple(args.effects),

@@ -46,8 +46,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def follow_traces(args: argparse.Namespace) -> UnitTrend:
     """The trends of the traces in a folder, or of the points in the JSON file of an earlier answer."""
-    from fdi.prognosis.gather import Options, gather_sizes
-    from fdi.prognosis.unit_trend import follow_unit, read_points
+    from fdi.prognosis.unit_trend import Options, follow_unit, gather_sizes, read_points
     from rig.cli.progress_bar import show_progress
 
     model, source = options.load_chosen_model(args), Path(args.folder)

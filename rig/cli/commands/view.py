@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fdi.comparison.compare import Comparison
     from fdi.progress import Progress
     from plant.model import Model
-    from rig.view.recording import ShownView
+    from rig.view.viewer import ShownView
 
 
 class Drawing(NamedTuple):
@@ -53,7 +53,7 @@ def run_command(args: argparse.Namespace) -> int:
     from rig.cli.answer import show_answer
     from rig.cli.progress_bar import show_progress
     from rig.view import viewer
-    from rig.view.recording import import_rerun
+    from rig.view.viewer import import_rerun
 
     _require_options_that_fit(args)
     sources = [args.trace, *args.others]
@@ -179,7 +179,7 @@ def _load_models(args: argparse.Namespace) -> tuple[Model, Model | None]:
     """The chosen model, and the same without --set and without added effects; None if it is the same."""
     from dataclasses import replace
 
-    from fdi.discovery.model_file import remove_all_effects
+    from fdi.discovery.update_model import remove_all_effects
     from rig.cli.discovery_options import load_model
 
     model, _ = load_model(args)

@@ -8,7 +8,7 @@ import pytest
 from noisy_traces import record_healthy
 
 from fdi.comparison.blocks import compare_controller, find_lags
-from fdi.estimation.preparation import read_cycles
+from fdi.estimation.replay import read_cycles
 from fdi.thresholds import CONTROLLER_ERROR_RATIO
 from fdi.trace.trace import Trace, shift_rows
 from plant import Model, simulate

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi.comparison.deviation_map import map_deviation
+from fdi.comparison.residuals import map_deviation
 from fdi.trace.trace import Trace
 
 

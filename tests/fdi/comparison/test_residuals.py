@@ -22,8 +22,7 @@ from fdi.comparison.residuals import (
     locate_error,
     name_shape,
 )
-from fdi.estimation.preparation import read_cycles
-from fdi.estimation.replay import differentiate
+from fdi.estimation.replay import differentiate, read_cycles
 from fdi.trace.trace import Trace
 from plant import Model
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdi.comparison.matched_checks import match_checks
-from fdi.comparison.run_differences import compare_runs, find_offset
+from fdi.comparison.run_differences import compare_runs, find_offset, match_checks
 from fdi.report.diff_report import build_diff_report
 from fdi.report.html import render_html
 from fdi.report.terminal import format_report

@@ -8,8 +8,7 @@ import pytest
 from places import SHARED
 from rig_command import rig
 
-from fdi.estimation.preparation import prepare_trace
-from fdi.estimation.replay import compute_residuals, replay_command, replay_current
+from fdi.estimation.replay import compute_residuals, prepare_trace, replay_command, replay_current
 from fdi.trace.trace import Trace, rms
 from plant import load_model
 

@@ -14,15 +14,18 @@ from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
     find_stays,
+    format_bands,
     judge_position,
     judge_trace,
+    load_bands,
+    load_default_bands,
     matches_command,
+    parse_bands,
     require_same_command,
+    save_bands,
 )
-from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands, parse_bands, save_bands
 from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import choose_bands, make_bands_by_simulation
-from fdi.diagnosis.simulated_units import UnitKind, simulate_units
+from fdi.diagnosis.learn_bands import UnitKind, choose_bands, make_bands_by_simulation, simulate_units
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi.diagnosis.bands import judge_trace
-from fdi.diagnosis.bands_file import format_bands, load_bands, load_default_bands
-from fdi.diagnosis.learn_bands import learn_bands
-from fdi.diagnosis.simulated_units import UnitKind, sample_sensor_noise, simulate_units
+from fdi.diagnosis.bands import format_bands, judge_trace, load_bands, load_default_bands
+from fdi.diagnosis.learn_bands import UnitKind, learn_bands, sample_sensor_noise, simulate_units
 from fdi.trace.trace import Trace
 from plant import InputError, load_model
 from plant.profile import build_profile as profile

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from noisy_traces import SHORT, record_plant
 
-from fdi.diagnosis.bands import describe_other_model, list_design
-from fdi.diagnosis.bands_file import format_bands, load_default_bands, parse_bands
+from fdi.diagnosis.bands import describe_other_model, format_bands, list_design, load_default_bands, parse_bands
 from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.diagnosis.learn_bands import make_bands_by_simulation

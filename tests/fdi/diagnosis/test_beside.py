@@ -9,12 +9,20 @@ import pytest
 from noisy_traces import record_plant
 from synthetic_run import build_command
 
-from fdi.diagnosis.beside import Beside, Explanation, average_explanations, mix_estimates, weigh_costs
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level
-from fdi.diagnosis.joint_search import EFFECT_POWERS, list_other_effects, make_joint_problem
+from fdi.diagnosis.joint_search import (
+    EFFECT_POWERS,
+    Beside,
+    Explanation,
+    average_explanations,
+    list_other_effects,
+    make_joint_problem,
+    mix_estimates,
+    weigh_costs,
+)
 from fdi.diagnosis.refine import find_flat, list_unknowns, make_problem, make_start
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import list_effect_unknowns
 from fdi.report.diagnosis_report import build_diagnosis_report

@@ -9,8 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fdi.diagnosis.bands_file import load_default_bands
+from fdi.diagnosis.bands import load_default_bands
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
+from fdi.diagnosis.learn_bands import UnitKind, simulate_units
 from fdi.diagnosis.precursors import (
     MEANINGS,
     compute_features,
@@ -19,7 +20,6 @@ from fdi.diagnosis.precursors import (
     measure_precursors,
     smooth_spikes,
 )
-from fdi.diagnosis.simulated_units import UnitKind, simulate_units
 from fdi.report.diagnosis_figures import draw_precursor_shifts, draw_sizes
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace

@@ -16,9 +16,8 @@ from fdi.diagnosis.refine import (
     make_start,
     refine_sizes,
 )
-from fdi.estimation.final_rounds import linearise_across
-from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.unidentifiable import find_flat_directions, relax_along
+from fdi.estimation.replay import hold_inputs
+from fdi.estimation.unidentifiable import find_flat_directions, linearise_across, relax_along
 from plant import Model, load_model
 from rig.campaign.judge import simulate_case
 from rig.campaign.matrix import build_matrix

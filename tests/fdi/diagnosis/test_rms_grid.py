@@ -19,7 +19,7 @@ from fdi.diagnosis.rms_grid import (
     merge_minima,
     search_grid,
 )
-from fdi.estimation.preparation import read_cycles
+from fdi.estimation.replay import read_cycles
 from plant import InputError, Model, simulate
 from plant.monitor import Monitor
 from plant.profile import build_profile

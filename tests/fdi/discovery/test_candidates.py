@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from fdi.discovery.candidates import Answer, Candidate, list_fitted_parameters
+from fdi.discovery.explain_runs import Answer, Candidate, list_fitted_parameters
 from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import Free
 from plant import Model

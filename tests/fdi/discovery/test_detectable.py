@@ -8,7 +8,7 @@ from fdi.discovery.detectable import Detectable, find_detectable_sizes, find_hid
 from fdi.estimation.fit import fit_unknowns
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import white_noise
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
 from fdi.trace.trace import Trace
 from plant import Model, simulate

@@ -10,16 +10,21 @@ from effect_files import restored_catalogue
 from noisy_traces import SHORT, record_plant
 from scipy.signal import lfilter
 
-from fdi.discovery.explain import explain, measure_gain
-from fdi.discovery.fingerprints import compute_firmware_residual, find_marks
+from fdi.discovery.explain import compute_firmware_residual, explain, find_marks, measure_gain
 from fdi.discovery.residual_pattern import Pattern, fit_curve, fit_wave, write_effect
-from fdi.discovery.scan import find_tones, scan_effects
-from fdi.discovery.search import Hypothesis, Search, measure_repeating
-from fdi.discovery.significance import Sensitivity, compute_p_value
+from fdi.discovery.search import (
+    Hypothesis,
+    Search,
+    Sensitivity,
+    compute_p_value,
+    find_tones,
+    measure_repeating,
+    scan_effects,
+)
 from fdi.estimation.fit import Fit, linearise
 from fdi.estimation.likelihood import BLOCK, compute_misfit, compute_weights
 from fdi.estimation.noise import fit_noise, measure_level
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unknowns import list_all_unknowns, list_effect_unknowns, turn_amplitudes_positive
 from fdi.thresholds import BLOCK_FITTED_SQUARE
 from fdi.trace.trace import Trace
@@ -201,7 +206,7 @@ def test_a_scan_finds_a_frequency_from_a_line_beside_it(turns: float, monkeypatc
     turn = 1.0 / (1e-3 * len(search.problem.trace))  # Hz
     beside = [{**ripple, "supply_ripple.frequency": 36.64 + turns * turn, "supply_ripple.phase": phase}
               for phase in (0.0, 1.57, 3.14, 4.71)]
-    monkeypatch.setattr("fdi.discovery.scan.find_tones", lambda *_: beside)
+    monkeypatch.setattr("fdi.discovery.search.find_tones", lambda *_: beside)
     (found,) = scan_effects(search.problem, search.fit_base().fit, ["supply_ripple"])
     values = {f.name: f.centre + f.scale * x for f, x in zip(found.free, found.x, strict=True)}
     assert values["supply_ripple.frequency"] == pytest.approx(36.64, abs=0.3 * turn)

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from noisy_traces import record_plant
 
-from fdi.discovery.explain import decide_verdict, shows_effect
-from fdi.discovery.fingerprints import Marks
+from fdi.discovery.explain import Marks, decide_verdict, shows_effect
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import linearise
 from fdi.estimation.likelihood import Free
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unknowns import list_all_unknowns
 from plant import load_model
 

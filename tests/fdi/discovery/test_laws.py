@@ -10,13 +10,28 @@ import pytest
 from effect_files import HEAD, restored_catalogue
 from short_runs import STEPS, build_command, build_other_command
 
-from fdi.discovery.balance import Balance, States, measure_way
-from fdi.discovery.laws.dependence import find_dependences
-from fdi.discovery.laws.effect_source import format_formula, write_effects, write_law, write_law_file
-from fdi.discovery.laws.find_law import LawSearch, find_law
-from fdi.discovery.laws.library import LIBRARY, name_parameter, registered_library
-from fdi.discovery.laws.regression import evaluate_columns, propose_terms, select_rows
-from fdi.discovery.laws.terms import PARTS, STATES, TERMS, find_states
+from fdi.discovery.laws.find_law import (
+    LawSearch,
+    evaluate_columns,
+    find_dependences,
+    find_law,
+    propose_terms,
+    select_rows,
+)
+from fdi.discovery.laws.terms import (
+    LIBRARY,
+    PARTS,
+    STATES,
+    TERMS,
+    find_states,
+    format_formula,
+    name_parameter,
+    registered_library,
+    write_effects,
+    write_law,
+    write_law_file,
+)
+from fdi.discovery.residual_pattern import Balance, States, measure_way
 from fdi.discovery.runs import collect_runs
 from fdi.discovery.search import Search
 from fdi.trace.trace import Trace

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fdi.estimation.final_rounds import finish_fit, invert_hessian
 from fdi.estimation.fit import DAMPINGS, Fit
 from fdi.estimation.likelihood import Free
+from fdi.estimation.unidentifiable import finish_fit, invert_hessian
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi.estimation.population import evolve_population
+from fdi.estimation.fit import evolve_population
 
 LOWEST = np.array([0.4, -1.2, 2.0, 0.0, -0.7, 1.1])
 TURN = np.linalg.qr(np.random.default_rng(3).standard_normal((6, 6)))[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from noisy_traces import record_healthy
 
-from fdi.estimation.preparation import (
+from fdi.estimation.replay import (
     FEWEST_ROWS,
     PERIODS,
     align_columns,

@@ -9,8 +9,7 @@ import numpy as np
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import white_noise
-from fdi.estimation.preparation import hold_inputs
-from fdi.estimation.replay import find_undecided_rows
+from fdi.estimation.replay import find_undecided_rows, hold_inputs
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 

@@ -11,7 +11,7 @@ from noisy_traces import record_plant
 from numpy.typing import NDArray
 
 from fdi.discovery.search import Search
-from fdi.estimation.preparation import hold_inputs
+from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import (
     FLAPPER,
     JACK_PRESSURE,

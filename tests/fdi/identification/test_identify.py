@@ -8,16 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi.discovery.model_file import read_provenance
+from fdi.discovery.update_model import read_provenance
 from fdi.estimation.likelihood import scaled_bounds
-from fdi.estimation.logarithms import compute_values
+from fdi.estimation.unidentifiable import compute_values
 from fdi.identification import global_fit
-from fdi.identification.closed_form import estimate_by_regressions
-from fdi.identification.controller import read_controller
-from fdi.identification.free_parameters import list_unknowns, parse_free_parameters, read_free_parameters
-from fdi.identification.identify import Identification, decide_verdict, identify_model
-from fdi.identification.model_text import write_identified_model
-from fdi.identification.runs import collect_identification_runs
+from fdi.identification.free_parameters import (
+    collect_identification_runs,
+    list_unknowns,
+    parse_free_parameters,
+    read_free_parameters,
+)
+from fdi.identification.identify import (
+    Identification,
+    decide_verdict,
+    estimate_by_regressions,
+    identify_model,
+    read_controller,
+    write_identified_model,
+)
 from fdi.report.identify_report import build_identification_report, describe_identification
 from fdi.report.terminal import format_report, print_report
 from fdi.trace.trace import Trace

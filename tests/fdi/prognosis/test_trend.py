@@ -15,15 +15,15 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal
 
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
-from fdi.prognosis import gather, regression, remaining_life
-from fdi.prognosis.dates import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
-from fdi.prognosis.growth_laws import evaluate_shapes, list_shapes
+from fdi.prognosis import regression, remaining_life, unit_trend
+from fdi.prognosis.regression import evaluate_shapes, list_shapes
 from fdi.prognosis.trend import Trend, fit_trend
+from fdi.prognosis.unit_trend import Row, find_date_in_name, find_row, format_day, parse_date, read_dates_table
 from fdi.progress import ignore_progress
 from fdi.report.trend_report import explain_level
 from fdi.trace.trace import Trace
 from plant import InputError, load_model, simulate
-from rig.recorder.provenance import collect_provenance
+from rig.recorder.schema import collect_provenance
 from studies.prognosis import (
     LAWS,
     Prediction,
@@ -285,11 +285,11 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (folder / "2026-02-01").mkdir(parents=True)
     for name in ("own.mcap", "2026-02-01/named.csv", "2026-02-01/dead.csv", "table.csv", "broken.csv"):
         (folder / name).write_text("")
-    monkeypatch.setattr(gather, "diagnose_once", diagnosed)
-    monkeypatch.setattr(gather, "read_start_time", started)
+    monkeypatch.setattr(unit_trend, "diagnose_once", diagnosed)
+    monkeypatch.setattr(unit_trend, "read_start_time", started)
 
-    def gathered(axis: str | None = None) -> gather.Gathered:
-        return gather.gather_sizes(folder, load_model(), gather.Options(axis), ignore_progress)
+    def gathered(axis: str | None = None) -> unit_trend.Gathered:
+        return unit_trend.gather_sizes(folder, load_model(), unit_trend.Options(axis), ignore_progress)
 
     with pytest.raises(InputError, match=r"table.csv: date: expected .*dates.csv"):
         gathered()
@@ -312,7 +312,7 @@ def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "unit").mkdir()
     there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
     Trace.from_columns(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
-    monkeypatch.setattr(gather, "find_cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(unit_trend, "find_cache_folder", lambda: tmp_path / "cache")
     first = rig("trend", tmp_path / "unit", "--json")
     assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"
     assert first.json["points"][0]["date"] == "2026-01-05" and first.json["points"][0]["fss"]["low"] < 5.0

@@ -8,7 +8,7 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from fdi.report import check_figures
+from fdi.report import run_figures
 from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Check, Trace
@@ -36,9 +36,9 @@ def make_check(kind: str, value: float, unit: str, high: float, window: tuple[fl
 def draw(monkeypatch: pytest.MonkeyPatch, check: Check) -> Any:
     """Axes of the close-up of a check."""
     kept: list[matplotlib.figure.Figure] = []
-    convert = check_figures.to_svg
-    monkeypatch.setattr(check_figures, "to_svg", lambda figure, salt: kept.append(figure) or convert(figure, salt))
-    assert check_figures.draw_failed_check(make_trace(), check).startswith("<svg")
+    convert = run_figures.to_svg
+    monkeypatch.setattr(run_figures, "to_svg", lambda figure, salt: kept.append(figure) or convert(figure, salt))
+    assert run_figures.draw_failed_check(make_trace(), check).startswith("<svg")
     return kept[0].axes[0]
 
 
@@ -111,13 +111,13 @@ def test_a_reaction_that_did_not_come_has_its_limit_alone(monkeypatch: pytest.Mo
     assert "not measurable" in [text.get_text() for text in ax.get_legend().get_texts()]
 
 
-@pytest.mark.parametrize("kind", sorted(check_figures.DRAWERS))
+@pytest.mark.parametrize("kind", sorted(run_figures.DRAWERS))
 def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> None:
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
     check = make_check(kind, NAN, unit, 5.0, (0.5, 1.5))
-    assert check_figures.draw_failed_check(make_trace(), check).startswith("<svg")
+    assert run_figures.draw_failed_check(make_trace(), check).startswith("<svg")
     for other in (check._replace(t0=NAN, t1=NAN), check._replace(kind="event_never"), check._replace(t0=50.0, t1=51.0)):
-        assert not check_figures.draw_failed_check(make_trace(), other)
+        assert not run_figures.draw_failed_check(make_trace(), other)
 
 
 def test_a_page_shows_each_failed_check_once() -> None:

@@ -8,15 +8,15 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from fdi.discovery.candidates import Answer, Blind, Candidate, Suspicious
-from fdi.discovery.fingerprints import Marks
-from fdi.discovery.model_file import Provenance, Row
+from fdi.discovery.explain import Marks
+from fdi.discovery.explain_runs import Answer, Blind, Candidate, Suspicious
 from fdi.discovery.runs import Source
-from fdi.discovery.update_model import ModelUpdate
+from fdi.discovery.update_model import ModelUpdate, Provenance, Row
 from fdi.estimation.fit import Value
 from fdi.report.explain_report import (
     MOODS,
     build_explanation_report,
+    build_model_report,
     describe_blind,
     describe_findings,
     describe_suspicious,
@@ -25,7 +25,6 @@ from fdi.report.explain_report import (
 )
 from fdi.report.html import render_html
 from fdi.report.json import to_plain
-from fdi.report.model_report import build_model_report
 from fdi.report.terminal import print_report
 from plant import Model
 

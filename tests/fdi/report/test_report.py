@@ -18,8 +18,7 @@ from synthetic_run import record_run
 
 from fdi.report import drawing, run_figures
 from fdi.report.html import render_html
-from fdi.report.run_report import build_run_report, write_run_page
-from fdi.report.run_verdict import read_verdict
+from fdi.report.run_report import build_run_report, read_verdict, write_run_page
 from fdi.trace.trace import Event, Trace
 from plant.errors import InputError
 from rig.recorder import Check, Recorder, Signals, Timing

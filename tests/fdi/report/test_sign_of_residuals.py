@@ -13,8 +13,8 @@ from noisy_traces import SHORT, record_plant
 from fdi.comparison.compare import Comparison, compare
 from fdi.estimation.likelihood import Problem
 from fdi.estimation.noise import white_noise
-from fdi.estimation.preparation import prepare_trace
-from fdi.report import compare_figures, explain_figures
+from fdi.estimation.replay import prepare_trace
+from fdi.report import compare_report, explain_report
 from fdi.report.compare_report import build_comparison_report
 from fdi.trace.trace import Trace
 from plant import Model
@@ -49,8 +49,8 @@ def keep_lines(monkeypatch: pytest.MonkeyPatch, module: Any) -> list[np.ndarray]
 
 def test_a_comparison_shows_measured_minus_model(monkeypatch: pytest.MonkeyPatch) -> None:
     found = compare_offset()
-    lines = keep_lines(monkeypatch, compare_figures)
-    compare_figures.draw_overview(found)
+    lines = keep_lines(monkeypatch, compare_report)
+    compare_report.draw_overview(found)
     scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
     for number, (name, scale) in enumerate(scales.items()):
         measured, model, residual = lines[2 + 3 * number:5 + 3 * number]  # after Com and XJ
@@ -73,8 +73,8 @@ def test_explain_and_add_show_measured_minus_model(monkeypatch: pytest.MonkeyPat
     predicted = problem.predict_outputs([], np.empty((1, 0)))
     misfit = problem.subtract_measurements(predicted)[0]
     fitted = cast(Any, SimpleNamespace(fit=SimpleNamespace(residuals=misfit)))
-    lines = keep_lines(monkeypatch, explain_figures)
-    explain_figures.draw_residuals(trace, fitted, fitted, dict.fromkeys(trace.outputs, 1e-6))
+    lines = keep_lines(monkeypatch, explain_report)
+    explain_report.draw_residuals(trace, fitted, fitted, dict.fromkeys(trace.outputs, 1e-6))
     p12 = trace.outputs.index("p12")
     before, after = lines[1 + 2 * p12:3 + 2 * p12]
     expected = 1e-5 * (trace.mask_unusable("p12") - predicted[0, p12])

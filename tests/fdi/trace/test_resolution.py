@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi.trace.resolution import find_comb, is_rounding_left, measure_resolution
+from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 
 
 def test_resolution_of_a_column() -> None:

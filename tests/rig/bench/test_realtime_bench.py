@@ -13,8 +13,16 @@ from vcan_host import kernel_has_vcan0
 from fdi.report.terminal import format_report
 from plant.errors import InputError
 from rig.bench import realtime
-from rig.bench.realtime import COMPILED, CYCLICTEST, IN_C, PYTHON, list_targets, parse_histogram, summarise_contenders
-from rig.bench.realtime_report import build_realtime_report
+from rig.bench.realtime import (
+    COMPILED,
+    CYCLICTEST,
+    IN_C,
+    PYTHON,
+    build_realtime_report,
+    list_targets,
+    parse_histogram,
+    summarise_contenders,
+)
 from rig.bench.responders import run_c_responder, run_emulator
 from rig.network import codec
 from rig.network.bus import open_can

@@ -14,9 +14,7 @@ import batch_work
 import pytest
 
 from plant import InputError, RigError
-from rig.campaign.batch import Batch, BatchProgress, Workers, run_batch, run_jobs
-from rig.campaign.row_file import RowFile, read_rows
-from rig.campaign.worker_processes import run_in_processes
+from rig.campaign.batch import Batch, BatchProgress, RowFile, Workers, read_rows, run_batch, run_in_processes, run_jobs
 
 
 def fail_test(job: object, reason: str) -> Any:

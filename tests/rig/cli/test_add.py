@@ -10,7 +10,7 @@ from places import SHARED
 from rig_command import Said, rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
-from fdi.discovery import model_file
+from fdi.discovery import update_model
 from fdi.estimation.fit import Value
 from plant import Model, load_model
 
@@ -48,7 +48,7 @@ def test_the_error_falls_to_the_floor(added: tuple[Said, Path]) -> None:
 
 def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Path], runs: dict[str, Path]) -> None:
     said, path = added
-    model, known = model_file.load_model_file(path)
+    model, known = update_model.load_model_file(path)
     assert model.effects == ("null_bias",) and load_model(path) == model
     value = said.json["parameters"]["null_bias.current"]
     assert model["null_bias.current"] == pytest.approx(value["value"], rel=1e-5)
@@ -57,7 +57,7 @@ def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[Said, Pa
     assert line.endswith("(95 %)") and "# A, " in line
     assert known.effects == ("null_bias",) and known.trace and known.trace.file == str(runs["est"])
     assert known.software.startswith("eha-rig") and [r.effect for r in known.ledger] == [None, "null_bias"]
-    before = model_file.remove_all_effects(model, known)
+    before = update_model.remove_all_effects(model, known)
     assert before.effects == () and before.values == Model().values
 
 
@@ -89,7 +89,7 @@ def test_without_it_the_error_rises_again(model: Path, runs: dict[str, Path]) ->
     assert after["removed"] and after["effect"] == "null_bias"
     for which in ("error", "holdout"):
         assert after[which]["xj"] > 10.0 * before[which]["xj"]
-    assert load_model(model).effects == () and model_file.read_provenance(model).effects == ()
+    assert load_model(model).effects == () and update_model.read_provenance(model).effects == ()
 
 
 def test_taken_out_without_a_run_all_else_stays(model: Path) -> None:
@@ -138,10 +138,10 @@ def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Pat
         said = rig("simulate", "--effects", own, "--set=spring.stiffness=1e5", "--out", tmp_path / "s.csv", "--quiet")
         assert said.status == 0, said.err
         model = Model().replace({"spring.stiffness": 1e5})
-        known = model_file.Provenance(effects=("spring",), effect_files=(str(own),))
+        known = update_model.Provenance(effects=("spring",), effect_files=(str(own),))
         interval = {"spring.stiffness": Value(1e5, 9e4, 1.1e5, "N/m")}
-        (tmp_path / "m.toml").write_text(model_file.format_model_file(model, interval, known))
-        assert model_file.load_model_file(tmp_path / "m.toml") == (model, known)
+        (tmp_path / "m.toml").write_text(update_model.format_model_file(model, interval, known))
+        assert update_model.load_model_file(tmp_path / "m.toml") == (model, known)
     with restored_catalogue():
         said = rig("compare", tmp_path / "s.csv", "--model", tmp_path / "m.toml", "--trust")
         assert said.status == 0 and str(own) in said.err, said.err

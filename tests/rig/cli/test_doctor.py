@@ -13,7 +13,7 @@ import pytest
 from plant.errors import InputError
 from rig import doctor
 from rig.cli.commands import doctor as command
-from rig.run import lateness
+from rig.run import priority
 
 
 @pytest.fixture(scope="module")
@@ -99,17 +99,17 @@ def test_bad_seconds_are_refused(seconds: str) -> None:
 
 def test_percentiles_of_known_wake_ups() -> None:
     late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
-    assert lateness.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
+    assert priority.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))
 
 
 def test_timer_lateness_counts_its_periods() -> None:
-    late = lateness.measure_timer_lateness(0.05)
+    late = priority.measure_timer_lateness(0.05)
     assert late.periods == 50
     assert 0 <= late.p50 <= late.p99 <= late.p99_9 <= late.max
 
 
 def test_fifo_ends_with_its_thread() -> None:
-    assert lateness.run_under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
+    assert priority.run_under_fifo(lambda: os.sched_getscheduler(0)) in (None, os.SCHED_FIFO)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
@@ -118,4 +118,4 @@ def test_fifo_without_the_right_is_none(monkeypatch: pytest.MonkeyPatch) -> None
         raise PermissionError
 
     monkeypatch.setattr("os.sched_setscheduler", refuse)
-    assert lateness.run_under_fifo(lambda: True) is None
+    assert priority.run_under_fifo(lambda: True) is None

@@ -14,12 +14,11 @@ from rig_command import gone, rig, started
 
 from dbc import EDS
 from rig.conformance.conformance_case import CHAPTERS, Result, Verdict
-from rig.conformance.conformance_report import Subject, write_junit
 from rig.conformance.data_sheet import DataSheet
-from rig.conformance.run_cases import CASES, Outcome, run_cases
+from rig.conformance.run_cases import CASES, Outcome, Subject, run_cases, write_junit
 from rig.conformance.target import Options, Target
 from rig.network.clock import VirtualClock
-from rig.network.wire import EmbeddedWire
+from rig.network.link import EmbeddedWire
 
 ROOT = Path(__file__).parents[3]
 _CONTROLLER = {"2.10", "4.5", "4.13", "4.17", "5.14"}

@@ -11,7 +11,7 @@ from dbc import EDS
 from rig.conformance.conformance_case import Verdict
 from rig.conformance.run_cases import Outcome
 from rig.device import NmtState, SdoAbort
-from rig.device.cob_id import INVALID
+from rig.device.dictionary import INVALID
 
 MS = 1_000_000  # ns
 TIMER = """[1800sub5]

@@ -15,7 +15,7 @@ from rig.conformance.run_cases import choose_cases, run_cases
 from rig.conformance.target import Options, Target
 from rig.network.clock import VirtualClock
 from rig.network.frame import Send
-from rig.network.wire import Done, EmbeddedWire
+from rig.network.link import Done, EmbeddedWire
 from rig.nodes.firmware import Firmware
 
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.live.dead_node import find_dead_node
 from rig.live.feed import COLUMNS, MESSAGES, ROWS, LiveFeed, LiveReader, Message, make_shared_file
-from rig.live.live_run import LiveRun, make_live_plan
+from rig.live.live_run import LiveRun, find_dead_node, make_live_plan
 from rig.live.screen import describe_line, draw_screen
 from rig.recorder import Check, Event, NmtState, Signals, Timing
 from rig.sequences import load_sequence

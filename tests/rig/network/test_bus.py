@@ -22,8 +22,7 @@ from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.frame import Frame
 from rig.network.link import Link
-from rig.network.turn import Turn
-from rig.network.udp import PORT, LoopbackBus
+from rig.network.udp import PORT, LoopbackBus, Turn
 from studies.robustness.disturb import has_semaphores
 
 only_socketcan = pytest.mark.parametrize("bus_kind", ["socketcan"], indirect=True)
@@ -293,7 +292,7 @@ class TestLink:
 def test_the_semaphores_of_killed_programs_are_removed_by_the_next_one() -> None:
     """Those of programs at work stay, and so do sets of the same size that are not ours."""
     killed, used, following = (spec("udp_multicast").partition(":")[2] for _ in range(3))
-    code = ("import os, signal, sys; from rig.network.turn import Turn; Turn(sys.argv[1], int(sys.argv[2])); "
+    code = ("import os, signal, sys; from rig.network.udp import Turn; Turn(sys.argv[1], int(sys.argv[2])); "
             "os.kill(os.getpid(), signal.SIGKILL)")
     assert subprocess.run([sys.executable, "-c", code, killed, str(PORT)], check=False).returncode == -signal.SIGKILL
     library = ctypes.CDLL(None)

@@ -77,7 +77,7 @@ def test_what_it_cannot_do_is_refused(options: dict[str, object], words: str) ->
 def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Path) -> None:
     group = find_group()
     (tmp_path / "short.toml").write_text(SHORT + SLOW_START)
-    program = ROOT / "docs" / "foreign_controller.py"
+    program = ROOT / "examples" / "foreign_controller.py"
     imports = [line for line in program.read_text().splitlines() if line.startswith(("import", "from"))]
     assert not any(package in line for line in imports for package in ("rig", "plant", "fdi", "dbc"))
     other = subprocess.Popen([sys.executable, program, group])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.errors import InputError
-from rig.network.cycle_record import CycleRecord, decode_cycle_record, encode_cycle_record
+from rig.network.node_objects import CycleRecord, decode_cycle_record, encode_cycle_record
 
 
 def make_record(cycles: int, seed: int = 0) -> CycleRecord:

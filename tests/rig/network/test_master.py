@@ -12,10 +12,9 @@ from plant import Model
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
+from rig.network.link import EmbeddedWire, Link, LinkWire, Wire, serve_node
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, PLANT, read_gains
-from rig.network.wire import EmbeddedWire, LinkWire, Wire, serve_node
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.nodes.scenario import Scenario

@@ -30,7 +30,7 @@ from rig.network import raw_bus
 from rig.network.bus import open_can
 from rig.network.link import Link
 from rig.network.raw_bus import FRAME, NEVER, NO_TURN, SENT, TIMEOUT, WOKEN, open_raw_bus
-from rig.network.turn import Turn
+from rig.network.udp import Turn
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 ways = pytest.mark.parametrize("way", ["compiled", "interpreted"])
@@ -282,7 +282,7 @@ only_udp = pytest.mark.parametrize("bus_kind", ["udp_multicast"], indirect=True)
 
 HOLDER = """
 import sys, time
-from rig.network.turn import Turn
+from rig.network.udp import Turn
 turn = Turn(sys.argv[1], 43113)
 turn.take()
 print("taken", flush=True)

@@ -9,10 +9,9 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from rig.network.clock import VirtualClock
 from rig.network.frame import Frame, Send
-from rig.network.master import Master, repeat_transfer
+from rig.network.link import EmbeddedWire
+from rig.network.master import CheckedSdoClient, ConfirmationError, Master, repeat_transfer
 from rig.network.node_objects import PLANT
-from rig.network.sdo_client import CheckedSdoClient, ConfirmationError
-from rig.network.wire import EmbeddedWire
 
 TYPE = bytes.fromhex("4300100000000000")  # of 0x1000
 Script = Sequence[str | None]

@@ -18,11 +18,10 @@ from rig.device import NmtState
 from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.cycle_record import decode_cycle_record
 from rig.network.frame import Frame
-from rig.network.link import Link
+from rig.network.link import Link, serve_node
+from rig.network.node_objects import decode_cycle_record
 from rig.network.raw_bus import open_raw_bus
-from rig.network.wire import serve_node
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop

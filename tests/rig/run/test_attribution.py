@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from rig.network.codec import Flags
-from rig.network.cycle_record import CycleRecord
 from rig.network.master import StartTime
-from rig.network.node_objects import CONTROLLER, PLANT, RIG
+from rig.network.node_objects import CONTROLLER, PLANT, RIG, CycleRecord
 from rig.run.attribution import (
     Attribution,
     CycleRecords,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.run.effect_folder import make_effect_folder, remove_left_folders
+from rig.run.job import make_effect_folder, remove_left_folders
 
 
 def test_the_folder_of_a_killed_run_is_removed_and_one_in_use_is_not(

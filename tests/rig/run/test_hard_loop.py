@@ -22,12 +22,10 @@ from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
+from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.network.raw_bus import open_raw_bus
-from rig.network.turn import Turn
-from rig.network.udp import PORT
-from rig.network.wire import LinkWire
+from rig.network.udp import PORT, Turn
 from rig.recorder import Signals, Timing
 from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
 from rig.run.loop import CycleInput

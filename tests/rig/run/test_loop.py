@@ -9,9 +9,8 @@ import pytest
 from rig.network import codec
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame
-from rig.network.link import Link
+from rig.network.link import EmbeddedWire, Link, LinkWire
 from rig.network.master import Master
-from rig.network.wire import EmbeddedWire, LinkWire
 from rig.recorder import Signals, Timing
 from rig.run.loop import CycleInput, CycleLoop
 from rig.sequences.faults import Fault, Late, Lost, Plan, Schedule, Silent

@@ -13,12 +13,11 @@ from standing_nodes import wait_for_node
 
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
-from rig.network.link import Link
+from rig.network.link import Link, LinkWire
 from rig.network.master import BusError, Master
 from rig.network.node_objects import CONTROLLER, PLANT
-from rig.network.wire import LinkWire
 from rig.run import participants
-from rig.run.processes import NodeProcesses
+from rig.run.participants import NodeProcesses
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from fdi.trace.trace import Trace
 from rig.network.frame import Frame
 from rig.recorder import Signals, Timing
 from rig.run import participants
-from rig.run.history import History
+from rig.run.loop import History
 from rig.run.outcome import Outcome
 from rig.run.probe import find_gap
 

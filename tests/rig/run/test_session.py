@@ -19,13 +19,12 @@ from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame, Send
-from rig.network.wire import EmbeddedWire
+from rig.network.link import EmbeddedWire
 from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError
 from rig.run import participants, runner
-from rig.run.participants import Participants
-from rig.run.processes import NodeProcesses
+from rig.run.participants import NodeProcesses, Participants
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
 

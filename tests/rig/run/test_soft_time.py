@@ -10,7 +10,7 @@ from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Trace
 from rig.run.job import Job
-from rig.run.soft_time import explain_soft_time
+from rig.run.runner import explain_soft_time
 
 LATE = '{ kind = "late", frame = "command", delay = 1e-4, start = 0.1, end = 0.2 }'
 JITTER = '{ kind = "jitter", name = "uneven", size = 2e-4, start = 0.1, end = 0.2 }'

@@ -14,8 +14,7 @@ from fdi.report.run_report import build_run_report
 from fdi.report.terminal import format_report
 from fdi.trace.trace import Trace
 from plant import load_model
-from rig.run.limits import find_limits
-from rig.run.outcome import Outcome
+from rig.run.outcome import Outcome, find_limits
 from rig.run.runner import run_job
 
 UNCHECKED = SHORT.partition("checks = [")[0]

@@ -13,7 +13,7 @@ from plant.profile import build_profile
 from plant.segments import Array, Hold, Ramp, Segment, Sine, Step
 from rig.sequences import checks, measures
 from rig.sequences.checks import CheckResult, evaluate_checks
-from rig.sequences.run_data import NO_DRIVES, DriveFrames
+from rig.sequences.measures import NO_DRIVES, DriveFrames
 
 NOISE = 2e-6  # m rms, as the position transducer has it
 LAG = 0.01  # s, of the first-order follower

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from plant.errors import InputError
-from rig.sequences.guards import Guard, GuardWatch
+from rig.sequences.checks import Guard, GuardWatch
 
 
 def test_a_guard_trips_after_enough_cycles_in_a_row() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from plant import load_model, simulate
 from plant.errors import InputError
-from rig.sequences import toml_lines
+from rig.sequences import tables
 from rig.sequences.checks import CheckResult, evaluate_checks
 from rig.sequences.sequence import Sequence, load_sequence, parse_sequence
 
@@ -240,7 +240,7 @@ def test_a_bad_sequence_is_refused_in_one_line(text: str, message: str) -> None:
 def test_lines_of_keys() -> None:
     text = ('a = "x [ {"\nb = [\n  { c = 1 }, # ]\n  { c = [1,\n 2] },\n]\n["d e".f]\ng.h = """\n\n"""\n'
             "[[i]]\n[[i]]\nj = 2024-01-01 10:00:00\nk = 1\n")
-    found = toml_lines.find_lines(text)
+    found = tables.find_lines(text)
     assert found[("b", 1, "c", 1)] == 5 and found[("b", 0, "c")] == 3
     assert found[("d e", "f", "g", "h")] == 8 and found[("i", 1)] == 12 and found[("i", 1, "k")] == 14
 

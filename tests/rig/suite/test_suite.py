@@ -12,7 +12,7 @@ from junit_schema import read_valid_junit
 from rig_command import Said, finished, rig, started
 from short_sequences import SHORT
 
-from rig.run.job_choice import JobChoice
+from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
 from rig.suite.report import Evidence, trace_requirements, write_junit
 from rig.suite.suite import (

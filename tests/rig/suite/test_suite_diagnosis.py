@@ -11,7 +11,7 @@ from rig_command import Said, rig
 from short_sequences import SHORT
 
 from fdi.trace.trace import Trace
-from rig.run.job_choice import JobChoice
+from rig.run.job import JobChoice
 from rig.sequences.checks import CheckResult
 from rig.suite.report import write_junit
 from rig.suite.suite import Case, CaseResult, read_suite_file

@@ -14,8 +14,7 @@ from rig_command import rig
 from short_sequences import SHORT
 
 from plant.errors import InputError
-from rig.testing.bench import Bench
-from rig.testing.sequence_text import build_sequence, write_toml
+from rig.testing.bench import Bench, build_sequence, write_toml
 
 ROOT = Path(__file__).parents[3]
 STEP = [{"name": "rest", "kind": "hold", "time": 0.05}, {"name": "step", "kind": "step", "to": 1e-3, "time": 0.2}]

@@ -18,7 +18,7 @@ from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
 from rig.view import rerun_log, viewer
-from rig.view.recording import ViewerError, make_lane_path
+from rig.view.viewer import ViewerError, make_lane_path
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
 

@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi.trace.importing.conversion import Imported, import_measurement
-from fdi.trace.importing.formats import open_measurement
+from fdi.trace.importing.conversion import Imported, Samples, import_measurement, place_samples
+from fdi.trace.importing.formats import ArrayMeasurement, Channel, open_measurement
 from fdi.trace.importing.guess import guess_map
 from fdi.trace.importing.import_map import parse_map
-from fdi.trace.importing.measurement import ArrayMeasurement, Channel
-from fdi.trace.importing.resampling import Samples, place_samples
 from plant.errors import InputError
 
 MAP = """

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi.trace.importing.text_table import open_text_table
+from fdi.trace.importing.formats import open_text_table
 from plant.errors import InputError
 
 LAYOUTS = {

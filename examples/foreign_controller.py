@@ -1,4 +1,4 @@
-"""A controller for the bench, written with python-can and canopen alone: python docs/foreign_controller.py [GROUP]
+"""A controller for the bench, written with python-can and canopen alone: python examples/foreign_controller.py [GROUP]
 
 It joins the UDP bus of `rig run --controller external --bus udp_multicast:GROUP` as node 2 and closes the position
 loop. It shows how a program joins a run. Unlike a firmware, it does not watch command, feedback, SYNC and heartbeat.
