@@ -21,7 +21,7 @@ NOISE_BAND_RATIO = 2.0
 RESIDUAL_IS_NOISE = 1.08
 """RMS residual over noise up to which only noise is left; what is above is physics that the model lacks.
 
-The solver's error at the 20 steps a cycle of the last fits is up to 0.5 um beside 2 um of noise (docs/accuracy.md):
+The solver's error at the 20 steps a cycle of the last fits is up to 0.5 um beside 2 um of noise (docs/statistics.md):
 3 %. The noise itself is known to 3 % from one repeat (docs/compare.md). 317 of 320 fits of simulated units stayed
 below (docs/fdi.md)."""
 
@@ -222,12 +222,12 @@ BAND_FAULT_CLEARANCE_SD = 4.5
 """Healthy standard deviations by which a fault of Table 2 must move the response where bands judge it.
 
 With 4.5 the limit of MidBand can lie 4 standard deviations from the healthy mean and still be passed by nearly every
-unit that has the fault. Some 20 ms of each 5 mm step are left to judge (docs/bands.md)."""
+unit that has the fault. Some 20 ms of each 5 mm step are left to judge (docs/statistics.md)."""
 
 BAND_NEAREST_LIMIT_SD = 4.0
 """Healthy standard deviations; no limit is nearer to the healthy mean than that.
 
-In 1424 simulated healthy units there was no event (docs/bands.md)."""
+In 1424 simulated healthy units there was no event (docs/statistics.md)."""
 
 STEP_FAULT_LEAVES_SD = 2.33, 1.96
 """Standard deviations (MidBand, MaxBand) by which a limit on a step lies below the mean response of clogged units.
@@ -280,7 +280,7 @@ FRICTION_HIDES_CLOGGING_RATIO = 2.0
 
 FLEET_FEWEST_TRACES = 5
 """Healthy traces that bands of a fleet need at least; bands of 5, 8 and 12 traces find 58, 94 and 96 % of 96 units
-with Kintas 0.25 (docs/bands.md)."""
+with Kintas 0.25 (docs/statistics.md)."""
 
 FLEET_PRIOR_TRACES = 8.0
 """Traces that the simulated scatter counts for beside the scatter of a fleet's own traces."""

@@ -2,7 +2,7 @@
 
 OpenBLAS, which NumPy and SciPy use, chooses its code by the CPU and splits its sums among as many threads as there are
 cores. Both change the last bits. A fit over stick-slip amplifies them: measured, up to 0.6 of the width of an interval
-(docs/accuracy.md). OpenBLAS reads its settings when it is loaded, so this has to come before the first import of NumPy.
+(docs/statistics.md). OpenBLAS reads its settings when it is loaded, so this comes before the first import of NumPy.
 """
 from __future__ import annotations
 

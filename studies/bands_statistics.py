@@ -1,4 +1,4 @@
-"""Print the tables of docs/bands.md, from units that the bands have not seen: python studies/bands_statistics.py."""
+"""Print the tables of the bands in docs/statistics.md, from units that the bands have not seen."""
 from __future__ import annotations
 
 import math

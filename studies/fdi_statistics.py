@@ -1,4 +1,4 @@
-"""Write the tables of a campaign into fdi_statistics.md, and its figure: python studies/fdi_statistics.py FOLDER ..
+"""Print the tables of a campaign in Markdown, and draw its figure: python studies/fdi_statistics.py FOLDER ..
 
 The first campaign gives all tables, further ones their rates only.
 """
@@ -14,9 +14,8 @@ from rig.campaign.folder import read_campaign_rows, read_matrix_of_folder
 from rig.campaign.report import draw_detection_curves, format_requirement, format_share
 from rig.campaign.summary import name_size, summarise_campaign
 
-PAGE = Path(__file__).parent.parent / "docs" / "fdi_statistics.md"
+FIGURE = Path(__file__).parent.parent / "docs" / "fdi_statistics.svg"
 MET = {None: "", True: "met", False: "**not met**"}
-BEGIN, END = "<!-- figures -->\n", "<!-- end of figures -->\n"
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -68,7 +67,7 @@ def format_other_campaign(folder: str) -> str:
 
 
 def main(folder: str, *others: str) -> None:
-    """Write the page and its figure."""
+    """Print the tables and write the figure of docs/statistics.md."""
     figures = summarise_campaign(read_campaign_rows(folder))
     took, status = figures["seconds"], ", ".join(f"{n} {word}" for word, n in figures["status"].items())
     times = f"{took['median']:.1f} s (median), {took['p95']:.1f} s (95th percentile), {took['most']:.1f} s (longest)"
@@ -77,10 +76,9 @@ def main(folder: str, *others: str) -> None:
     text += "".join(map(format_other_campaign, others))
     for reason in figures["reasons"]:
         text += f"{reason['status']}: {reason['case']}, seed {reason['seed']}: {reason['reason']}\n\n"
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    PAGE.write_text(before + BEGIN + "\n" + text + END + rest.partition(END)[2], encoding="utf-8")
+    print(text)
     curves = max(figures["tolerances"], key=lambda of: sum(map(len, of["curves"].values())))
-    PAGE.with_suffix(".svg").write_text(draw_detection_curves(curves), encoding="utf-8")
+    FIGURE.write_text(draw_detection_curves(curves), encoding="utf-8")
 
 
 if __name__ == "__main__":

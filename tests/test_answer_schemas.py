@@ -90,11 +90,22 @@ def list_keys(schema: Any) -> Iterator[str]:
             yield from list_keys(value)
 
 
+def list_explained(schema: Any) -> Iterator[str]:
+    """The keys of a schema that have a description, and the words of all descriptions."""
+    if isinstance(schema, dict):
+        yield from re.findall(r"\w+", schema["description"]) if isinstance(schema.get("description"), str) else ()
+        yield from (key for key, value in schema.get("properties", {}).items() if "description" in value)
+        for value in schema.values():
+            yield from list_explained(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from list_explained(value)
+
+
 @pytest.mark.parametrize("command", ["run", "diff", "check", "compare", "explain", "add", "identify", "fdi", "trend"])
-def test_the_page_explains_every_key(command: str) -> None:
-    section = next(part for part in PAGE.split("\n## ") if part.startswith(f"rig {command}"))
-    known = {*re.findall(r"`(\w+)`", section), "filter_clogging", "spool_friction"}
-    assert set(list_keys(SCHEMAS[f"{command}.json"])) <= known
+def test_a_schema_explains_every_key(command: str) -> None:
+    schema = SCHEMAS[f"{command}.json"]
+    assert set(list_keys(schema)) <= {*list_explained(schema), "verdict", "filter_clogging", "spool_friction"}
 
 
 def keys_of(answer: Any) -> set[str]:

@@ -17,6 +17,7 @@ from reference_pages import write_reference
 from plant.model import list_offered_effects
 from plant.plants import list_plants
 from rig.cli.command_list import HELP_OF_COMMAND
+from rig.conformance.run_cases import CASES
 from rig.sequences import faults
 from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS
 
@@ -66,6 +67,8 @@ def test_the_reference_has_every_effect_key_and_kind(reference: Path) -> None:
     for word, kinds in (("Segment", SEGMENT_KINDS), ("Fault", faults.KINDS), ("Check", CHECK_KINDS)):
         assert {f"{word} {name}" for name in kinds} <= set(sections)
     assert "| `filter.clogging` |" in (reference / "parameters.md").read_text()
+    page = (reference / "conformance.md").read_text()
+    assert [each.number for each in CASES] == re.findall(r"^\| (\d+\.\d+) \|", page, re.MULTILINE)
     keys = (reference / "json.md").read_text()
     assert all(f"## {path.name}" in keys for path in (ROOT / "docs" / "schema").glob("*.json"))
     assert "| `signals.*.floor_source` | `repeats`, `model`, `data`" in keys

@@ -391,7 +391,7 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
                    progress: Progress = ignore_progress) -> Floats:
     """Sensed position, (count, n) m, of units over a command (n,) m with a known load (n,) N.
 
-    The same seed gives the same units, whatever their faults. The solver takes `steps` a cycle; docs/accuracy.md says
+    The same seed gives the same units, whatever their faults. The solver takes `steps` a cycle; docs/statistics.md says
     what that leaves out. Every other block of units moved before its test and came to rest wherever friction left it;
     the others start at rest at null, as a model does.
     """

@@ -72,19 +72,16 @@ NOT_PLAYED = {
 NOT_PLAYED_SECTIONS = {("docs/commands.md", "Find the parameters"): _MINUTES,
                        ("docs/commands.md", "Measure the software"): "measures for minutes to hours"}
 NOT_PLAYED_PAGES = {
-    "docs/bands.md": "TRACE stands for a file; tests/fdi/diagnosis runs these options",
     "docs/bus.md": "two programs at once; tests/rig/network runs them",
     "docs/campaign.md": "docs/commands.md shows and plays the same lines",
     "docs/fdi.md": "TRACE stands for a file; tests/fdi/diagnosis runs these options",
-    "docs/fdi_statistics.md": _HOURS,
     "docs/hardware.md": "needs CAN hardware and changes the machine",
     "docs/identify.md": _MINUTES,
     "docs/laws.md": _MINUTES,
     "docs/pytest.md": "tests/rig/testing runs the example of the page",
     "docs/real_data.md": "needs recordings of others",
-    "docs/robustness.md": _HOURS,
+    "docs/statistics.md": _HOURS,
     "docs/suite.md": "tests/rig/suite runs the suite of the page",
-    "docs/trial.md": _HOURS,
 }
 
 

@@ -117,7 +117,8 @@ def test_filter_laws_against_an_explicit_scheme(law: str, exponent: float) -> No
     pairs = ((m.replace(clogged), m) for m in (SILENT, SMOOTH))
     ours, smooth = (rms(simulate(a, PREFLIGHT).xj - simulate(b, PREFLIGHT).xj) for a, b in pairs)
     assert ours == pytest.approx(truth, abs=0.3e-6)
-    line = next(line for line in (ROOT / "docs/accuracy.md").read_text().splitlines() if line.startswith(f"| {law} |"))
+    page = (ROOT / "docs/statistics.md").read_text()
+    line = next(line for line in page.splitlines() if line.startswith(f"| {law} |"))
     cells = line.split("|")
     assert [float(cells[i]) for i in (2, 3, 5)] == pytest.approx([x * 1e6 for x in (ours, truth, smooth)], abs=0.3)
 
@@ -151,8 +152,8 @@ def test_finer_steps_are_better(table: list) -> None:
 
 
 def test_the_page_says_what_is_measured(table: list) -> None:
-    """docs/accuracy.md holds the numbers of `rig bench --accuracy`, not older ones."""
-    page = (ROOT / "docs/accuracy.md").read_text()
+    """docs/statistics.md holds the numbers of `rig bench --accuracy`, not older ones."""
+    page = (ROOT / "docs/statistics.md").read_text()
     for row in table:
         line = next(line for line in page.splitlines() if line.startswith(f"| {1000 / row.steps:g} |"))
         said = [float(cell) for cell in line.split("|")[3:7]]

@@ -231,7 +231,7 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
 
 
 def describe_search(found: LawSearch) -> str:
-    """A row of the table in docs/laws.md."""
+    """A row of the table of laws in docs/statistics.md."""
     worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
     floor = found.floor[worst]
     if found.law is None:

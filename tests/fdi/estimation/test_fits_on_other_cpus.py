@@ -1,7 +1,7 @@
 """Fits agree on all CPUs with AVX2 and FMA within a small fraction of their own 95 % interval; verdicts are the same.
 
-Linear algebra has the same kernels there (plant/blas.py); NumPy's elementary functions have not. docs/accuracy.md says
-what was measured, on older CPUs too.
+Linear algebra has the same kernels there (plant/blas.py); NumPy's elementary functions have not. docs/statistics.md
+says what was measured, on older CPUs too.
 """
 from __future__ import annotations
 

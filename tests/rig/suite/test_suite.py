@@ -101,13 +101,6 @@ def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tup
     assert [case["seed"] for case in cases.values()] == [1, 2, 0, 0, 0, 0, 0]
 
 
-def test_the_keys_of_the_answer_are_documented(suite: tuple[Path, Said]) -> None:
-    answer = json.loads((suite[0] / "suite.json").read_text())
-    page = (ROOT / "docs" / "json.md").read_text().split("With several sequences or a suite file")[1].split("\n## ")[0]
-    keys = {*answer, *answer["cases"][0], *answer["requirements"][0], *answer["requirements"][0]["checks"][0]}
-    assert keys <= set(re.findall(r"`(\w+)`", page))
-
-
 def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
     _, said = suite
     lines = said.out.splitlines()
