@@ -24,7 +24,7 @@ from rig.network.node_objects import NAMES, PLANT, Identity
 from rig.run.attribution import Attribution, Cause, Trouble, count_most_in_a_row
 from rig.run.job import Job, find_differences
 from rig.run.loop import History, Loop
-from rig.run.session import SessionEvent
+from rig.run.state import SessionEvent
 from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import HEARTBEAT
 

@@ -112,7 +112,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     """Play the session of a job and judge it. Raises RigError."""
     progress("bring-up", 0.0)
     session.bring_up()
-    loop = session.loop
+    loop = session.stage.loop
     assert loop is not None
     stopwatch = WallClock()
     with contextlib.ExitStack() as rights:
@@ -129,19 +129,19 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
     reason = explain_soft_time(job)
     recorder.metadata("timing", {"kind": kind, "reason": reason})
-    history = session.history
+    history = session.log.history
     attribution = attribute_run(job, session)
     checks = judge_run(job, session, attribution.judged)
     for check in checks:
-        recorder.put(session.now(), _make_check_record(check))
-    diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.interrupted else {}
+        recorder.put(session.stage.now(), _make_check_record(check))
+    diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
+    safety, log, starter = session.safety, session.log, session.starter
     outcome = Outcome(
-        job=job, folder=folder, checks=checks, events=session.events, aborted=session.aborted, safe=session.safe,
-        interrupted=session.interrupted, timing=summarise_timing(history, loop, scheduled, kind, reason),
-        counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / spent,
-        attribution=attribution, due_ns=tuple(session.due_ns), start_times=session.start_times,
-        identities=session.identities, fdi=diagnosis,
-        limits=find_limits(history.column, job.model, job.scenario.plan.start))
+        job=job, folder=folder, checks=checks, events=session.journal.events, aborted=safety.aborted,
+        safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis, attribution=attribution,
+        timing=summarise_timing(history, loop, scheduled, kind, reason), counters=_count_lost_frames(history),
+        speed=len(history) * job.period_ns * 1e-9 / spent, due_ns=tuple(log.due_ns), start_times=starter.start_times,
+        identities=starter.identities, limits=find_limits(history.column, job.model, job.scenario.plan.start))
     recorder.metadata("differences", {"text": find_differences(job).describe()})
     if outcome.limits:
         recorder.metadata("limits", {f"{number:02d}": limit.describe() for number, limit in enumerate(outcome.limits)})
@@ -157,11 +157,11 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
 
 def judge_run(job: Job, session: Session, judged: Mask) -> list[CheckResult]:
     """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks."""
-    main = [session.history.column(name, MAIN) for name in Columns._fields[1:]]
+    main = [session.log.history.column(name, MAIN) for name in Columns._fields[1:]]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.events,
-                              sequence.fault_starts(), session.read_drives())
+    results = evaluate_checks(sequence.checks, Columns(t, *main), sequence.sections(), session.journal.events,
+                              sequence.fault_starts(), session.log.read_drives())
     return [*results, *judge_protocol(session.read_protocol_record(judged), sequence.protocol)]
 
 
@@ -174,18 +174,18 @@ def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
 
 def attribute_run(job: Job, session: Session) -> Attribution:
     """Find the cycles of a run that may be judged, and the first cause of its troubles."""
-    return attribute(collect_records(job, session), session.troubles, job.sequence.timing, session.gone)
+    return attribute(collect_records(job, session), session.safety.troubles, job.sequence.timing, session.nodes.gone)
 
 
 def collect_records(job: Job, session: Session) -> CycleRecords:
     """The records of all cycles for the attribution. In lockstep nothing is late; frames are there or missing."""
-    history = session.history
+    history = session.log.history
     columns = {name: history.column(name) for name in ("lateness", "feedback_response", "valve_response", "response")}
     if not job.realtime:
         columns = {name: np.where(np.isnan(values), values, 0.0) for name, values in columns.items()}
     plan = job.scenario.plan
     injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
-    return CycleRecords(np.array(session.due_ns, dtype=np.int64), columns["lateness"], columns["feedback_response"],
+    return CycleRecords(np.array(session.log.due_ns, dtype=np.int64), columns["lateness"], columns["feedback_response"],
                         columns["valve_response"], columns["response"], history.column("flags").astype(np.int64),
                         injected, select_plant_delays(session.plant_record, len(history)))
 

@@ -22,7 +22,7 @@ from plant.segments import RATE
 from rig.run.job import JobChoice, build_job
 from rig.run.outcome import Outcome
 from rig.run.runner import run_job
-from rig.run.session import SessionEvent
+from rig.run.state import SessionEvent
 from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import Sequence as TestSequence
 from rig.sequences.sequence import load_sequence, parse_sequence

@@ -199,4 +199,4 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
         return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
     if strangers:
         return ""
-    return session.aborted or "; ".join(failed)
+    return session.safety.aborted or "; ".join(failed)

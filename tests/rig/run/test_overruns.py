@@ -6,7 +6,7 @@ from math import nan
 import pytest
 
 from rig.recorder import Timing
-from rig.run.session import OverrunWatch
+from rig.run.watch import OverrunWatch
 from rig.sequences.timing import TimingPolicy
 
 ON_TIME = Timing(0, False, 1e-5, 2e-4, 2e-4, 1e-4, 1e-4, 0.0)

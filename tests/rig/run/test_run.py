@@ -363,7 +363,7 @@ def test_the_memory_of_a_run_is_free_when_it_ends(
     class NotedSession(Session):
         def run_phases(self) -> None:
             super().run_phases()
-            kept.extend((weakref.ref(self), weakref.ref(self.loop), weakref.ref(self.history)))
+            kept.extend((weakref.ref(self), weakref.ref(self.stage.loop), weakref.ref(self.log.history)))
 
     monkeypatch.setattr(runner, "Session", NotedSession)
     gc.disable()

@@ -250,9 +250,9 @@ def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tm
 
         session._choose_cleanup = begin_cleanup  # type: ignore[method-assign, assignment]
         session.run_phases()
-    assert session.aborted.startswith("node 2 controller 0x8250")
-    assert session.gone[3] == "its process was ended by SIGKILL"
-    assert [trouble.text for trouble in session.troubles if trouble.kind == "process"] == [
+    assert session.safety.aborted.startswith("node 2 controller 0x8250")
+    assert session.nodes.gone[3] == "its process was ended by SIGKILL"
+    assert [trouble.text for trouble in session.safety.troubles if trouble.kind == "process"] == [
         "node 3 plant: its process was ended by SIGKILL"]
     assert phases(tmp_path)[2] == cleanup and set(control_words(tmp_path)[-cleanup:]) == {0}
 
@@ -267,7 +267,7 @@ def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tm
 ])
 def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
     session = play_with(Intruder(250, *frames), tmp_path)
-    assert session.aborted.startswith(why) and phases(tmp_path)[2] == 50
+    assert session.safety.aborted.startswith(why) and phases(tmp_path)[2] == 50
 
 
 def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
@@ -275,7 +275,7 @@ def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
     noise = [(cob_id, bytes(length)) for cob_id in (0x084, 0x184, 0x284, 0x584, 0x604, 0x704, 0x7E5, 0x082, 0x083,
                                                     0x583, 0x603) for length in (0, 3)]
     session = play_with(Intruder(250, *noise), tmp_path)
-    assert session.aborted == "" and phases(tmp_path) == [50, 350, 50]
+    assert session.safety.aborted == "" and phases(tmp_path) == [50, 350, 50]
 
 
 @pytest.mark.parametrize("error", [RigError("the bus is gone"), RuntimeError("a bug"), KeyboardInterrupt()])

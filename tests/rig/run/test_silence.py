@@ -1,7 +1,7 @@
 """Nodes that have stopped sending: known by the time for which the rig listened, not by the time that passed."""
 from __future__ import annotations
 
-from rig.run.session import SilenceWatch
+from rig.run.watch import SilenceWatch
 
 MS = 1_000_000  # ns
 

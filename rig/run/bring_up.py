@@ -1,0 +1,155 @@
+"""Bring-up: the nodes are reset, identified, configured and started, and the probes before set-up are played."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from plant.errors import InputError
+from rig.network.clock import WallClock
+from rig.network.link import EmbeddedWire
+from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, Gains, Identity, read_gains
+from rig.nodes.scenario import Scenario
+from rig.recorder import Signals, Timing
+from rig.run.attribution import Mask, find_start_problem
+from rig.run.hard_loop import open_loop
+from rig.run.job import Job
+from rig.run.loop import History
+from rig.run.probe import (
+    ATTEMPTS,
+    BEFORE,
+    PROBES,
+    WARM_UP,
+    Step,
+    count_cycles,
+    find_gap,
+    find_on_time,
+    has_no_answers,
+    list_first_steps,
+    list_inputs,
+    make_probe_scenario,
+)
+from rig.run.state import Journal, SafeState, Stage
+from rig.sequences.faults import Schedule
+
+
+class BringUp:
+    """Starts the nodes of a job, for a probe or the run. `stop()` is True when the operator wants to end."""
+
+    def __init__(self, job: Job, stage: Stage, journal: Journal, safety: SafeState, master: Master,
+                 stop: Callable[[], bool]) -> None:
+        self._job, self._stage, self._journal, self._safety = job, stage, journal, safety
+        self._master, self._stop = master, stop
+        self._is_embedded = isinstance(master.wire, EmbeddedWire)
+        self.identities: dict[int, Identity] = {}
+        self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
+        self.gains: Gains | None = None  # object 0x2110 of the controller, if it has it
+        self.probes: list[History] = []  # played before set-up
+        self._probe = History()  # the one being played
+
+    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
+        """Keep a complete cycle of a probe (called by the loop)."""
+        self._probe.add(signals, timing)
+
+    def start_nodes(self, scenario: Scenario, *, is_run: bool = False) -> None:
+        """Reset, identify, configure and start the nodes, for a probe or the run. Raises BusError and InputError."""
+        job = self._job
+        self._master.reset()
+        self._stage.is_watching = is_run
+        if not self.identities:
+            self._identify_nodes()
+        gains = read_gains(job.model) if job.controller != "external" else None
+        if self.gains is None:
+            self.gains = gains or self._master.read_gains()
+        patient = not job.realtime and isinstance(self._stage.clock, WallClock)
+        self._master.configure(scenario.to_bytes(), gains,
+                               job.sequence.timing.choose_sync_period() if job.realtime or self._is_embedded else 0,
+                               PATIENT if patient else HEARTBEAT_LIMIT)
+        self._master.start()
+        self._wait_for_operational(job.sequence.timing.operational)
+
+    def play_probes(self) -> None:
+        """Play the probes before set-up, each after a reset of the nodes.
+
+        In real time a probe with a gap is repeated. If the bench itself cannot deliver one, none is judged.
+
+        Raises:
+            BusError: a node does not answer or refuses.
+        """
+        steps = list_first_steps(self._job.sequence.protocol.step_delay)
+        cycles = count_cycles(steps)
+        steps = (*WARM_UP, *steps) if self._job.realtime else steps
+        self._stage.is_probing = True
+        for _ in range(PROBES):
+            probe = self._play_probe(steps)
+            attempts = ATTEMPTS if self._job.realtime else 1
+            while ((gap := find_gap(probe, self.find_on_time_of(probe), cycles)) and (attempts := attempts - 1)
+                   and not self._safety.aborted):
+                probe = self._play_probe(steps)
+            if self._safety.aborted:
+                break
+            if gap == "bench" and self._job.realtime:
+                self._journal.log("WARN", "probe", f"no probe without a gap in {ATTEMPTS} attempts: the plant was late")
+                self.probes.clear()
+                break
+            self.probes.append(probe)
+        self._stage.is_probing = False
+
+    def _play_probe(self, steps: tuple[Step, ...]) -> History:
+        """Play one probe after a reset of the nodes. Raises BusError."""
+        scenario = make_probe_scenario(self._job.scenario)
+        self.start_nodes(scenario)
+        self._probe = History()
+        if self._safety.aborted:  # a node did not become OPERATIONAL
+            return self._probe
+        self._stage.loop = open_loop(self._master, Schedule(scenario.plan, scenario.model.values), self, self._job.bus,
+                                     self._job.period_ns, self._job.realtime)
+        try:
+            for step in list_inputs(steps, BEFORE, 0.0):
+                self._stage.loop.cycle(step)
+                if self._job.realtime and self._stop():
+                    self._safety.stop()
+                if self._safety.aborted or has_no_answers(self._probe):
+                    self._stage.loop.hold(BEFORE)
+                    break
+            self._stage.loop.finish()
+        except BaseException:
+            self._master.stop()
+            raise
+        finally:
+            self._stage.loop.close()
+            self._stage.loop = None
+        return self._probe
+
+    def _identify_nodes(self) -> None:
+        """Read and log what the nodes say about themselves; refuse a firmware that the sequence is not meant for.
+
+        Raises:
+            InputError: another firmware.
+        """
+        for node in (CONTROLLER, PLANT):
+            identity = self._master.read_identity(node)
+            self.identities[node] = identity
+            self._journal.log("INFO", "identity", f"node {node} {NAMES[node]}: {identity}")
+            known = {key: str(value) for key, value in identity._asdict().items() if value is not None}
+            self._journal.recorder.metadata(f"node{node}", known)
+        sequence = self._job.sequence
+        key, difference = sequence.firmware.find_difference(self.identities[CONTROLLER]._asdict())
+        if difference:
+            raise InputError(sequence.name, f"firmware.{key}", difference)
+
+    def _wait_for_operational(self, limit: float) -> None:
+        """Wait until each node says that it is OPERATIONAL, and log how long that took; too long ends the run.
+
+        A node that is too slow is given three times the limit, so that the time it needs is known.
+        """
+        times = self._master.wait_for_operational(3 * limit)
+        self.start_times = {node: time.seconds for node, time in times.items()}
+        for node, seconds in sorted(self.start_times.items()):
+            self._journal.log("INFO", "nmt",
+                              f"node {node} {NAMES[node]} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
+        if problem := find_start_problem(times, limit):
+            self._safety.handle(problem.kind, problem.text, problem.node)
+
+    def find_on_time_of(self, history: History, faults: Schedule | None = None) -> Mask:
+        """The cycles of a play in which the bench was on time."""
+        return find_on_time(history, faults, self._job.realtime, self._job.period_ns * 1e-9)

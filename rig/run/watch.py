@@ -1,0 +1,221 @@
+"""The watch of the nodes of a run: emergencies, heartbeats, states, processes that end, and silence."""
+from __future__ import annotations
+
+from collections.abc import Collection, Container, Mapping
+from itertools import filterfalse
+from math import isnan
+
+from canopen.emcy import EmcyError
+
+from rig.device.emcy import EmcyCode
+from rig.network.master import HEARTBEAT_LIMIT, Master
+from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG, NmtState
+from rig.recorder import NmtState as NmtRecord
+from rig.recorder import Signals, Timing
+from rig.run.participants import FRAME_TIMEOUT, NodeProcesses, describe_exit
+from rig.run.state import Journal, SafeState, Stage
+from rig.sequences.protocol import Emergency, Heartbeat
+from rig.sequences.timing import TimingPolicy
+
+
+class NodeWatch:
+    """What the nodes of a run report and whether they still answer. Trouble goes to the safe state."""
+
+    def __init__(self, stage: Stage, journal: Journal, safety: SafeState, master: Master, processes: NodeProcesses,
+                 looks_for_silence: bool) -> None:
+        """`looks_for_silence`: in lockstep between processes, where a cycle waits long for a node that is late."""
+        self._stage, self._journal, self._safety, self._processes = stage, journal, safety, processes
+        self._master, self._looks = master, looks_for_silence
+        self.gone: dict[int, str] = {}  # nodes that do not answer any more, and how that is known
+        self.emergencies: list[Emergency] = []
+        self.heartbeats: dict[int, list[Heartbeat]] = {node: [] for node in (CONTROLLER, PLANT)}
+        self.last_answers = {CONTROLLER: -1, PLANT: -1}  # last cycle with a cyclic frame of the node
+        self._operational: set[int] = set()
+        self._next_look = 0  # when to look again whether the nodes are alive
+        self._silence = SilenceWatch(round(FRAME_TIMEOUT * 1e9))
+        self._silent: set[int] = set()  # the nodes among `gone` that are known by their silence in lockstep
+        wire = master.wire
+        wire.is_node_gone = self.is_node_gone
+        master.on_emcy, master.on_state = self._note_emergency, self._note_state
+        master.on_lost, master.on_back = self._handle_silence, self._handle_return
+        master.on_heartbeat = lambda node, t_ns: self.heartbeats[node].append(
+            Heartbeat(t_ns * 1e-9, wire.blind_ns * 1e-9))
+        master.on_rival = lambda cob_id: safety.handle(
+            "bus", f"another node sends 0x{cob_id:03X}, a frame of node {RIG} {NAMES[RIG]}")
+
+    def begin(self) -> None:
+        """Count heartbeats from here on."""
+        for times in self.heartbeats.values():
+            times.clear()
+
+    def look_again(self) -> bool:
+        """Look at once; whether a node will not answer any more."""
+        self._next_look = 0
+        return self.is_node_gone()
+
+    def add(self, signals: Signals) -> None:
+        """Take in a complete cycle: who answered in it."""
+        if signals.xs == signals.xs:  # not NaN
+            self.last_answers[PLANT] = signals.cycle
+        if signals.cor == signals.cor:
+            self.last_answers[CONTROLLER] = signals.cycle
+
+    def _note_emergency(self, node: int, error: EmcyError) -> None:
+        if self._stage.is_playing or self._stage.is_probing:
+            is_in_run = self._stage.loop is not None and self._stage.is_playing
+            self.emergencies.append(Emergency(self._stage.playing.k if is_in_run else -1, node, error.code))
+        if error.code & 0xFF00 == 0:
+            left = "an error is gone, others stand" if error.register else "no error any more"
+            self._journal.log("INFO", "recovered", f"node {node} {NAMES[node]}: {left}")
+        elif error.code == EmcyCode.HEARTBEAT_LOST and self._master.is_behind():
+            self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and node {node} "
+                                        f"{NAMES[node]} reports 0x{error.code:04X}", RIG)
+        else:
+            self._safety.handle("emcy", f"node {node} {NAMES[node]} 0x{error.code:04X} {error.get_desc()}".rstrip(),
+                                node, error.code, round(error.timestamp * 1e9))
+
+    def _note_state(self, node: int, state: int) -> None:
+        known = {s.value: s.name.lower().replace("_", "-") for s in NmtState}
+        name = known.get(state, f"state {state}") if state else "boot-up"
+        self._journal.recorder.put(self._stage.now(), NmtRecord(node, state, name))
+        if state == NmtState.OPERATIONAL:
+            self._operational.add(node)
+        elif node in self._operational:
+            self._operational.discard(node)
+            if self._stage.is_playing:  # a watchdog reset, a power cycle, or an NMT command of another master
+                self._safety.handle("nmt", f"node {node} {NAMES[node]} left OPERATIONAL: {name}", node, state)
+
+    def _handle_silence(self, node: int) -> None:
+        self.note_ended_processes()
+        limit = "" if node not in self._master.heard_ns else (
+            f": last heartbeat {1e-9 * (self._stage.clock.now() - self._master.heard_ns[node]):.2f} s ago")
+        if not self._is_answering(node):
+            self.gone.setdefault(node, f"no heartbeat any more{limit}")
+        self._safety.handle("heartbeat", f"node {node} {NAMES[node]} is silent", node)
+
+    def _handle_return(self, node: int) -> None:
+        if node not in self._processes.find_ended():
+            self.gone.pop(node, None)
+        self._journal.log("INFO", "heartbeat", f"node {node} {NAMES[node]} is heard")
+
+    def _is_answering(self, node: int, recent: int = 20) -> bool:
+        """Whether a node sent a cyclic frame in one of the `recent` cycles: its heartbeat alone may be missing."""
+        return self._stage.loop is not None and self.last_answers[node] >= self._stage.loop.k - recent
+
+    def is_node_gone(self) -> bool:
+        """Whether a node will not answer any more; looks every 20 ms."""
+        now = self._stage.clock.now()
+        if now >= self._next_look:
+            self._next_look = now + 20_000_000
+            self.note_ended_processes()
+            if self._stage.is_playing and self._looks:
+                self._look_for_silent_nodes(now)
+        return bool(self.gone)
+
+    def note_ended_processes(self) -> bool:
+        """Note which nodes that the rig started have ended; True if that was not known yet.
+
+        A process that is killed sends nothing more from then on, but takes some ms to end. Other nodes may report the
+        missing frames before.
+        """
+        is_news = False
+        for node, status in self._processes.find_ended().items():
+            how = describe_exit(status)
+            if self.gone.get(node) != how:
+                is_news, self.gone[node] = True, how
+                self._safety.handle("process", f"node {node} {NAMES[node]}: {how}", node)
+        return is_news
+
+    def _look_for_silent_nodes(self, now: int) -> None:
+        """Lockstep between processes: a node that neither beats nor answers is gone, until it is heard again.
+
+        The heartbeat alone is watched with much patience there, and a cycle waits long for a node that is late.
+        """
+        if self._master.is_deaf:
+            return
+        heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
+        self._silence.look(now, {node: heard[node] for node, state in self._master.states.items()
+                                 if node in heard and state == NmtState.OPERATIONAL})
+        answering = [node for node in self.last_answers if self._is_answering(node, recent=1)]
+        found = self._silence.find_silent(answering)
+        for node in self._silent - found.keys():
+            self._silent.discard(node)
+            self._handle_return(node)
+        for node in found.keys() - self.gone.keys():
+            self._silent.add(node)
+            self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
+            what = f"node {node} {NAMES[node]} is silent"
+            self._safety.handle("heartbeat", what, node)
+            if not self._safety.aborted:  # no sequence can mean that in lockstep
+                self._safety.abort("abort", what)
+
+    def find_silent_nodes(self) -> None:
+        """After trouble: find out which nodes still answer, for the first cause depends on it."""
+        if self._safety.aborted and not self._safety.interrupted:
+            seconds = HEARTBEAT_LIMIT * 1e-3
+            silent = list(filterfalse(self._is_answering, self._master.find_silent(seconds)))
+            self._processes.wait(silent)
+            self.note_ended_processes()
+            for node in silent:
+                self.gone.setdefault(node, f"no heartbeat within {seconds:g} s at the end of the run")
+
+
+class OverrunWatch:
+    """Counts overruns in a row, cycle by cycle. `problem` says when there were too many; empty before that.
+
+    A cycle is an overrun if its SYNC was sent late or the plant's frames came late or not at all. It counts once, or as
+    many times as SYNC was whole periods late. Cycles in which the sequence itself disturbs these frames do not count,
+    and do not end a row of overruns.
+    """
+
+    def __init__(self, policy: TimingPolicy, period: float, injected: Container[int] = ()) -> None:
+        """`period` is the length of a cycle in s; `injected`: cycles whose SYNC or plant frames a fault disturbs."""
+        self._most = policy.most_in_a_row if policy.overruns == "abort" else None
+        self._policy, self._period, self._injected = policy, period, injected
+        self._in_a_row = 0
+        self.problem = ""
+
+    def add(self, timing: Timing) -> None:
+        """Take in a complete cycle."""
+        if self._most is None or self.problem or timing.cycle * self._period < self._policy.grace:
+            return
+        if timing.cycle in self._injected:
+            return
+        is_fed = timing.feedback_response <= self._policy.feedback and not isnan(timing.valve_response)
+        is_late = timing.lateness > self._policy.sync or not is_fed
+        self._in_a_row = self._in_a_row + max(1, int(timing.lateness / self._period)) if is_late else 0
+        if self._in_a_row > self._most:
+            self.problem = (f"the bench was late: {self._in_a_row} overruns in a row up to cycle {timing.cycle}, "
+                            f"{self._most} are accepted")
+
+
+class SilenceWatch:
+    """Adds up for each node how long the rig has listened without a heartbeat of it.
+
+    A look that comes late counts for `step` at most: then the rig stood still, and perhaps the node with it.
+    """
+
+    def __init__(self, limit_ns: int, step_ns: int = 100_000_000) -> None:
+        """`limit_ns`: silence after which a node counts as gone if it does not take part in the cycles either."""
+        self._limit, self._step = limit_ns, step_ns
+        self._looked_ns = 0
+        self._heard_ns: dict[int, int] = {}
+        self._silent_ns: dict[int, int] = {}
+
+    def look(self, now_ns: int, heard_ns: Mapping[int, int]) -> None:
+        """Take note of the last heartbeats.
+
+        Args:
+            now_ns: time.
+            heard_ns: when the last heartbeat of each node came that is to be watched.
+        """
+        passed = min(now_ns - self._looked_ns, self._step)
+        self._looked_ns = now_ns
+        self._silent_ns = {node: self._silent_ns.get(node, 0) + passed if heard == self._heard_ns.get(node) else 0
+                           for node, heard in heard_ns.items()}
+        self._heard_ns = dict(heard_ns)
+
+    def find_silent(self, answering: Collection[int] = ()) -> dict[int, float]:
+        """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s."""
+        return {node: silent * 1e-9 for node, silent in self._silent_ns.items()
+                if silent >= self._limit and node not in answering}
