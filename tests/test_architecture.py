@@ -291,6 +291,32 @@ def test_no_links_to_elsewhere() -> None:
     assert listed and [line for line in listed.splitlines() if line.startswith(symbolic_link)] == []
 
 
+def list_changing_fields(class_: ast.ClassDef) -> set[str]:
+    """The fields that methods other than `__init__` assign, or whose containers they change in place."""
+    in_place = {"append", "add", "pop", "clear", "update", "extend", "discard", "insert", "remove", "setdefault"}
+    found: set[str] = set()
+    for method in class_.body:
+        if isinstance(method, ast.FunctionDef) and method.name != "__init__":
+            for node in ast.walk(method):
+                targets: list[ast.expr] = node.targets if isinstance(node, ast.Assign) else []
+                targets = [node.target] if isinstance(node, ast.AugAssign | ast.AnnAssign) else targets
+                targets = [part for target in targets for part in getattr(target, "elts", [target])]
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in in_place:
+                    targets = [node.func.value]
+                for target in targets:
+                    place = target.value if isinstance(target, ast.Subscript) else target
+                    if isinstance(place, ast.Attribute) and ast.unparse(place.value) == "self":
+                        found.add(place.attr)
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name)
+def test_no_type_has_more_than_fifteen_fields_that_change(path: Path) -> None:
+    """Who has to keep more in mind cannot follow it."""
+    classes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
+    assert {each.name: found for each in classes if len(found := list_changing_fields(each)) > 15} == {}
+
+
 def constants(path: Path) -> Iterator[tuple[str, ast.expr]]:
     """Names in capitals that a module gives a value, and the value."""
     for node in tree(path).body:

@@ -118,7 +118,7 @@ def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: in
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
         master = Master(wire, clock.now, stamped=True)
-        master.on_frame = recorder.frame
+        master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
         loop: Loop = (HardLoop(master, Schedule(Plan(stop=0)), log, open_raw_bus(bus, RECEIVED), period_ns, True)
                       if is_compiled else CycleLoop(master, Schedule(Plan(stop=0)), log, period_ns, True))

@@ -84,15 +84,29 @@ class _Network(canopen.Network):
         self._sent(can_id, bytes(data))
 
 
+class Hooks:
+    """Who is told: `on_frame` of every frame, sent or received, the others of what the master detects."""
+
+    def __init__(self) -> None:
+        self.on_frame: Callable[[Frame], None] = lambda frame: None
+        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
+        self.on_state: Callable[[int, int], None] = lambda node, state: None
+        self.on_lost: Callable[[int], None] = lambda node: None
+        self.on_back: Callable[[int], None] = lambda node: None
+        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
+        self.on_rival: Callable[[int], None] = lambda cob_id: None
+        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+
+
 class Master:
-    """Node 1 on the bus. `on_frame` gets every frame, sent or received; the other hooks report what the master detects.
+    """Node 1 on the bus; `hooks` are told what it sees.
 
     `stamped`: frames carry their time of reception, and it is kept; otherwise they get the time of `now()`.
     """
 
     def __init__(self, wire: Wire, now: Callable[[], int], stamped: bool = False) -> None:
         self.wire, self._now, self._stamped = wire, now, stamped
-        self._ignore_all()
+        self.hooks = Hooks()
         self.silent = False  # a fault: no heartbeat of ours
         self.is_deaf = False  # a fault: the rig receives nothing
         self.states = {CONTROLLER: -1, PLANT: -1}
@@ -108,7 +122,7 @@ class Master:
         self._beat = HeartbeatProducer(RIG, self._send_heartbeat)
         self._beat_ns = self._last_pause_ns = 0  # when the rig's own heartbeat was sent; the time between the last two
         self._limit_ns = 0  # after which the nodes miss it
-        self._watch = HeartbeatConsumer(lambda node: self.on_lost(node), lambda node: self.on_back(node))
+        self._watch = HeartbeatConsumer(lambda node: self.hooks.on_lost(node), lambda node: self.hooks.on_back(node))
         self._state = NmtState.PRE_OPERATIONAL
         # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
         self._services = {base + node: length for base, length in ((0x080, 8), (0x580, 8), (0x700, 1))
@@ -117,24 +131,12 @@ class Master:
 
     def close(self) -> None:
         """Report to nobody any more. Whoever the master reported to is then free, together with what it holds."""
-        self._now = self.wire.clock.now
-        self._ignore_all()
-
-    def _ignore_all(self) -> None:
-        """Set the hooks to nobody."""
-        self.on_frame: Callable[[Frame], None] = lambda frame: None
-        self.on_emcy: Callable[[int, EmcyError], None] = lambda node, error: None
-        self.on_state: Callable[[int, int], None] = lambda node, state: None
-        self.on_lost: Callable[[int], None] = lambda node: None
-        self.on_back: Callable[[int], None] = lambda node: None
-        self.on_heartbeat: Callable[[int, int], None] = lambda node, t_ns: None  # with the time of the wire's clock
-        self.on_rival: Callable[[int], None] = lambda cob_id: None
-        self.on_cyclic: dict[int, Callable[[Frame], None]] = {}  # COB-ID to what reads that PDO
+        self._now, self.hooks = self.wire.clock.now, Hooks()
 
     def _join(self, node: int) -> Any:  # the library's node; its types are too loose to help
         remote = _Node(node, _read_dictionary(node))
         self.network.add_node(remote)
-        remote.emcy.add_callback(lambda error: self.on_emcy(node, error))
+        remote.emcy.add_callback(lambda error: self.hooks.on_emcy(node, error))
         remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(node, state))
         return remote
 
@@ -147,7 +149,7 @@ class Master:
             self._operational.setdefault(node, StartTime(seconds, min(seconds, self.wire.blind_ns * 1e-9)))
         if self.states[node] != state:
             self.states[node] = state
-            self.on_state(node, state)
+            self.hooks.on_state(node, state)
 
     def _send_heartbeat(self, cob_id: int, data: bytes) -> None:
         if self.silent:
@@ -170,7 +172,7 @@ class Master:
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Put a frame on the bus."""
-        self.on_frame(Frame(self._now(), cob_id, data))
+        self.hooks.on_frame(Frame(self._now(), cob_id, data))
         self.wire.send(cob_id, data)
 
     def receive(self, frame: Frame) -> None:
@@ -179,21 +181,21 @@ class Master:
             return
         if not self._stamped and frame.t_ns != (now := self._now()):
             frame = Frame(now, frame.cob_id, frame.data)
-        self.on_frame(frame)
-        cyclic = self.on_cyclic.get(frame.cob_id)
+        self.hooks.on_frame(frame)
+        cyclic = self.hooks.on_cyclic.get(frame.cob_id)
         if cyclic is not None:
             cyclic(frame)
             return
         if frame.cob_id in _OURS and frame.cob_id not in self._rivals:
             self._rivals.add(frame.cob_id)
-            self.on_rival(frame.cob_id)
+            self.hooks.on_rival(frame.cob_id)
         if self._services.get(frame.cob_id) != len(frame.data):
             return
         if frame.cob_id in self._watch.cob_ids:
             self.heard_ns[frame.cob_id - 0x700] = now = self.wire.clock.now()
             self._watch.receive(Frame(now, frame.cob_id, frame.data))
             if frame.data[0] != NmtState.INITIALISING:  # not a boot-up
-                self.on_heartbeat(frame.cob_id - 0x700, frame.t_ns if self._stamped else now)
+                self.hooks.on_heartbeat(frame.cob_id - 0x700, frame.t_ns if self._stamped else now)
         self.network.notify(frame.cob_id, bytearray(frame.data), frame.t_ns * 1e-9)
 
     def tick(self) -> None:

@@ -81,7 +81,6 @@ class Emulator:
         self._missed = 0  # drive frames missing in a row
         self._synced = -1  # the cycle of the last SYNC
         self._current = 0.0
-        self._counts = {"missing": 0, "late": 0}
         self._held.clear()
         self._late.clear()
         for sub in (1, 2):
@@ -239,8 +238,8 @@ class Emulator:
         self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more
 
     def _count(self, what: str) -> None:
-        self._counts[what] += 1
-        self._od[COUNTERS, 1 if what == "missing" else 2] = self._counts[what]
+        sub = 1 if what == "missing" else 2
+        self._od[COUNTERS, sub] = cast(int, self._od[COUNTERS, sub]) + 1
 
     def _move(self) -> None:
         """Advance the plant by one cycle under the load of this cycle."""

@@ -89,7 +89,7 @@ class HardLoop:
         self._last_t_ns = 0
         self._reported = False  # an EMCY of the plant has come in this cycle
         self.scheduler = ""
-        self._write_frame, master.on_frame = master.on_frame, self._keep_frame
+        self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(RECEIVED)
         self._warm_up()
@@ -199,7 +199,7 @@ class HardLoop:
             self._drain()
         finally:
             self._release_frames(2**63)
-            self._master.on_frame, self._wire.receive = self._write_frame, self._receive
+            self._master.hooks.on_frame, self._wire.receive = self._write_frame, self._receive
 
     # ------------------------------------------------------------------------------------ towards the cycle
 

@@ -111,7 +111,7 @@ class CycleLoop:
         self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
         self._demand = 0.0  # m, of the last cycle
         read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
-        master.on_cyclic.update(read)
+        master.hooks.on_cyclic.update(read)
 
     @property
     def queued(self) -> int:

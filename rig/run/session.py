@@ -160,7 +160,7 @@ class Session:
         self._overruns = OverrunWatch(job.sequence.timing, job.period_ns * 1e-9,
                                       set(np.flatnonzero(injected.sync | injected.plant).tolist()))
         self.log = CycleLog(job, self.journal, self.nodes, self._overruns)
-        self._master.on_frame = self.log.keep_drive if job.sequence.disturbs_bus else recorder.frame
+        self._master.hooks.on_frame = self.log.keep_drive if job.sequence.disturbs_bus else recorder.frame
         self._agenda = FaultAgenda(self._faults, self.stage, self.journal, self._master)
         self.starter = BringUp(job, self.stage, self.journal, self.safety, self._master, stop)
         self.plant_record: CycleRecord | None = None  # the plant's own, read after a real-time run with trouble

@@ -36,11 +36,11 @@ class NodeWatch:
         self._silent: set[int] = set()  # the nodes among `gone` that are known by their silence in lockstep
         wire = master.wire
         wire.is_node_gone = self.is_node_gone
-        master.on_emcy, master.on_state = self._note_emergency, self._note_state
-        master.on_lost, master.on_back = self._handle_silence, self._handle_return
-        master.on_heartbeat = lambda node, t_ns: self.heartbeats[node].append(
+        master.hooks.on_emcy, master.hooks.on_state = self._note_emergency, self._note_state
+        master.hooks.on_lost, master.hooks.on_back = self._handle_silence, self._handle_return
+        master.hooks.on_heartbeat = lambda node, t_ns: self.heartbeats[node].append(
             Heartbeat(t_ns * 1e-9, wire.blind_ns * 1e-9))
-        master.on_rival = lambda cob_id: safety.handle(
+        master.hooks.on_rival = lambda cob_id: safety.handle(
             "bus", f"another node sends 0x{cob_id:03X}, a frame of node {RIG} {NAMES[RIG]}")
 
     def begin(self) -> None:

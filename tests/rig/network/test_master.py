@@ -78,7 +78,7 @@ def test_boot_ups_are_not_lost_among_the_frames_of_others(bus_kind: str) -> None
         try:
             master = Master(wire, clock.now)
             frames: list[Frame] = []
-            master.on_frame = frames.append
+            master.hooks.on_frame = frames.append
             for _ in range(3):
                 over.wait(0.5)  # 1000 frames
                 master.reset()
@@ -101,7 +101,7 @@ def test_bring_up(wire: Wire) -> None:
     """Boot-up, scenario, gains, heartbeats, start: what a run begins with."""
     master = Master(wire, wire.clock.now)
     seen: list[tuple[int, int]] = []
-    master.on_state = lambda node, state: seen.append((node, state))
+    master.hooks.on_state = lambda node, state: seen.append((node, state))
     master.reset()
     master.configure(SCENARIO, read_gains(Model()), 1_000_000)
     master.start()
@@ -158,8 +158,8 @@ def test_malformed_frames_do_not_reach_the_library(cob_id: int) -> None:
     """canopen unpacks an emergency of any length: struct.error, and the run would end."""
     master = alone()
     heard: list[object] = []
-    master.on_emcy = lambda node, error: heard.append(error)
-    master.on_state = lambda node, state: heard.append(state)
+    master.hooks.on_emcy = lambda node, error: heard.append(error)
+    master.hooks.on_state = lambda node, state: heard.append(state)
     for length in range(9):
         if (cob_id & 0x780, length) not in ((0x080, 8), (0x700, 1)):
             master.receive(Frame(0, cob_id, b"\x85" * length))
@@ -194,7 +194,7 @@ def test_a_boot_up_ends_the_errors_of_a_node() -> None:
 def test_another_rig_is_noticed_once(cob_id: int) -> None:
     master = alone()
     heard: list[int] = []
-    master.on_rival = heard.append
+    master.hooks.on_rival = heard.append
     for _ in range(3):
         master.receive(Frame(0, cob_id, b""))
     assert heard == [cob_id] and master.hears_rival(0.0)
@@ -204,7 +204,7 @@ def test_heartbeats_are_watched_from_the_first_on() -> None:
     clock = VirtualClock()
     master = Master(EmbeddedWire(clock, [Emulator, Firmware]), clock.now)
     lost: list[int] = []
-    master.on_lost = lost.append
+    master.hooks.on_lost = lost.append
     master.reset()
     master.configure(SCENARIO, read_gains(Model()), 0)
     for _ in range(10):
@@ -219,7 +219,7 @@ def test_heartbeats_are_watched_from_the_first_on() -> None:
 def test_every_frame_is_seen_once() -> None:
     master = Master(EmbeddedWire(VirtualClock(), [Emulator, Firmware]), lambda: 7)
     frames: list[Frame] = []
-    master.on_frame = frames.append
+    master.hooks.on_frame = frames.append
     master.reset()
     boots = [(7, 0x703, b"\0"), (7, 0x702, b"\0")]
     assert frames == [*boots, (7, 0x000, b"\x82\x03"), (7, 0x000, b"\x82\x02"), *boots]  # each node by its number

@@ -111,7 +111,7 @@ class Bench:
         self.times: list[int] = []
         self.frames: list[Frame] = []
         self.master = Master(self.wire, lambda: self.loop.now(), realtime)
-        self.master.on_frame = self.frames.append
+        self.master.hooks.on_frame = self.frames.append
         schedule = Schedule(Plan(faults=faults, stop=1000))
         bus = open_raw_bus(where, RECEIVED)
         self.loop = HardLoop(self.master, schedule, self, bus, PERIOD, realtime, ahead)
@@ -479,7 +479,7 @@ def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtim
 def test_a_second_rig_is_told(bus_kind: str, realtime: bool) -> None:
     with bench(bus_kind, realtime) as one:
         rivals: list[int] = []
-        one.master.on_rival = rivals.append
+        one.master.hooks.on_rival = rivals.append
         one.play(0, 1)
         rig = Link(open_can(one.where), time.monotonic_ns)
         rig.send(codec.COMMAND, struct.pack("<iHH", 0, 7, 500))
