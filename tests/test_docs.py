@@ -193,11 +193,6 @@ def test_the_table_of_symbols_has_the_nominal_values(name: str, value: str) -> N
     assert float(value) == pytest.approx(Model()[name], rel=2e-3)
 
 
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
-def test_the_catalogue_in_the_physics_page_is_complete(name: str) -> None:
-    assert f"| `{name}` | {CATALOGUE[name].port or 'base'} |" in PHYSICS
-
-
 def test_the_glossary_has_every_verdict() -> None:
     glossary = (ROOT / "docs" / "glossary.md").read_text()
     schemas = "".join(path.read_text() for path in (ROOT / "docs" / "schema").glob("*.json"))
