@@ -14,7 +14,7 @@ from rig.device import Abort, NmtState
 from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.node_objects import COUNTERS
-from rig.nodes.emulator import MISSED_LIMIT, Emulator
+from rig.nodes.emulator import COUNTERS, MISSED_LIMIT, Emulator
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (
     BusOff,
@@ -317,7 +317,7 @@ def test_a_plant_that_is_bus_off_moves_without_current_and_comes_back() -> None:
         desk.wait(MS)
     cycles = [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)]
     assert cycles == [*range(10), *range(30, 40)]
-    assert desk.node._current == 5e-3 and desk.node._counts["missing"] >= 20
+    assert desk.node._current == 5e-3 and desk.node._od[COUNTERS, 1] >= 20
     assert not [t_ns for t_ns, _, _ in desk.heard if 10 * MS <= t_ns < 30 * MS]
 
 
