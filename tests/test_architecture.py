@@ -87,7 +87,7 @@ CLOCK_FILES = (
     "studies/",
     "rig/bench/responders.py",  # waits for a node to boot
     "rig/network/", "rig/run/loop.py", "rig/run/priority.py", "rig/cli/commands/",
-    "rig/live/",  # a screen has a rate
+    "rig/view/live_",  # a screen has a rate
     "rig/recorder/",  # its thread must close a chunk in time
     "rig/view/viewer.py",  # waits for the viewer to come up
 )

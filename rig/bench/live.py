@@ -32,11 +32,11 @@ from fdi.report.report import Cell, Column, Item, Line, Mood, Report, Section, T
 from fdi.trace.trace import Trace
 from plant.errors import InputError, RigError
 from rig.bench.realtime import choose_priority, compute_percentiles
-from rig.live.viewer_feeder import make_viewer_command
 from rig.network.clock import WallClock
 from rig.network.raw_bus import can_open
 from rig.run.hard_loop import compile_cycle
 from rig.run.priority import list_cpus
+from rig.view.live_feeder import make_viewer_command
 from rig.view.viewer import find_free_port, is_listening, kill_viewer
 
 Seconds = NDArray[np.float64]

@@ -14,11 +14,11 @@ from rig.cli import options
 if TYPE_CHECKING:
     from fdi.progress import Progress
     from fdi.report.report import Report
-    from rig.live.live_process import ViewerPlace
     from rig.recorder import Record
     from rig.run.job import Job, JobChoice
     from rig.run.outcome import Outcome
     from rig.run.runner import Observe
+    from rig.view.live_process import ViewerPlace
 
 TERMINAL = "terminal"  # --live without a word
 
@@ -65,12 +65,12 @@ def run_command(args: argparse.Namespace) -> int:
     from plant import InputError
     from rig.cli.answer import show_answer
     from rig.cli.interruption import catch_signals
-    from rig.live.live_process import find_viewer_place
     from rig.network.clock import WallClock
     from rig.run.job import build_job, replace_settings
     from rig.run.outcome import diagnose_servovalve
     from rig.run.page_writer import PageWriter
     from rig.run.runner import run_job
+    from rig.view.live_process import find_viewer_place
 
     args.live, args.sequence = split_live(args.live, args.sequence)
     if args.max_overruns is not None and not 0 <= args.max_overruns <= 1:
@@ -179,9 +179,9 @@ def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> It
     if not is_live:
         yield announce_dead_node
         return
-    from rig.live.live_process import show_live
-    from rig.live.live_run import find_dead_node, make_live_plan
     from rig.recorder import Event
+    from rig.view.live_process import show_live
+    from rig.view.live_run import find_dead_node, make_live_plan
 
     deaths: list[Event] = []
     with show_live(make_live_plan(job.sequence, job.pace), last_cpu_is_taken=job.realtime, place=place) as feed:
@@ -199,8 +199,8 @@ def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> It
 
 def announce_dead_node(t_ns: int, record: Record) -> None:
     """Print a line on standard error, at once, when a node has died."""
-    from rig.live.live_run import find_dead_node
     from rig.recorder import Event
+    from rig.view.live_run import find_dead_node
 
     if isinstance(record, Event) and find_dead_node(record.level, record.kind, record.text):
         clear = "\r\033[K" if sys.stderr.isatty() else ""

@@ -1,9 +1,9 @@
-"""The program that feeds the viewer during a run, in a process of its own: `python -m rig.live.viewer_feeder NUMBER
+"""The program that feeds the viewer during a run, in a process of its own: `python -m rig.view.live_feeder NUMBER
 PORT FILE`.
 
 NUMBER is the file descriptor of the shared memory. PORT is that of an open viewer on 127.0.0.1, or 0; FILE is a
 recording to write, or empty; with neither, a viewer is opened, which stays open after the run. Standard input is as for
-`rig.live.dashboard`.
+`rig.view.live_dashboard`.
 """
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import sys
 import time
 from typing import Any
 
-from rig.live.dashboard import follow_run
-from rig.live.feed import LiveReader
-from rig.live.live_run import LivePlan, LiveRun
+from rig.view.live_dashboard import follow_run
+from rig.view.live_feed import LiveReader
+from rig.view.live_run import LivePlan, LiveRun
 from rig.view.viewer import find_free_port, is_listening
 
 _EVERY = 0.1  # s between two pieces
@@ -27,7 +27,7 @@ def feed_viewer(reader: LiveReader, plan: LivePlan, port: int, file: str) -> Non
     os.environ["RUST_LOG"] = "off"  # a viewer that is gone is one line of ours, not many of its library
     import rerun as rr
 
-    from rig.live.viewer_recording import LiveView, build_live_blueprint
+    from rig.view.live_recording import LiveView, build_live_blueprint
 
     viewer = None if port or file else open_empty_viewer(port := find_free_port())
     stream = rr.RecordingStream("eha-rig", recording_id=f"live-{os.getpid()}")

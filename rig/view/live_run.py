@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from plant import Columns
 from plant.segments import RATE
-from rig.live.feed import COLUMNS, Message
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.sequences import Sequence
 from rig.sequences.checks import Check
 from rig.sequences.measures import MAIN, RunData
+from rig.view.live_feed import COLUMNS, Message
 
 PHASES = ("set-up", "main", "clean-up")
 _COLUMN = {name: number for number, name in enumerate(COLUMNS)}

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from plant.segments import RATE
-from rig.live.live_run import CheckState, LiveRun
 from rig.network.node_objects import NAMES
+from rig.view.live_run import CheckState, LiveRun
 
 _WINDOW = 5 * RATE  # cycles of the plot
 _STYLES = {"PASS": "green", "FAIL": "bold red", "measures": "bold cyan", "waits": "dim", "after the run": "dim"}

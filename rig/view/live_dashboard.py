@@ -1,4 +1,4 @@
-"""The program that shows a run in the terminal, in a process of its own: `python -m rig.live.dashboard NUMBER`.
+"""The program that shows a run in the terminal, in a process of its own: `python -m rig.view.live_dashboard NUMBER`.
 
 NUMBER is the file descriptor of the shared memory. The plan of the run comes on standard input, which stays open as
 long as the rig runs: when it ends, however it ends, this program restores the terminal and ends too.
@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.live import Live
 
-from rig.live.feed import LiveReader, Message
-from rig.live.live_run import LivePlan, LiveRun
-from rig.live.screen import describe_line, draw_screen
+from rig.view.live_feed import LiveReader, Message
+from rig.view.live_run import LivePlan, LiveRun
+from rig.view.live_screen import describe_line, draw_screen
 
 _FRAME = 0.1  # s between two frames
 

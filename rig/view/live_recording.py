@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.live.feed import COLUMNS, Message
-from rig.live.live_run import CheckState, LivePlan, LiveRun
 from rig.network.node_objects import NAMES
+from rig.view.live_feed import COLUMNS, Message
+from rig.view.live_run import CheckState, LivePlan, LiveRun
 from rig.view.rerun_log import (
     ACTIVE,
     PLOTS,

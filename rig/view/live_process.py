@@ -15,8 +15,8 @@ from typing import NamedTuple
 from fdi.output import require_writable
 from plant.errors import InputError
 from rig.interrupts import ignore_interrupts
-from rig.live.feed import LiveFeed, make_shared_file
-from rig.live.live_run import LivePlan
+from rig.view.live_feed import LiveFeed, make_shared_file
+from rig.view.live_run import LivePlan
 from rig.view.viewer import is_listening
 
 
@@ -37,9 +37,9 @@ def show_live(plan: LivePlan, last_cpu_is_taken: bool, place: ViewerPlace | None
     with make_shared_file() as file:
         feed = LiveFeed(file.fileno())
         with ignore_interrupts():
-            program = ["rig.live.dashboard", str(file.fileno())]
+            program = ["rig.view.live_dashboard", str(file.fileno())]
             if place is not None:
-                program = ["rig.live.viewer_feeder", str(file.fileno()), str(place.port), str(place.file or "")]
+                program = ["rig.view.live_feeder", str(file.fileno()), str(place.port), str(place.file or "")]
             process = subprocess.Popen([sys.executable, "-m", *program],
                                        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
         try:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.live.feed import COLUMNS, MESSAGES, ROWS, LiveFeed, LiveReader, Message, make_shared_file
-from rig.live.live_run import LiveRun, find_dead_node, make_live_plan
-from rig.live.screen import describe_line, draw_screen
 from rig.recorder import Check, Event, NmtState, Signals, Timing
 from rig.sequences import load_sequence
+from rig.view.live_feed import COLUMNS, MESSAGES, ROWS, LiveFeed, LiveReader, Message, make_shared_file
+from rig.view.live_run import LiveRun, find_dead_node, make_live_plan
+from rig.view.live_screen import describe_line, draw_screen
 
 
 def add_cycle(feed: LiveFeed, k: int, xj: float = 0.0) -> None:

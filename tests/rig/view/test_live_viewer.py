@@ -16,7 +16,7 @@ from rig_command import rig
 
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.live.live_process import find_viewer_place
+from rig.view.live_process import find_viewer_place
 from rig.view.viewer import find_free_port, is_listening
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="pip install 'eha-rig[view]'")
