@@ -14,7 +14,7 @@ from rig.device import Abort, NmtState
 from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.node_objects import COUNTERS
-from rig.nodes.emulator import COUNTERS, MISSED_LIMIT, Emulator
+from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (
     BusOff,
