@@ -22,8 +22,8 @@ RESIDUAL_IS_NOISE = 1.08
 """RMS residual over noise up to which only noise is left; what is above is physics that the model lacks.
 
 The solver's error at the 20 steps a cycle of the last fits is up to 0.5 um beside 2 um of noise (docs/statistics.md):
-3 %. The noise itself is known to 3 % from one repeat (docs/compare.md). 317 of 320 fits of simulated units stayed
-below (docs/fdi.md)."""
+3 %. The noise itself is known to 3 % from one repeat (docs/statistics.md). 317 of 320 fits of simulated units stayed
+below (docs/statistics.md)."""
 
 SOLVER_ERROR_SHARE = 0.2
 """Share of the noise floor that the solver's error may reach: added in squares, a fifth makes 2 %.
@@ -160,7 +160,7 @@ DETECTABLE_MARGIN = 2.0
 """The size of an effect that counts as detectable, over the one that gains `GAIN_DETECTED`.
 
 Three margins were tried, 2, 2.6 and 3: of effects hidden at 1.5 times the size, 21 of 26, 22 of 25 and 20 of 26 were
-named. Wanted were nine of ten, so `rig explain` shows no sizes (docs/explain.md)."""
+named. Wanted were nine of ten, so `rig explain` shows no sizes (docs/statistics.md)."""
 
 WHITE_SQUARE_POOR = 1.02
 """Mean square of whitened residuals from which on a last fit is tried again from a healthy unit."""
@@ -296,7 +296,7 @@ FSS_INTERVAL_FACTOR = 1.1
 """Factor on the interval of FSS that the covariance gives: stick-slip and the solver's step add to it.
 
 Over 320 simulated cases the error was 1.14 standard deviations; with the factor 95.3 % of the intervals hold the true
-value, without it 91.3 % (docs/fdi.md)."""
+value, without it 91.3 % (docs/statistics.md)."""
 
 RESIDUAL_WORST = 5.0
 """RMS residual over noise, over all blocks, that a few stops of the ram at the wrong moment may leave.
@@ -307,7 +307,7 @@ with other effects has been begun elsewhere too and must do better (`FITTED_RUN_
 RESIDUAL_HOPELESS = {"xj": 7.0, "p12": 7.0, "xs": 2.0}
 """RMS residual over noise above which a fit does not start again elsewhere: something other than the faults is off.
 
-Of 80 units with Kintas 0.3 and more, five were judged only because such a fit starts again (docs/fdi.md)."""
+Of 80 units with Kintas 0.3 and more, five were judged only because such a fit starts again."""
 
 RESIDUAL_JUDGES_NOTHING = 1.5
 """RMS residual over noise above which a fit says nothing of any size: neither a level nor a suspect is reported."""
@@ -384,7 +384,7 @@ PACE_SCALE = 0.12
 """Scale of the logarithm of how much faster or slower a fault goes on than the fitted law (Student's t).
 
 Set so that 95 % of the intervals hold the true date in a simulated fleet whose faults follow other laws than the fitted
-ones; docs/trend.md scores other units."""
+ones; docs/statistics.md scores other units."""
 
 PACE_FREEDOM = 3.0
 """Degrees of freedom of that Student's t: one unit in a hundred changes its pace by more than a factor of two."""
@@ -472,10 +472,10 @@ DEPENDENCE_SHARE = 0.05
 IDENTIFIED_INTERVAL_FACTOR = 1.6
 """Factor on the standard deviation of an identified parameter: a fit ends somewhere in a rough valley.
 
-That of `EFFECT_INTERVAL_FACTOR`; with `IDENTIFIED_SYSTEMATIC_SD` it is checked by 20 trials (docs/identify.md)."""
+That of `EFFECT_INTERVAL_FACTOR`; with `IDENTIFIED_SYSTEMATIC_SD` it is checked by 20 trials (docs/statistics.md)."""
 
 IDENTIFIED_SYSTEMATIC_SD = 0.001
-"""Standard deviation, relative, that the solver's step adds to an identified parameter (docs/identify.md)."""
+"""Standard deviation, relative, that the solver's step adds to an identified parameter."""
 
 PILOT_FLOW_SYSTEMATIC_SD = 0.0015
 """The same for the pilot stage's flow gain.
@@ -487,7 +487,7 @@ was 0.13 % (RMS); with `IDENTIFIED_SYSTEMATIC_SD` three intervals missed."""
 STATIC_FRICTION_SYSTEMATIC_SD = 0.02
 """The same for the ram's static friction, which decides single stops: the fit may make one and miss the next.
 
-Its error was 0.4, 0.5, 0.6, 0.8 and 4.0 % in the first five trials (docs/identify.md)."""
+Its error was 0.4, 0.5, 0.6, 0.8 and 4.0 % in the first five trials."""
 
 FITTED_RUN_WORST = 1.3
 """RMS residual over noise of a fitted run, over all its blocks, above which an identification is only a part, and a
@@ -495,7 +495,7 @@ diagnosis beside other effects explains nothing: a search that has tried other s
 
 The typical block hides a few stops of the ram at the wrong moment; in a run that was fitted they mean that the fit
 ended in a local minimum. In trials with fresh seeds the two fits with 2.5 and 2.8 had frictions that were 5 to 13 %
-off; the others had at most 1.1 (docs/identify.md)."""
+off; the others had at most 1.1."""
 
 IDENTIFIABLE_SHARE = 0.2
 """Half the interval over half the range of the data sheet, up to which a parameter is identifiable from the runs."""
