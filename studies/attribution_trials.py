@@ -1,8 +1,8 @@
 """Stall or kill one process of the bench at a random moment, and count whom the run blames.
 
-    python studies/attribution_trials.py --trials 100 --out trials
-    python studies/attribution_trials.py --trials 100 --mixed --out trials
-    python studies/attribution_trials.py --trials 100 --mixed --stay --controller c --pace lockstep
+    python -m studies.attribution_trials --trials 100 --out trials
+    python -m studies.attribution_trials --trials 100 --mixed --out trials
+    python -m studies.attribution_trials --trials 100 --mixed --stay --controller c --pace lockstep
 
 Each trial is one `rig run` on the UDP bus with plant and controller as processes of their own. At a random cycle one of
 the three processes is stopped (SIGSTOP) for 2, 10 or 50 ms, or one of the nodes is killed (SIGKILL). A stall of the rig

@@ -1,4 +1,4 @@
-"""Print the tables of a campaign in Markdown, and draw its figure: python studies/fdi_statistics.py FOLDER ..
+"""Print the tables of a campaign in Markdown, and draw its figure: python -m studies.fdi_statistics FOLDER ..
 
 The first campaign gives all tables, further ones their rates only.
 """

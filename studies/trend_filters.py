@@ -1,6 +1,6 @@
 """Compare `rig trend` with two library filters on the same units: the table "Filters from libraries" in trend.md.
 
-    pip install progpy filterpy; OPENBLAS_NUM_THREADS=1 python studies/trend_filters.py [UNITS OF EACH LAW]
+    pip install progpy filterpy; OPENBLAS_NUM_THREADS=1 python -m studies.trend_filters [UNITS OF EACH LAW]
 
 Both filters estimate the state (size x, rate a, curvature c) with x' = a + c x. They take each interval as the noise of
 its trace, and let a and c wander. Sizes are scaled to 1 at MaxBand, time to 100 days.

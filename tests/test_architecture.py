@@ -68,7 +68,7 @@ ONLY_IN = {
     "rerun": ("rig/",),
     "rich": ("rig/", "fdi/report/"),
     "mcap": ("rig/", "fdi/"),
-    "matplotlib": ("fdi/", "rig/"),
+    "matplotlib": ("fdi/", "rig/", "studies/"),
     "jax": ("studies/",),
     "progpy": ("studies/",),
     "sklearn": ("studies/",),

@@ -25,7 +25,7 @@ from fdi.diagnosis.bands import (
 )
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Fault
 from fdi.diagnosis.precursors import Precursor
-from fdi.diagnosis.rms_grid import Grid
+from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
 from fdi.report.drawing import ABOVE, COMMAND, GREEN, INK, RED, STYLE, label_log_axis, thin_line, to_svg
 from fdi.thresholds import BAND_NEAREST_LIMIT_SD
 from fdi.trace.sections import Section, find_sections
@@ -35,6 +35,7 @@ Floats = NDArray[np.float64]
 
 AMBER, BLUE, SPEED = "#d9730d", "#1f6feb", "#0f8b8d"
 SHADES = {"middle": AMBER, "most": RED}
+MAP_CONTOURS = 7
 UM, MM, MS = 1e6, 1e3, 1e3
 ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
 FIT_MARKER: dict[str, Any] = {"marker": "o", "ms": 6}
@@ -214,3 +215,45 @@ def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
         ax.set_xlabel("shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")
         ax.legend(ncols=2, **ABOVE)
         return to_svg(figure, "telling")
+
+
+def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
+    """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
+
+    Args:
+        grid: from `fdi.diagnosis.rms_grid.search_grid`.
+        truth: the faults' sizes (Kintas, FSS in N), where they are known.
+    """
+    drawn = [(name, m, letter) for name, m, letter in (
+        ("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C")) if m]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(3.7 * len(drawn), 3.5), layout="constrained")
+        axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
+        for ax, (name, m, letter) in zip(axes, drawn, strict=True):
+            _draw_map(ax, grid, m, letter)
+            if m is grid.joint:
+                ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
+            ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}", fontsize=9)
+            ax.set_xlabel("Kintas")
+            if truth:
+                ax.plot(*truth, "X", color="white", ms=9, mec=INK, mew=0.8, label="injected")
+        if grid.step and grid.ramp:
+            for ax in axes[:2]:
+                ax.plot(*zip(LOWER_CORNER, UPPER_CORNER, strict=True), color="white", lw=0.8, ls="--")
+                ax.plot(grid.merged.kintas, grid.merged.fss, "D", color="#ffd33d", ms=5, mec=INK, label="G")
+        axes[0].set_ylabel("FSS [N]")
+        for ax in axes:
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=False)
+        return to_svg(figure, "maps")
+
+
+def _draw_map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
+    """One map as an image of its logarithm, with contours and its minimum."""
+    half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
+    box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
+    level: Any = np.log10(m.rms.T * 1e6)
+    ax.imshow(level, origin="lower", extent=box, aspect="auto", cmap="viridis", interpolation="none")
+    if min(level.shape) > 1:
+        ax.contour(grid.kintas, grid.fss, level, MAP_CONTOURS, colors="white", linewidths=0.4, alpha=0.6)
+    ax.plot(m.minimum.kintas, m.minimum.fss, "o", color=RED, ms=6, mec="white", label=letter)
+    ax.grid(False)

@@ -381,7 +381,7 @@ def _show_maps(d: Diagnosis) -> list[Item]:
         return []
 
     def draw() -> str:
-        from fdi.report.paper_figures import draw_maps
+        from fdi.report.diagnosis_figures import draw_maps
 
         return draw_maps(grid)
 

@@ -11,11 +11,12 @@ from fdi import Trace
 from fdi.diagnosis.bands import find_excursions
 from fdi.diagnosis.learn_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
-from fdi.report import paper_figures as figures
+from fdi.report.diagnosis_figures import draw_maps
 from plant import Model, simulate
 from plant.profile import build_profile
 from plant.segments import Chirp, Hold, Step
 from rig.sequences import load_sequence
+from studies import paper_figures as figures
 
 PREFLIGHT = load_sequence("preflight").main_profile().command
 
@@ -55,10 +56,10 @@ def test_a_trace_in_its_bands() -> None:
 
 def test_the_maps() -> None:
     grid = search_grid(trace(0.25, 30.0), sliding=(2.0 / 3.0,))
-    said = texts(figures.draw_maps(grid, truth=(0.25, 30.0)))
+    said = texts(draw_maps(grid, truth=(0.25, 30.0)))
     assert {"A", "B", "C", "G", "injected", "between cells", "Kintas", "FSS [N]"} <= said
     assert any(text.startswith("step sections: ") for text in said)
-    assert "injected" not in texts(figures.draw_maps(grid))
+    assert "injected" not in texts(draw_maps(grid))
 
 
 @pytest.mark.parametrize("cells", [1, 2, 5])
@@ -66,5 +67,5 @@ def test_maps_of_steps_alone_and_of_few_cells(cells: int) -> None:
     com = build_profile([Hold(time=0.3), Step(to=2e-3, time=0.8), Chirp(amplitude=1e-3, f0=1, f1=9, time=1)]).command
     measured = Trace.from_columns(simulate(Model(), com)._asdict(), 1e-3, {})
     grid = search_grid(measured, kintas=np.linspace(0.0, 0.4, cells), fss=np.linspace(0.0, 60.0, cells))
-    said = texts(figures.draw_maps(grid))
+    said = texts(draw_maps(grid))
     assert {"A", "C"} <= said and not {"B", "G"} & said

@@ -1,4 +1,4 @@
-"""Make the figures and tables of worked_cases.md: python docs/worked_cases.py (six runs, one minute)."""
+"""Make the figures and tables of worked_cases.md: python -m studies.worked_cases (six runs, one minute)."""
 from __future__ import annotations
 
 import subprocess
@@ -12,11 +12,12 @@ from fdi import Trace
 from fdi.diagnosis.bands import find_excursions
 from fdi.diagnosis.learn_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
-from fdi.report import paper_figures as figures
+from fdi.report.diagnosis_figures import draw_maps
 from fdi.report.drawing import shorten_svg
 from plant import Model, simulate
+from studies import paper_figures as figures
 
-HERE = Path(__file__).parent / "worked_cases"
+HERE = Path(__file__).parent.parent / "docs" / "worked_cases"
 RIG = [sys.executable, "-m", "rig.cli.main"]
 FSS_NC = 5.0  # N
 CASES = {"14": (0.25, 6 * FSS_NC), "15": (0.17, 9 * FSS_NC)}
@@ -82,7 +83,7 @@ def main() -> None:
     for number, kind, signal in (("10", "step", "position"), ("11", "ramp", "position"), ("12", "ramp", "speed")):
         save(number, figures.draw_bands(found, friction, bands, case, kind, signal))
     for number, trace in cases.items():
-        save(number, figures.draw_maps(search_grid(trace), CASES[number]))
+        save(number, draw_maps(search_grid(trace), CASES[number]))
         for drive in ("current", "command"):
             print(format_minima(f"{CASES[number][0]:g}, {CASES[number][1]:g} N", drive, trace))
     for drive in ("current", "command"):

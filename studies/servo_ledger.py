@@ -1,6 +1,6 @@
 """Fits the model of the real servo to one run, step by step, and prints the error on all runs after each step.
 
-    python docs/servo_ledger.py FOLDER [--out servo.toml] [--pictures FOLDER]
+    python -m studies.servo_ledger FOLDER [--out servo.toml] [--pictures FOLDER]
 
 FOLDER holds exp_data_3_4.csv.gz and the other runs as the rig's logger wrote them (docs/real_data.md). Only 3_4 is
 fitted: the steps of the flow to its position, those of the forces to its pressure.
@@ -43,7 +43,7 @@ DIFFERENCE = 0.02  # of a parameter's first value, for slopes
 # what follows another value: the runs do not tell static from dynamic friction; a chamber at rest has the pressure of
 # the return line
 TIED = {"jack.static_friction": "jack.dynamic_friction", "undissolved_air.preload": "pump.return_pressure"}
-HEAD = """# A real electro-hydrostatic position servo, fitted to one run by docs/servo_ledger.py: docs/real_data.md.
+HEAD = """# A real electro-hydrostatic position servo, fitted to one run by studies/servo_ledger.py: docs/real_data.md.
 # Nominal values and their units: plant/models/ehs.toml and plant/ehs.py.
 
 """
@@ -178,7 +178,7 @@ def write_model(rows: Sequence[LedgerRow], trace: Path, out: Path) -> None:
     model = replace(rows[-1].model, name="servo")
     ledger = tuple(Row(row.step.effect if row.step else None, select_signals(row.errors[FITTED]), {}) for row in rows)
     source = read_source(str(trace))._replace(file=trace.name)
-    known = Provenance(name_software(), ("python docs/servo_ledger.py FOLDER",), (), signals=("xj", "p12"),
+    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=("xj", "p12"),
                        trace=source, ledger=ledger)
     out.write_text(HEAD + format_model_file(model, {}, known), encoding="utf-8")
 

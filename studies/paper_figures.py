@@ -1,12 +1,11 @@
 """The paper's figures redrawn from runs of the rig, as SVG text that stands inside an HTML page.
 
 Figs. 7 and 8: what either fault does to a step and to a slow ramp. Figs. 10 to 12: a trace in the bands, position on a
-step, position on a ramp, speed on a ramp. Figs. 14 and 15: the RMS maps of the two worked cases.
+step, position on a ramp, speed on a ramp. The RMS maps, figs. 14 and 15, are those of `rig fdi`.
 """
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -15,7 +14,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fdi.diagnosis.bands import Bands, Excursion, StepBand
-from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
 from fdi.report.drawing import COMMAND, GREEN, INK, RED, STYLE, thin_line, to_svg
 from fdi.trace.sections import Section
 from fdi.trace.trace import Trace
@@ -23,7 +21,6 @@ from fdi.trace.trace import Trace
 Floats = NDArray[np.float64]
 COLOURS = ("#2b8a3e", "#d9730d", "#c93c37", "#1f6feb", "#8250df")
 AMBER = "#d9730d"
-LEVELS = 7  # contours
 LABELS = {("step", "position"): "position [mm]", ("ramp", "position"): "departure of\nposition [um]",
           ("ramp", "speed"): "departure of\nspeed [mm/s]"}  # of the bands' axes
 
@@ -151,46 +148,8 @@ def _draw_ramp_in_band(ax: Axes, trace: Trace, e: Excursion) -> None:
     ax.set_xlabel("time [s]")
 
 
-def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
-    """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
-
-    Args:
-        grid: from `fdi.diagnosis.rms_grid.search_grid`.
-        truth: the faults' sizes (Kintas, FSS in N), where they are known.
-    """
-    drawn = [(name, m, letter) for name, m, letter in (
-        ("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C")) if m]
-    with rc_context(STYLE):
-        figure = Figure(figsize=(3.7 * len(drawn), 3.5), layout="constrained")
-        axes = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
-        for ax, (name, m, letter) in zip(axes, drawn, strict=True):
-            _draw_map(ax, grid, m, letter)
-            if m is grid.joint:
-                ax.plot(grid.best.kintas, grid.best.fss, "*", color="#ffd33d", ms=9, mec=INK, label="between cells")
-            ax.set_title(f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}", fontsize=9)
-            ax.set_xlabel("Kintas")
-            if truth:
-                ax.plot(*truth, "X", color="white", ms=9, mec=INK, mew=0.8, label="injected")
-        if grid.step and grid.ramp:
-            for ax in axes[:2]:
-                ax.plot(*zip(LOWER_CORNER, UPPER_CORNER, strict=True), color="white", lw=0.8, ls="--")
-                ax.plot(grid.merged.kintas, grid.merged.fss, "D", color="#ffd33d", ms=5, mec=INK, label="G")
-        axes[0].set_ylabel("FSS [N]")
-        for ax in axes:
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=False)
-        return to_svg(figure, "maps")
 
 
-def _draw_map(ax: Axes, grid: Grid, m: Map, letter: str) -> None:
-    """One map as an image of its logarithm, with contours and its minimum."""
-    half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
-    box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
-    level: Any = np.log10(m.rms.T * 1e6)
-    ax.imshow(level, origin="lower", extent=box, aspect="auto", cmap="viridis", interpolation="none")
-    if min(level.shape) > 1:
-        ax.contour(grid.kintas, grid.fss, level, LEVELS, colors="white", linewidths=0.4, alpha=0.6)
-    ax.plot(m.minimum.kintas, m.minimum.fss, "o", color=RED, ms=6, mec="white", label=letter)
-    ax.grid(False)
 
 
 def _select_section(trace: Trace, kind: str, number: int) -> Section:
