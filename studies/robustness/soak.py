@@ -12,10 +12,11 @@ from rig.network.master import BusError
 from rig.run.job import Job
 from rig.run.runner import run_job
 from rig.sequences.sequence import parse_sequence
-from studies.robustness.disturb import SEQUENCE, find_processes, has_semaphores
+from studies.robustness.disturb import SEQUENCE, find_processes, has_semaphores, wait_until
 from studies.robustness.nodes import Usage, read_usage, start_nodes
 
 NO_ANSWER = "no answer"
+SETTLE = 5.0  # s
 
 
 class Soak(NamedTuple):
@@ -58,21 +59,26 @@ def soak_bench(minutes: float, group: str, pace: str = "lockstep", controller: s
     start: dict[str, Usage] = {}
     problems = []
     with tempfile.TemporaryDirectory(prefix="eha-rig-soak-") as place, start_nodes(bus, controller) as nodes:
-        while clock.now() < minutes * 60e9 or runs < 2:
+        while clock.now() < minutes * 60e9 or runs < 3:
             try:
                 outcome = run_job(job, Path(place) / "run", ignore_progress, lambda: False)
                 verdict, cycles = outcome.verdict, cycles + outcome.timing["cycles"]
             except BusError:  # a busy machine: the nodes did not answer in time
                 verdict = NO_ANSWER
             runs, verdicts[verdict] = runs + 1, verdicts.get(verdict, 0) + 1
-            if not start and clock.now() > minutes * 6e9:
+            if not start and runs >= 2 and clock.now() > minutes * 6e9:  # the first runs load what stays loaded
                 start = read_usage(nodes)
             progress("soak", min(1.0, clock.now() / (minutes * 60e9)))
-        end = read_usage(nodes)
+
+        def read_end() -> Soak:
+            return Soak(minutes, runs, cycles, verdicts, start, read_usage(nodes), ())
+
+        wait_until(lambda: not read_end().find_growth(), SETTLE)  # a thread of the last run may still be ending
+        soak = read_end()
     if verdicts.get(NO_ANSWER, 0) > 0.1 * runs:
         problems.append(f"in {verdicts[NO_ANSWER]} of {runs} runs the nodes did not answer in time")
     if find_processes(group):
         problems.append("processes are left")
     if has_semaphores(group):
         problems.append("semaphores are left")
-    return Soak(minutes, runs, cycles, verdicts, start or end, end, tuple(problems))
+    return soak._replace(problems=tuple(problems))
