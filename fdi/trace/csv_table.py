@@ -77,11 +77,11 @@ def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
         raise InputError(path, "", f"a place that can be written ({error.strerror})") from error
 
 
-def open_text(path: Path) -> io.TextIOBase:
+def open_text(path: Path, encoding: str = "utf-8-sig") -> io.TextIOBase:
     """A text file, unpacked if it is a `.gz`. Reading a `.gz` beyond its limit raises UnpackingError."""
     if path.suffix == ".gz":
-        return io.TextIOWrapper(io.BufferedReader(_LimitedGzip(path)), encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")
+        return io.TextIOWrapper(io.BufferedReader(_LimitedGzip(path)), encoding=encoding, newline="")
+    return path.open(encoding=encoding, newline="")
 
 
 class _LimitedGzip(io.RawIOBase):

@@ -12,13 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace.importing.formats import Channel, Measurement, require_channel
+from fdi.trace.importing.formats import Channel, Measurement
 from fdi.trace.importing.import_map import (
     REQUIRED_SIGNALS,
     ImportMap,
     SignalMap,
     SourceTerm,
-    TimeBase,
     compute_times,
     convert_to_si,
     require_growth,
@@ -26,7 +25,7 @@ from fdi.trace.importing.import_map import (
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
-from plant.errors import InputError
+from plant.errors import InputError, suggest_name
 
 Floats = NDArray[np.float64]
 
@@ -55,7 +54,6 @@ class Imported:
 
     trace: Trace
     signals: tuple[ImportedSignal, ...]
-    samples: int  # of the recording's fastest signal
     used: frozenset[str]  # columns of the recording that the map names
 
 
@@ -70,34 +68,29 @@ def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float
     Raises:
         InputError: a column, time or value that cannot be used.
     """
-    _require_sources(measurement, chosen)
     channels = _read_channels(measurement, chosen)
     samples = {name: _scale(measurement, chosen, signal, channels) for name, signal in chosen.signals.items()}
-    period = _choose_period(chosen, samples, cycle)
+    period = chosen.period or _measure_cycle(samples["xj"], cycle)
     rows = _make_rows(chosen, samples, period)
     columns, done, sensors = {}, [], {}
     for name, signal in chosen.signals.items():
-        placed = place_samples(samples[name], rows, period, signal.method, signal.low_pass,
-                               CYCLE_PARTS.get(name, ""))
-        columns[name] = placed.x
-        if np.isnan(placed.x).all():
+        own = samples[name]
+        x, how = place_samples(own, rows, period, signal.method, signal.low_pass, CYCLE_PARTS.get(name, ""))
+        if np.isnan(x).all():
             raise InputError(chosen.path, f"signals.{name}", "samples within the time of the other signals")
-        sensor, how = _find_sensor(signal, samples[name], rows, placed.how, period)
-        sensors[name] = sensor
-        done.append(ImportedSignal(name, _describe_source(signal), _describe_unit(signal), 1.0 / samples[name].period,
-                                   float(np.nanmin(placed.x)), float(np.nanmax(placed.x)), samples[name].gaps,
-                                   int(np.isnan(placed.x).sum()), how))
-    origin = {**describe_origin(measurement, chosen), "imported.start": repr(float(rows[0]))}
+        sensors[name], how = _find_sensor(signal, own, rows, how, period)
+        columns[name] = x
+        source = f"{signal.term.source} - {signal.minus.source}" if signal.minus else signal.term.source
+        done.append(ImportedSignal(name, source, _describe_unit(signal.term), 1.0 / own.period,
+                                   float(np.nanmin(x)), float(np.nanmax(x)),
+                                   int((np.diff(own.t) > 1.5 * own.period).sum()), int(np.isnan(x).sum()), how))
+    origin = {"imported": measurement.path.name, "imported.sha256": hash_file(measurement.path),
+              "imported.format": measurement.format, "imported.map": chosen.path.name,
+              "imported.map_sha256": hashlib.sha256(chosen.text.encode()).hexdigest(),
+              "imported.start": repr(float(rows[0]))}
     trace = replace(Trace.from_columns(columns, period, origin),
                     sensors={name: sensor for name, sensor in sensors.items() if not sensor.is_ideal})
-    return Imported(trace, tuple(done), max(len(s.t) for s in samples.values()), frozenset(channels))
-
-
-def describe_origin(measurement: Measurement, chosen: ImportMap) -> dict[str, str]:
-    """Where a trace comes from: file, its hash and format, and the map with its hash."""
-    return {"imported": measurement.path.name, "imported.sha256": hash_file(measurement.path),
-            "imported.format": measurement.format, "imported.map": chosen.path.name,
-            "imported.map_sha256": hashlib.sha256(chosen.text.encode()).hexdigest()}
+    return Imported(trace, tuple(done), frozenset(channels))
 
 
 def hash_file(path: Path) -> str:
@@ -106,35 +99,28 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _list_terms(signal: SignalMap) -> list[SourceTerm]:
-    return [signal.term, *([signal.minus] if signal.minus else [])]
-
-
-def _time_of(measurement: Measurement, chosen: ImportMap, signal: SignalMap) -> TimeBase | None:
-    """The time base of a signal; None for the channel's own times."""
-    base = signal.time or chosen.time
-    if base is None and not measurement.has_times:
-        raise InputError(chosen.path, "time", "a table with source (a column) or rate (rows a second)")
-    return base
-
-
-def _require_sources(measurement: Measurement, chosen: ImportMap) -> None:
-    if chosen.time and chosen.time.source:
-        require_channel(measurement, chosen.time.source, chosen.path, "time.source")
-    for name, signal in chosen.signals.items():
-        require_channel(measurement, signal.term.source, chosen.path, f"signals.{name}.source")
-        if signal.minus:
-            require_channel(measurement, signal.minus.source, chosen.path, f"signals.{name}.minus.source")
-        if signal.time and signal.time.source:
-            require_channel(measurement, signal.time.source, chosen.path, f"signals.{name}.time.source")
-
-
 def _read_channels(measurement: Measurement, chosen: ImportMap) -> Mapping[str, Channel]:
-    """All channels that the map names, read at once."""
-    bases = [base for base in (chosen.time, *(s.time for s in chosen.signals.values())) if base and base.source]
-    names = [term.source for signal in chosen.signals.values() for term in _list_terms(signal)]
-    dates = [str(base.source) for base in bases if base.unit is None and base.bits is None]
-    return measurement.read(list(dict.fromkeys([*names, *(str(base.source) for base in bases)])), dates)
+    """All channels that the map names, read at once.
+
+    Raises:
+        InputError: a name that is no channel of the recording, with the field of the map and the nearest channel.
+    """
+    bases = {"time": chosen.time}
+    wanted = {}  # field of the map: channel
+    for name, signal in chosen.signals.items():
+        bases[f"signals.{name}.time"] = signal.time
+        wanted[f"signals.{name}.source"] = signal.term.source
+        if signal.minus:
+            wanted[f"signals.{name}.minus.source"] = signal.minus.source
+    timed = {field: base for field, base in bases.items() if base and base.source}
+    wanted |= {f"{field}.source": str(base.source) for field, base in timed.items()}
+    for field, name in wanted.items():
+        if name not in measurement.units:
+            shown = ", ".join(list(measurement.units)[:12]) + (", .." if len(measurement.units) > 12 else "")
+            raise InputError(chosen.path, field, f"a column of {measurement.path.name} ({shown}), not {name!r}"
+                                                 f"{suggest_name(name, measurement.units)}")
+    return measurement.read(list(dict.fromkeys(wanted.values())),
+                            [str(base.source) for base in timed.values() if base.unit is None and base.bits is None])
 
 
 def _scale(measurement: Measurement, chosen: ImportMap, signal: SignalMap, channels: Mapping[str, Channel]) -> Samples:
@@ -142,36 +128,34 @@ def _scale(measurement: Measurement, chosen: ImportMap, signal: SignalMap, chann
     channel = channels[signal.term.source]
     x = _convert(channel.values, signal.term)
     t = _find_times(measurement, chosen, signal, channel, channels)
+    t = t - signal.delay if signal.delay else t
     if signal.minus:
         other = channels[signal.minus.source]
         if len(other.values) != len(x) or (other.t is not None and channel.t is not None
                                               and not np.array_equal(other.t, channel.t)):
             raise InputError(chosen.path, f"signals.{signal.name}.minus", "a channel with the same times")
         x = x - _convert(other.values, signal.minus)
-    t = t - signal.delay if signal.delay else t
     there = ~np.isnan(x)
     for first, last in signal.dead:
-        there &= ~((t >= first) & (t <= last))
+        there &= (t < first) | (t > last)
     if there.sum() < 2:
         reason = "it is marked dead; leave it out of the map" if signal.dead else f"it has {int(there.sum())}"
         raise InputError(measurement.path, signal.term.source, f"at least two values; {reason}")
-    if there.all():
-        return Samples(t, x)
-    return Samples(t[there], x[there])
+    return Samples(t, x) if there.all() else Samples(t[there], x[there])
 
 
 def _convert(values: Floats, term: SourceTerm) -> Floats:
-    s = term.scaling
-    x = values if s.scale == 1.0 and s.offset == 0.0 else s.scale * values + s.offset
-    x = convert_to_si(x, s.unit)
-    return x if s.sign > 0 else 0.0 - x
+    x = values if term.scale == 1.0 and term.offset == 0.0 else term.scale * values + term.offset
+    x = convert_to_si(x, term.unit)
+    return x if term.sign > 0 else 0.0 - x
 
 
 def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, channel: Channel,
                 channels: Mapping[str, Channel]) -> Floats:
-    base = _time_of(measurement, chosen, signal)
+    base = signal.time or chosen.time
     if base is None:
-        assert channel.t is not None  # has_times
+        if channel.t is None:
+            raise InputError(chosen.path, "time", "a table with source (a column) or rate (rows a second)")
         require_growth(channel.t, measurement.path, signal.term.source)
         return channel.t
     column = channels[base.source].values if base.source else None
@@ -181,13 +165,15 @@ def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, 
     return compute_times(base, len(channel.values), column, measurement.path, base.source or "rate")
 
 
-def _choose_period(chosen: ImportMap, samples: Mapping[str, Samples], cycle: float) -> float:
-    """The map's, else the model's cycle, or the period of XJ if that is longer."""
-    if chosen.period is not None:
-        return chosen.period
-    own = samples["xj"]
+def _measure_cycle(own: Samples, cycle: float) -> float:
+    """The model's cycle, or the period of XJ if that is longer; as the recording's own clock has it if that drifts."""
     nominal = cycle if own.period < 1.25 * cycle else round(own.period, 6)
-    return measure_period(own, nominal)
+    rows = float(np.rint(np.diff(own.t) / own.period).sum())
+    mean = float(own.t[-1] - own.t[0]) / rows
+    ratio = max(1, round(nominal / mean)) if mean < nominal else 1
+    if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP:
+        return nominal
+    return round(mean * ratio, 9)
 
 
 def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
@@ -238,16 +224,11 @@ def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, pe
     return sensor, "; ".join(parts)
 
 
-def _describe_source(signal: SignalMap) -> str:
-    return " - ".join(term.source for term in _list_terms(signal))
-
-
-def _describe_unit(signal: SignalMap) -> str:
-    s = signal.term.scaling
+def _describe_unit(s: SourceTerm) -> str:
     sign = "-" if s.sign < 0 else ""
     scale = f"{s.scale:g} " if s.scale != 1.0 else ""
-    offset = f" {s.offset:+g} {s.unit_name}" if s.offset else ""
-    return f"{sign}{scale}{s.unit_name}{offset}"
+    offset = f" {s.offset:+g} {s.unit.name}" if s.offset else ""
+    return f"{sign}{scale}{s.unit.name}{offset}"
 
 
 SLIP = 0.4  # of a row: two clocks that drift apart by less over the recording are the same
@@ -266,29 +247,6 @@ class Samples(NamedTuple):
         """The usual time between two samples, s."""
         return float(np.percentile(np.diff(self.t), 50, method="lower"))
 
-    @property
-    def gaps(self) -> int:
-        """Places where samples are missing."""
-        return int((np.diff(self.t) > 1.5 * self.period).sum())
-
-
-class Placed(NamedTuple):
-    """A channel on the rows of a trace, NaN where there is none, and how it came there."""
-
-    x: Floats
-    how: str
-
-
-def measure_period(samples: Samples, nominal: float) -> float:
-    """The period of samples, s: `nominal` if the two do not drift apart over the recording, else to 9 digits."""
-    steps = np.rint(np.diff(samples.t) / samples.period)
-    rows = float(steps.sum())
-    mean = float(samples.t[-1] - samples.t[0]) / rows
-    ratio = max(1, round(nominal / mean)) if mean < nominal else 1
-    if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP:
-        return nominal
-    return round(mean * ratio, 9)
-
 
 def find_hold(samples: Samples, ratio: int) -> int | None:
     """Which of so many samples brings a new value, 0 for the first; None if more than one does."""
@@ -301,8 +259,8 @@ def find_hold(samples: Samples, ratio: int) -> int | None:
 
 
 def place_samples(samples: Samples, rows: Floats, period: float, method: str, low_pass: bool | None,
-                  cycle_part: str) -> Placed:
-    """The channel at the times `rows` (n,), s, one a `period`.
+                  cycle_part: str) -> tuple[Floats, str]:
+    """The channel at the times `rows` (n,), s, one a `period`, NaN where there is none; and how it came there.
 
     Args:
         samples: the channel.
@@ -315,8 +273,7 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
     """
     ratio = period / samples.period
     whole = round(ratio)
-    slip = abs(ratio / whole - 1.0) * len(rows) if whole >= 1 else math.inf
-    is_whole = whole >= 1 and slip < 0.5 * max(whole, 1) + 0.01 * len(rows)
+    is_whole = whole >= 1 and abs(ratio / whole - 1.0) * len(rows) < 0.5 * whole + 0.01 * len(rows)
     if method in ("auto", "samples") and whole == 1 and is_whole:
         placed = _place_each(samples, rows, period)
         if placed is not None:
@@ -324,21 +281,16 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
     if method in ("auto", "samples") and whole > 1 and is_whole:
         return _pick(samples, rows, period, whole, low_pass, cycle_part)
     if method == "samples":
-        return _place_nearest(samples, rows, 0.5 * period)
+        return _place_nearest(samples, rows, 0.5 * period), "nearest sample"
+    apart = f"{1e3 * samples.period:.4g} ms apart"
     if method == "hold" or (method == "auto" and cycle_part and _is_stepwise(samples)):
-        return _hold(samples, rows)
-    filtered, note = samples, ""
+        return _hold(samples, rows), f"last sample, {apart}"
     if ratio > 1.5 and low_pass is not False:
-        filtered, note = _filter(samples, ratio), "low-pass filtered, "
-    note += f"straight lines between samples {_format_ms(samples.period)} apart"
-    return Placed(_interpolate(filtered, rows), note)
+        return _interpolate(_filter(samples, ratio), rows), f"low-pass filtered, straight lines between samples {apart}"
+    return _interpolate(samples, rows), f"straight lines between samples {apart}"
 
 
-def _format_ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.4g} ms"
-
-
-def _place_each(samples: Samples, rows: Floats, period: float) -> Placed | None:
+def _place_each(samples: Samples, rows: Floats, period: float) -> tuple[Floats, str] | None:
     """Each sample on the row next to it, whatever its place in the cycle; None if two would share a row."""
     turns = np.exp(2j * np.pi * (samples.t - rows[0]) / period)
     phase = float(np.angle(turns.mean())) / (2 * np.pi) * period
@@ -349,40 +301,35 @@ def _place_each(samples: Samples, rows: Floats, period: float) -> Placed | None:
     out = np.full(len(rows), math.nan)
     out[place[inside]] = samples.x[inside]
     where = f", {1e3 * phase:+.2f} ms from the row" if abs(phase) > 0.05 * period else ""
-    return Placed(out, f"as recorded{where}")
+    return out, f"as recorded{where}"
 
 
-def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str) -> Placed:
+def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str
+          ) -> tuple[Floats, str]:
     """Every so many samples; those of a held signal where its new value is."""
     held = find_hold(samples, ratio)
     how = f"every {_format_ordinal(ratio)} sample"
     if held is not None:
         own = (samples.t[0] + held * samples.period - rows[0]) % period
         own = 0.0 if own > period - 0.25 * samples.period else own
-        shift = 0.0
-        if cycle_part == "answer":
-            shift = own
-        elif cycle_part == "demand" and own:
-            shift = own - period
-        return Placed(_place_nearest(samples, rows + shift, 0.6 * samples.period).x,
-                      f"{how}; the signal is held for {ratio}")
+        shift = {"answer": own, "demand": own - period if own else 0.0}.get(cycle_part, 0.0)
+        return _place_nearest(samples, rows + shift, 0.6 * samples.period), f"{how}; the signal is held for {ratio}"
     if low_pass is None:
         low_pass = not cycle_part and _measure_folded_share(samples, ratio) > FOLDED_SHARE
     if low_pass:
         samples, how = _filter(samples, ratio), f"low-pass filtered, {how}"
-    return Placed(_place_nearest(samples, rows, 0.6 * samples.period).x, how)
+    return _place_nearest(samples, rows, 0.6 * samples.period), how
 
 
 def _format_ordinal(n: int) -> str:
     return f"{n}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(n if n < 20 else n % 10, 'th')}"
 
 
-def _place_nearest(samples: Samples, rows: Floats, reach: float) -> Placed:
+def _place_nearest(samples: Samples, rows: Floats, reach: float) -> Floats:
     """The sample nearest to each row, if it is within `reach`, s."""
     after = np.clip(np.searchsorted(samples.t, rows), 1, len(samples.t) - 1)
     nearest = np.where(rows - samples.t[after - 1] <= samples.t[after] - rows, after - 1, after)
-    apart = np.abs(samples.t[nearest] - rows)
-    return Placed(np.where(apart <= reach, samples.x[nearest], math.nan), "nearest sample")
+    return np.where(np.abs(samples.t[nearest] - rows) <= reach, samples.x[nearest], math.nan)
 
 
 def _is_stepwise(samples: Samples) -> bool:
@@ -390,11 +337,11 @@ def _is_stepwise(samples: Samples) -> bool:
     return len(samples.x) > 10 and float(np.mean(np.diff(samples.x) == 0.0)) > 0.5
 
 
-def _hold(samples: Samples, rows: Floats) -> Placed:
+def _hold(samples: Samples, rows: Floats) -> Floats:
     before = np.searchsorted(samples.t, rows + 1e-9, side="right") - 1
-    x = samples.x[np.clip(before, 0, None)]
-    late = rows - samples.t[np.clip(before, 0, None)] > 1.5 * samples.period
-    return Placed(np.where((before < 0) | late, math.nan, x), f"last sample, {_format_ms(samples.period)} apart")
+    held = np.clip(before, 0, None)
+    late = rows - samples.t[held] > 1.5 * samples.period
+    return np.where((before < 0) | late, math.nan, samples.x[held])
 
 
 def _interpolate(samples: Samples, rows: Floats) -> Floats:
@@ -407,23 +354,17 @@ def _interpolate(samples: Samples, rows: Floats) -> Floats:
     return np.where(lost & ~exact, math.nan, np.interp(rows, samples.t, samples.x))
 
 
-def _design_low_pass(ratio: float) -> Floats:
-    """Symmetric low-pass of unit gain: -6 dB at 0.8 of the rows' Nyquist frequency, Hamming window."""
-    half = round(8 * ratio)
-    k = np.arange(-half, half + 1)
-    taps = np.sinc(0.8 * k / ratio) * np.hamming(2 * half + 1)
-    out: Floats = taps / taps.sum()
-    return out
-
-
 def _filter(samples: Samples, ratio: float) -> Samples:
-    """The channel without what lies above the rows' Nyquist frequency, not shifted in time; each piece for itself."""
-    taps = _design_low_pass(ratio)
-    half = len(taps) // 2
+    """The channel without what lies above the rows' Nyquist frequency, not shifted in time; each piece for itself.
+
+    The filter is symmetric, of unit gain, with -6 dB at 0.8 of that frequency and a Hamming window.
+    """
+    half = round(8 * ratio)
+    taps = np.sinc(0.8 * np.arange(-half, half + 1) / ratio) * np.hamming(2 * half + 1)
+    taps /= taps.sum()
     edges = [0, *(np.flatnonzero(np.diff(samples.t) > 1.5 * samples.period) + 1).tolist(), len(samples.t)]
-    pieces = []
-    for first, stop in pairwise(edges):
-        pieces.append(np.convolve(np.pad(samples.x[first:stop], half, "edge"), taps, "valid"))
+    pieces = [np.convolve(np.pad(samples.x[first:stop], half, "edge"), taps, "valid")
+              for first, stop in pairwise(edges)]
     return Samples(samples.t, np.concatenate(pieces))
 
 

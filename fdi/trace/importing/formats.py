@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import gzip
 import importlib
 import io
 import itertools
@@ -13,6 +12,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
@@ -24,12 +24,11 @@ from fdi.trace.csv_table import open_text, report_unreadable
 from fdi.trace.importing.import_map import OTHER_UNITS, find_unit
 from fdi.trace.signals import SIGNALS
 from fdi.trace.trace import Trace
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError
 
 Floats = NDArray[np.float64]
 
 TEXT_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".gz")
-SUFFIXES = (*TEXT_SUFFIXES, ".mf4", ".mdf", ".mat", ".parquet", ".mcap")
 
 
 def open_measurement(path: Path, separator: str | None = None, decimal: str | None = None,
@@ -39,20 +38,14 @@ def open_measurement(path: Path, separator: str | None = None, decimal: str | No
     Raises:
         InputError: a file that cannot be read, another format, or a package that is not installed.
     """
-    if path.suffix != ".mcap" and not path.is_file():
-        raise InputError(path, "", "a readable file" + ("" if path.exists() else "; it does not exist"))
     suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(path, "", f"a file that ends in {', '.join(SUFFIXES)}")
+    if suffix != ".mcap" and not path.is_file():
+        raise InputError(path, "", "a readable file" + ("" if path.exists() else "; it does not exist"))
     if suffix in TEXT_SUFFIXES:
         return open_text_table(path, separator, decimal, name_line)
-    if suffix in (".mf4", ".mdf"):
-        return _open_mdf(path)
-    if suffix == ".mat":
-        return _open_mat(path)
-    if suffix == ".parquet":
-        return _open_parquet(path)
-    if suffix == ".mcap":
-        return _open_log(path)
-    raise InputError(path, "", f"a file that ends in {', '.join(SUFFIXES)}")
+    return READERS[suffix](path)
 
 
 def _import_reader(name: str, path: Path) -> ModuleType:
@@ -80,73 +73,58 @@ def _as_floats(path: Path, name: str, values: Any) -> Floats:
 
 def _open_log(path: Path) -> Measurement:
     trace = Trace.read(path)
-    names = ("t", *trace.signals)
-    return ArrayMeasurement(path, f"trace of {trace.provenance.get('version.eha-rig', 'this software')}",
-                            {name: SIGNALS[name].unit for name in names},
-                            {name: Channel(trace.column(name)) for name in names})
+    units = {name: SIGNALS[name].unit for name in ("t", *trace.signals)}
+    return ChannelReader(path, f"trace of {trace.provenance.get('version.eha-rig', 'this software')}", units,
+                         lambda name: Channel(trace.column(name)))
 
 
-@dataclass(frozen=True)
-class MdfMeasurement:
-    """An MDF file of version 3 or 4; each channel group has its own times."""
+def _open_with(path: Path, kind: str, reader: Callable[[Path], Any]) -> Any:
+    """What a package's reader makes of a file.
 
-    path: Path
-    format: str
-    units: Mapping[str, str]
-    places: Mapping[str, tuple[str, int, int]]  # name, group, index
-    file: Any
-    has_times: bool = True
-
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The channels, in physical values."""
-        out = {}
-        for name in names:
-            signal = self.file.get(*self.places[name], ignore_invalidation_bits=False)
-            values = _as_floats(self.path, name, signal.samples)
-            invalid = getattr(signal, "invalidation_bits", None)
-            if invalid is not None and np.any(invalid):
-                values[np.asarray(invalid, bool)] = np.nan
-            out[name] = Channel(values, np.asarray(signal.timestamps, np.float64))
-        return out
+    Raises:
+        InputError: a damaged file, for which the packages raise errors of many kinds.
+    """
+    try:
+        return reader(path)
+    except Exception as error:
+        raise InputError(path, "", f"{kind} ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 
 def _open_mdf(path: Path) -> Measurement:
-    asammdf = _import_reader("asammdf", path)
-    try:
-        file = asammdf.MDF(path)
-    except Exception as error:  # the package raises errors of many kinds for damaged files
-        raise InputError(path, "", f"an MDF file ({str(error).splitlines()[0] if str(error) else error!r})") from error
-    places: dict[str, tuple[str, int, int]] = {}
-    units: dict[str, str] = {}
+    """An MDF file of version 3 or 4; each channel group has its own times."""
+    file = _open_with(path, "an MDF file", _import_reader("asammdf", path).MDF)
+    places: dict[str, tuple[str, int, int]] = {}  # name, group, index
     for name, where in file.channels_db.items():
         for group, index in where:
-            if file.masters_db.get(group) == index:
-                continue
-            label = name if len(where) == 1 else f"{name} (group {group})"
-            places[label] = (name, group, index)
-            channel = file.groups[group].channels[index]
-            conversion = getattr(channel, "conversion", None)
-            units[label] = getattr(channel, "unit", "") or getattr(conversion, "unit", "") or ""
+            if file.masters_db.get(group) != index:
+                places[name if len(where) == 1 else f"{name} (group {group})"] = name, group, index
     if not places:
         raise InputError(path, "", "an MDF file with at least one channel")
-    order = sorted(places, key=lambda label: places[label][1:])
-    return MdfMeasurement(path, f"MDF {file.version}", {label: units[label] for label in order}, places, file)
+
+    def read(label: str) -> Channel:
+        signal = file.get(*places[label], ignore_invalidation_bits=False)
+        values = _as_floats(path, label, signal.samples)
+        if signal.invalidation_bits is not None:
+            values[np.asarray(signal.invalidation_bits, bool)] = np.nan
+        return Channel(values, np.asarray(signal.timestamps, np.float64))
+
+    units = {}
+    for label, (_, group, index) in sorted(places.items(), key=lambda place: place[1][1:]):
+        channel = file.groups[group].channels[index]
+        units[label] = getattr(channel, "unit", "") or getattr(channel.conversion, "unit", "") or ""
+    return ChannelReader(path, f"MDF {file.version}", units, read, has_times=True)
 
 
 def _open_mat(path: Path) -> Measurement:
     from scipy.io import loadmat
 
-    try:
-        content = loadmat(path, squeeze_me=True, struct_as_record=False)
-    except NotImplementedError:
-        raise InputError(path, "", "a MAT file of version 5 to 7.2; in MATLAB: save FILE.mat -v7") from None
-    except Exception as error:  # the reader raises errors of many kinds for damaged files
-        raise InputError(path, "", f"a MAT file ({' '.join(str(error).split()) or type(error).__name__})") from error
+    content = _open_with(path, "a MAT file of version 5 to 7.2, as save -v7 writes it",
+                         partial(loadmat, squeeze_me=True, struct_as_record=False))
     columns = dict(_flatten({name: value for name, value in content.items() if not name.startswith("__")}))
     if not columns:
         raise InputError(path, "", "a MAT file with at least one vector of numbers")
-    channels = {name: Channel(_as_floats(path, name, values)) for name, values in columns.items()}
-    return ArrayMeasurement(path, "MAT", {name: split_unit(name)[1] for name in columns}, channels)
+    return ChannelReader(path, "MAT", {name: split_unit(name)[1] for name in columns},
+                         lambda name: Channel(_as_floats(path, name, columns[name])))
 
 
 def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
@@ -162,40 +140,26 @@ def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
                 yield from ((f"{label}(:,{i + 1})", value[:, i]) for i in range(value.shape[1]))
 
 
-@dataclass(frozen=True)
-class ParquetMeasurement:
-    """A Parquet file; of its columns only those asked for are read."""
-
-    path: Path
-    format: str
-    units: Mapping[str, str]
-    file: Any
-    has_times: bool = False
-
-    def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
-        """The columns; nulls are missing values, timestamps are seconds since the first."""
-        table = self.file.read(columns=list(names))
-        out = {}
-        for name in names:
-            values = table.column(name).to_numpy(zero_copy_only=False)
-            if values.dtype.kind == "M":
-                values = (values - values[0]) / np.timedelta64(1, "ns") * 1e-9
-            out[name] = Channel(_as_floats(self.path, name, values))
-        return out
-
-
 def _open_parquet(path: Path) -> Measurement:
-    parquet = _import_reader("pyarrow.parquet", path)
-    try:
-        file = parquet.ParquetFile(path)
-    except Exception as error:  # the package raises errors of many kinds for damaged files
-        raise InputError(path, "", f"a Parquet file ({' '.join(str(error).split())})") from error
+    """A Parquet file; nulls are missing values, timestamps are seconds since the first."""
+    file = _open_with(path, "a Parquet file", _import_reader("pyarrow.parquet", path).ParquetFile)
+
+    def read(name: str) -> Channel:
+        values = file.read(columns=[name]).column(name).to_numpy(zero_copy_only=False)
+        if values.dtype.kind == "M":
+            values = (values - values[0]) / np.timedelta64(1, "ns") * 1e-9
+        return Channel(_as_floats(path, name, values))
+
     units = {}
     for column in file.schema_arrow:
         said = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
         units[column.name] = "s" if str(column.type).startswith("timestamp") else said or split_unit(column.name)[1]
-    return ParquetMeasurement(path, "Parquet", units, file)
+    return ChannelReader(path, "Parquet", units, read)
 
+
+READERS: Mapping[str, Callable[[Path], Measurement]] = {".mf4": _open_mdf, ".mdf": _open_mdf, ".mat": _open_mat,
+                                                        ".parquet": _open_parquet, ".mcap": _open_log}
+SUFFIXES = (*TEXT_SUFFIXES, *READERS)
 
 ENCODINGS = "UTF-8, UTF-16 or Latin-1"  # that text tables may have
 SEPARATORS = (";", "\t", "|", ",", " ")
@@ -249,7 +213,7 @@ class TextTable:
         appends = [(i, name, columns[name].append, _parse_date if name in dates else parse_number)
                    for i, name in places]
         width = len(self.layout.names)
-        with report_unreadable(self.path, ENCODINGS), _open(self.path, self.layout.encoding) as stream:
+        with report_unreadable(self.path, ENCODINGS), open_text(self.path, self.layout.encoding) as stream:
             for line, fields in _split_rows(stream, self.layout):
                 if len(fields) != width and not _is_padded(fields, width):
                     raise InputError(f"{self.path}: line {line}", "", f"{width} fields, not {len(fields)}")
@@ -273,7 +237,7 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
     """
     with report_unreadable(path, ENCODINGS):
         encoding = _find_encoding(path)
-        with _open(path, encoding) as stream:
+        with open_text(path, encoding) as stream:
             lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
     separator, decimal = _find_separators(path, lines, separator, decimal)
     rows = [_split_line(line, separator) for line in lines]
@@ -308,8 +272,8 @@ def _is_unit(text: str) -> bool:
 
 def _find_encoding(path: Path) -> str:
     """By the byte order mark, else UTF-8 if the first 64 KiB are, else Latin-1."""
-    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as stream:
-        start = stream.read(65536)
+    with open_text(path, "latin-1") as stream:
+        start = stream.read(65536).encode("latin-1")
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     if b"\0" in start:
@@ -319,19 +283,6 @@ def _find_encoding(path: Path) -> str:
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8-sig"
-
-
-def _open(path: Path, encoding: str) -> io.TextIOBase:
-    if path.suffix == ".gz":
-        return open_text(path) if encoding == "utf-8-sig" else _reopen_gzip(path, encoding)
-    return path.open(encoding=encoding, newline="")
-
-
-def _reopen_gzip(path: Path, encoding: str) -> io.TextIOBase:
-    stream = open_text(path)
-    assert isinstance(stream, io.TextIOWrapper)
-    stream.reconfigure(encoding=encoding)
-    return stream
 
 
 def _is_comment(line: str) -> bool:
@@ -525,28 +476,16 @@ class Measurement(Protocol):
 
 
 @dataclass(frozen=True)
-class ArrayMeasurement:
-    """A recording that is in memory as arrays."""
+class ChannelReader:
+    """A recording of which one channel is read at a time."""
 
     path: Path
     format: str
     units: Mapping[str, str]
-    channels: Mapping[str, Channel]
+    read_channel: Callable[[str], Channel]
     has_times: bool = False
 
     def read(self, names: Collection[str], dates: Collection[str] = ()) -> dict[str, Channel]:
         """The channels of these names."""
-        return {name: self.channels[name] for name in names}
+        return {name: self.read_channel(name) for name in names}
 
-
-def require_channel(measurement: Measurement, name: str, where: object, field: str) -> None:
-    """Refuse a name that is no channel of the recording.
-
-    Raises:
-        InputError: it names the field of the map and the nearest channel.
-    """
-    if name not in measurement.units:
-        shown = list(measurement.units)[:12]
-        more = ", .." if len(measurement.units) > len(shown) else ""
-        raise InputError(where, field, f"a column of {measurement.path.name} ({', '.join(shown)}{more}), "
-                                       f"not {name!r}{suggest_name(name, measurement.units)}")

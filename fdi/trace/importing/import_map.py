@@ -2,8 +2,7 @@
 from __future__ import annotations
 
 import math
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -15,28 +14,23 @@ from numpy.typing import NDArray
 from fdi.trace.sensor_dynamics import SensorDynamics
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError, suggest_name
+from plant.parameters import parse_toml
+
+Floats = NDArray[np.float64]
 
 REQUIRED_SIGNALS = ("com", "xj", "cor")
 SIGNAL_NAMES = tuple(name for name in SIGNALS if name != "t")
 
 
 @dataclass(frozen=True)
-class Scaling:
-    """How raw values become SI: sign * (scale * raw + offset), in `unit`."""
-
-    unit: Unit
-    unit_name: str
-    sign: float = 1.0
-    scale: float = 1.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True)
 class SourceTerm:
-    """A column of the recording and its scaling."""
+    """A column of the recording, and how its raw values become SI: sign * (scale * raw + offset), in `unit`."""
 
     source: str
-    scaling: Scaling
+    unit: Unit
+    sign: float
+    scale: float
+    offset: float
 
 
 @dataclass(frozen=True)
@@ -55,11 +49,11 @@ class SignalMap:
 
     name: str
     term: SourceTerm
-    minus: SourceTerm | None = None  # is subtracted, as the pressure of the other chamber
-    time: TimeBase | None = None  # None: that of the recording
-    delay: float = 0.0  # s, that the recorded signal is late
-    method: str = "auto"  # auto, samples, interpolate, hold
-    low_pass: bool | None = None  # before samples are left out; None: if it is needed
+    minus: SourceTerm | None  # is subtracted, as the pressure of the other chamber
+    time: TimeBase | None  # None: that of the recording
+    delay: float  # s, that the recorded signal is late
+    method: str  # auto, samples, interpolate, hold
+    low_pass: bool | None  # before samples are left out; None: if it is needed
     sensor: SensorDynamics = field(default_factory=SensorDynamics)
     dead: tuple[tuple[float, float], ...] = ()  # s, when the channel was dead; -inf .. inf: always
 
@@ -69,56 +63,97 @@ class ImportMap:
     """A whole map."""
 
     path: Path
+    text: str
     signals: Mapping[str, SignalMap]
     time: TimeBase | None
-    period: float | None = None  # s, of the trace's rows
-    start: float | None = None  # s of the recording, first and last that is taken
-    end: float | None = None
-    separator: str | None = None
-    decimal: str | None = None
-    name_line: int | None = None
-    text: str = ""
+    period: float | None  # s, of the trace's rows
+    start: float | None  # s of the recording, first and last that is taken
+    end: float | None
+    separator: str | None
+    decimal: str | None
+    header: int | None  # line of the names
 
 
-class _Table:
-    """A TOML table whose keys are taken one by one; what is left at the end is refused."""
+# ---------------------------------------------------------------------------------------------------------------------
+# The keys of a map
+# ---------------------------------------------------------------------------------------------------------------------
 
-    def __init__(self, where: object, name: str, values: Any) -> None:
-        if not isinstance(values, dict):
-            raise InputError(where, name, "a table")
-        self.where, self.name, self._left = where, name, dict(values)
-        self._known: list[str] = []
+class Key(NamedTuple):
+    """A key of a table: the types that its value may have, what is expected in words, and its default (...: none)."""
 
-    def label(self, key: str) -> str:
-        return f"{self.name}.{key}" if self.name else key
+    kinds: tuple[type, ...]
+    expected: str
+    default: Any = None
+    is_valid: Callable[[Any], bool] = lambda value: True
 
-    def take(self, key: str, kind: type | tuple[type, ...], expected: str, default: Any = None) -> Any:
-        self._known.append(key)
-        if key not in self._left:
-            return default
-        value = self._left.pop(key)
-        kinds = kind if isinstance(kind, tuple) else (kind,)
-        if not isinstance(value, kind) or (isinstance(value, bool) and bool not in kinds):
-            raise InputError(self.where, self.label(key), f"{expected}, not {value!r}")
-        return value
 
-    def take_number(self, key: str, default: float | None = None, low: float = -math.inf,
-                    expected: str = "a finite number") -> float | None:
-        value = self.take(key, (int, float), expected, default)
-        if value is not None and not (math.isfinite(value) and value >= low):
-            raise InputError(self.where, self.label(key), f"{expected}, not {value!r}")
-        return value  # type: ignore[no-any-return]
+def _is_positive(x: float) -> bool:
+    return 0.0 < x < math.inf
 
-    def take_positive(self, key: str, expected: str) -> float | None:
-        value = self.take_number(key, expected=expected)
-        if value is not None and value <= 0.0:
-            raise InputError(self.where, self.label(key), f"{expected}, not {value!r}")
-        return value
 
-    def close(self) -> None:
-        for key in self._left:
-            raise InputError(self.where, self.label(key), f"one of {', '.join(self._known)}"
-                                                          f"{suggest_name(key, self._known)}")
+def _is_duration(x: float) -> bool:
+    return 0.0 <= x < math.inf
+
+
+def _is_span(x: Any) -> bool:
+    """Whether it is [from, to] with from before to."""
+    return isinstance(x, list) and len(x) == 2 and all(isinstance(end, int | float) for end in x) and x[0] < x[1]
+
+
+NUMBER = (int, float)
+METHODS = ("auto", "samples", "interpolate", "hold")
+MAP = {"file": Key((dict,), "a table", {}), "trace": Key((dict,), "a table", {}), "time": Key((dict,), "a table"),
+       "signals": Key((dict,), "a table of signals", {})}
+FILE = {"separator": Key((str,), "one character, such as ';' or '\\t'", None, lambda x: len(x) == 1),
+        "decimal": Key((str,), "'.' or ','", None, lambda x: x in (".", ",")),
+        "header": Key((int,), "the number of the line with the names, from 1", None, lambda x: x >= 1)}
+ROWS = {"period": Key(NUMBER, "a period above 0 s", None, _is_positive),
+        "start": Key(NUMBER, "a finite number", None, math.isfinite),
+        "end": Key(NUMBER, "a finite number", None, math.isfinite)}
+TIME = {"source": Key((str,), "the name of a column"),
+        "rate": Key(NUMBER, "rows or counts a second, above 0", None, _is_positive),
+        "bits": Key((int,), "bits of a counter, 1 to 64", None, lambda x: 1 <= x <= 64),
+        "unit": Key((str,), "a unit of time, or iso", "s")}
+TERM = {"source": Key((str,), "the name of a column", ...),
+        "unit": Key((str,), "a unit"),
+        "sign": Key(NUMBER, "1 or -1", 1.0, lambda x: x in (1, -1)),
+        "scale": Key(NUMBER, "a number other than 0", 1.0, lambda x: math.isfinite(x) and x != 0),
+        "offset": Key(NUMBER, "a finite number", 0.0, math.isfinite)}
+SIGNAL = {**TERM,
+          "minus": Key((str, dict), "a column, or a table with source, unit, scale and offset"),
+          "time": Key((dict,), "a table as [time]"),
+          "method": Key((str,), "auto, samples, interpolate or hold", "auto", lambda x: x in METHODS),
+          "delay": Key(NUMBER, "seconds that the signal is late", 0.0, math.isfinite),
+          "low_pass": Key((bool,), "true or false"),
+          "sensor": Key((dict,), "a table", {})}
+SENSOR = {"moving_mean": Key(NUMBER, "samples of the recording, from 1", 1.0, lambda x: x in range(1, 1_000_000)),
+          "centred": Key((bool,), "true or false", False),
+          "lag": Key(NUMBER, "a time constant from 0 s", 0.0, _is_duration),
+          "quantum": Key(NUMBER, "a step from 0, in the unit of the signal", 0.0, _is_duration),
+          "dead": Key((bool, list), "true, or a list of [from, to] in s, from before to", [],
+                      lambda x: isinstance(x, bool) or all(map(_is_span, x)))}
+
+
+def _read_table(where: object, name: str, values: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
+    """The values of a table, defaults included.
+
+    Raises:
+        InputError: an unknown key, or a value that it cannot have.
+    """
+    if not isinstance(values, dict):
+        raise InputError(where, name, "a table")
+    prefix = f"{name}." if name else ""
+    for word in values:
+        if word not in keys:
+            raise InputError(where, f"{prefix}{word}", f"one of {', '.join(keys)}{suggest_name(word, keys)}")
+    for word, key in keys.items():
+        if word not in values and key.default is ...:
+            raise InputError(where, f"{prefix}{word}", key.expected)
+        if word in values and not (type(values[word]) in key.kinds and key.is_valid(values[word])):
+            raise InputError(where, f"{prefix}{word}", f"{key.expected}, not {values[word]!r}")
+    found = {word: values.get(word, key.default) for word, key in keys.items()}
+    return {word: float(value) if type(value) is int and float in keys[word].kinds else value
+            for word, value in found.items()}
 
 
 def read_map(path: Path) -> ImportMap:
@@ -138,172 +173,89 @@ def parse_map(text: str, path: Path) -> ImportMap:
     """The map that a TOML text holds; `path` is its name in messages.
 
     Raises:
-        InputError: as of `read_map`.
+        InputError: as of `read_map`; or a map without a signal that every analysis needs, or with a column that is two
+            signals.
     """
-    try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, "", f"a TOML file ({error})") from error
-    top = _Table(path, "", values)
-    file = _Table(path, "file", top.take("file", dict, "a table", {}))
-    rows = _Table(path, "trace", top.take("trace", dict, "a table", {}))
-    time = top.take("time", dict, "a table")
-    signals = top.take("signals", dict, "a table of signals", {})
-    out = ImportMap(
-        path, {name: _parse_signal(path, name, table) for name, table in signals.items()},
-        None if time is None else _parse_time(_Table(path, "time", time)),
-        rows.take_positive("period", "a period above 0 s"),
-        rows.take_number("start"), rows.take_number("end"),
-        _parse_separator(file), _parse_decimal(file), _parse_line(file), text)
-    for table in (top, file, rows):
-        table.close()
-    _check_signals(out)
-    return out
-
-
-def _check_signals(found: ImportMap) -> None:
-    """Refuse a map without a signal that every analysis needs, and one column that is two signals."""
+    top = _read_table(path, "", parse_toml(text, path), MAP)
+    signals = {name: _parse_signal(path, name, table) for name, table in top["signals"].items()}
     for name in REQUIRED_SIGNALS:
-        if name not in found.signals:
-            raise InputError(found.path, f"signals.{name}", "a table with the source of "
-                                                            f"{SIGNALS[name].symbol}, {SIGNALS[name].quantity}")
+        if name not in signals:
+            raise InputError(path, f"signals.{name}", "a table with the source of "
+                                                      f"{SIGNALS[name].symbol}, {SIGNALS[name].quantity}")
     owner: dict[str, str] = {}
-    for name, signal in found.signals.items():
+    for name, signal in signals.items():
         other = owner.setdefault(signal.term.source, name)
-        if other != name and signal.minus is None and found.signals[other].minus is None:
-            raise InputError(found.path, f"signals.{name}.source",
+        if other != name and signal.minus is None and signals[other].minus is None:
+            raise InputError(path, f"signals.{name}.source",
                              f"a column of its own; signals.{other} has {signal.term.source!r} already")
+    return ImportMap(path, text, signals, _parse_time(path, "time", top["time"]),
+                     **_read_table(path, "trace", top["trace"], ROWS), **_read_table(path, "file", top["file"], FILE))
 
 
-def _parse_separator(file: _Table) -> str | None:
-    value: str | None = file.take("separator", str, "one character, such as ';' or '\\t'")
-    if value is not None and len(value) != 1:
-        raise InputError(file.where, "file.separator", f"one character, such as ';' or '\\t', not {value!r}")
-    return value
-
-
-def _parse_decimal(file: _Table) -> str | None:
-    value: str | None = file.take("decimal", str, "'.' or ','")
-    if value not in (None, ".", ","):
-        raise InputError(file.where, "file.decimal", f"'.' or ',', not {value!r}")
-    return value
-
-
-def _parse_line(file: _Table) -> int | None:
-    value: int | None = file.take("header", int, "the number of the line with the names, from 1")
-    if value is not None and value < 1:
-        raise InputError(file.where, "file.header", f"the number of the line with the names, from 1, not {value}")
-    return value
-
-
-def _parse_time(table: _Table) -> TimeBase:
-    source = table.take("source", str, "the name of a column")
-    rate = table.take_positive("rate", "rows or counts a second, above 0")
-    bits = table.take("bits", int, "bits of a counter, 1 to 64")
-    unit = table.take("unit", str, "a unit of time, or iso")
-    table.close()
-    if bits is not None and not 1 <= bits <= 64:
-        raise InputError(table.where, table.label("bits"), f"bits of a counter, 1 to 64, not {bits}")
+def _parse_time(path: Path, name: str, values: Any) -> TimeBase | None:
+    if values is None:
+        return None
+    table = _read_table(path, name, values, TIME)
+    source, rate, bits = table["source"], table["rate"], table["bits"]
     if bits is not None and (source is None or rate is None):
-        raise InputError(table.where, table.name, "source and rate (counts a second) for a counter of so many bits")
+        raise InputError(path, name, "source and rate (counts a second) for a counter of so many bits")
     if source is None and rate is None:
-        raise InputError(table.where, table.name, "source (a column), or rate (rows a second)")
+        raise InputError(path, name, "source (a column), or rate (rows a second)")
     if source is not None and rate is not None and bits is None:
-        raise InputError(table.where, table.label("bits"), "the bits of the counter, as source and rate are given")
-    if unit == "iso" or source is None or bits is not None:
-        return TimeBase(source, None, rate, bits)
-    return TimeBase(source, require_unit("s" if unit is None else unit, "s", table.where, table.label("unit")))
+        raise InputError(path, f"{name}.bits", "the bits of the counter, as source and rate are given")
+    has_unit = rate is None and table["unit"] != "iso"
+    return TimeBase(source, require_unit(table["unit"], "s", path, f"{name}.unit") if has_unit else None, rate, bits)
 
 
-def _parse_signal(path: Path, name: str, values: Any) -> SignalMap:
-    if name not in SIGNAL_NAMES:
-        raise InputError(path, f"signals.{name}", f"one of {', '.join(SIGNAL_NAMES)}{suggest_name(name, SIGNAL_NAMES)}")
-    table = _Table(path, f"signals.{name}", values)
-    term = _parse_term(table, SIGNALS[name].unit, None)
-    minus = table.take("minus", (str, dict), "a column, or a table with source, unit, scale and offset")
+def _parse_signal(path: Path, signal: str, values: Any) -> SignalMap:
+    name = f"signals.{signal}"
+    if signal not in SIGNAL_NAMES:
+        raise InputError(path, name, f"one of {', '.join(SIGNAL_NAMES)}{suggest_name(signal, SIGNAL_NAMES)}")
+    table = _read_table(path, name, values, SIGNAL)
+    si, minus = SIGNALS[signal].unit, table["minus"]
+    term = _parse_term(path, name, {word: table[word] for word in TERM}, si)
     if isinstance(minus, str):
         minus = {"source": minus}
-    other = None
     if minus is not None:
-        inner = _Table(path, f"signals.{name}.minus", minus)
-        other = _parse_term(inner, SIGNALS[name].unit, term.scaling)
-        inner.close()
-    time = table.take("time", dict, "a table as [time]")
-    method = table.take("method", str, "auto, samples, interpolate or hold", "auto")
-    if method not in ("auto", "samples", "interpolate", "hold"):
-        raise InputError(path, table.label("method"), f"auto, samples, interpolate or hold, not {method!r}")
-    delay = table.take_number("delay", 0.0, expected="seconds that the signal is late")
-    low_pass = table.take("low_pass", bool, "true or false")
-    sensor, dead = _parse_sensor(table, term.scaling)
-    if sensor.filters and name not in OUTPUTS:
-        raise InputError(path, table.label("sensor"), f"moving_mean and lag for {', '.join(OUTPUTS)} alone; {name} is "
-                                                      "an input of the model and is used as recorded")
-    table.close()
-    base = None if time is None else _parse_time(_Table(path, f"signals.{name}.time", time))
-    return SignalMap(name, term, other, base, float(delay or 0.0), method, low_pass, sensor, dead)
-
-
-def _parse_term(table: _Table, si: str, base: Scaling | None) -> SourceTerm:
-    """Source and scaling; `base` is what is not given."""
-    source = table.take("source", str, "the name of a column")
-    if source is None:
-        raise InputError(table.where, table.label("source"), "the name of a column")
-    unit_name = table.take("unit", str, "a unit", base.unit_name if base else si)
-    unit = require_unit(unit_name, si, table.where, table.label("unit"))
-    sign = table.take_number("sign", base.sign if base else 1.0, expected="1 or -1")
-    if sign not in (1, -1):
-        raise InputError(table.where, table.label("sign"), f"1 or -1, not {sign!r}")
-    scale = table.take_number("scale", base.scale if base else 1.0, expected="a number other than 0")
-    if not scale:
-        raise InputError(table.where, table.label("scale"), "a number other than 0")
-    offset = table.take_number("offset", base.offset if base else 0.0)
-    return SourceTerm(source, Scaling(unit, unit_name, float(sign or 1.0), float(scale), float(offset or 0.0)))
-
-
-def _parse_sensor(table: _Table, scaling: Scaling) -> tuple[SensorDynamics, tuple[tuple[float, float], ...]]:
-    """The dynamics with its quantum in SI, and when the channel was dead."""
-    inner = _Table(table.where, table.label("sensor"), table.take("sensor", dict, "a table", {}))
-    mean = inner.take("moving_mean", int, "samples of the recording, from 1", 1)
-    if mean < 1:
-        raise InputError(table.where, inner.label("moving_mean"), f"samples of the recording, from 1, not {mean}")
-    centred = inner.take("centred", bool, "true or false", False)
-    lag = inner.take_number("lag", 0.0, 0.0, "a time constant from 0 s")
-    quantum = inner.take_number("quantum", 0.0, 0.0, f"a step from 0 {scaling.unit_name}")
-    dead = inner.take("dead", (bool, list), "true, or a list of [from, to] in s", [])
-    inner.close()
+        usual = {word: TERM[word]._replace(default=table[word]) for word in TERM if word != "source"}
+        minus = _parse_term(path, f"{name}.minus", _read_table(path, f"{name}.minus", minus, TERM | usual), si)
+    sensor = _read_table(path, f"{name}.sensor", table["sensor"], SENSOR)
+    dead = sensor.pop("dead")
     if isinstance(dead, bool):
-        dead = [[-math.inf, math.inf]] if dead else []
-    for span in dead:
-        is_span = isinstance(span, list) and len(span) == 2 and all(isinstance(x, int | float) for x in span)
-        if not (is_span and span[0] < span[1]):
-            raise InputError(table.where, inner.label("dead"), f"[from, to] in s, from before to, not {span!r}")
-    sensor = SensorDynamics(moving_mean=float(mean), centred=centred, lag=float(lag or 0.0),
-                            quantum=float(quantum or 0.0) * float(scaling.unit.factor))
-    return sensor, tuple((float(a), float(b)) for a, b in dead)
+        dead = [(-math.inf, math.inf)] if dead else []
+    dynamics = SensorDynamics(**{**sensor, "quantum": sensor["quantum"] * float(term.unit.factor)})
+    if dynamics.filters and signal not in OUTPUTS:
+        raise InputError(path, f"{name}.sensor", f"moving_mean and lag for {', '.join(OUTPUTS)} alone; {signal} is "
+                                                 "an input of the model and is used as recorded")
+    return SignalMap(signal, term, minus, _parse_time(path, f"{name}.time", table["time"]), table["delay"],
+                     table["method"], table["low_pass"], dynamics, tuple((float(a), float(b)) for a, b in dead))
 
 
-Floats = NDArray[np.float64]
+def _parse_term(path: Path, name: str, table: Mapping[str, Any], si: str) -> SourceTerm:
+    return SourceTerm(**{**table, "unit": require_unit(table["unit"] or si, si, path, f"{name}.unit")})
 
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Units
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Unit(NamedTuple):
-    """A unit: the SI unit of its quantity and how many of those it is."""
+    """A unit: its name, the SI unit of its quantity and how many of those it is."""
 
+    name: str
     si: str
     factor: Fraction
 
 
-def _list_units(si: str, **factors: str | int) -> dict[str, Unit]:
-    return {name: Unit(si, Fraction(factor)) for name, factor in factors.items()}
-
-
-UNITS: Mapping[str, Unit] = {
-    **_list_units("m", m=1, cm="1/100", mm="1/1000", um="1/1000000", nm="1/1000000000", inch="0.0254", mil="0.0000254"),
-    **_list_units("Pa", Pa=1, hPa=100, kPa=1000, MPa=1000000, GPa=1000000000, mbar=100, bar=100000,
-                  psi="6894.757293168361"),
-    **_list_units("A", A=1, mA="1/1000", uA="1/1000000"),
-    **_list_units("N", N=1, kN=1000, MN=1000000, daN=10, lbf="4.4482216152605"),
-    **_list_units("s", s=1, ms="1/1000", us="1/1000000", ns="1/1000000000", min=60, h=3600),
-}
+UNITS: Mapping[str, Unit] = {name: Unit(name, si, Fraction(factor)) for si, factors in {
+    "m": {"m": "1", "cm": "1/100", "mm": "1/1000", "um": "1/1000000", "nm": "1/1000000000", "inch": "0.0254",
+          "mil": "0.0000254"},
+    "Pa": {"Pa": "1", "hPa": "100", "kPa": "1000", "MPa": "1000000", "GPa": "1000000000", "mbar": "100",
+           "bar": "100000", "psi": "6894.757293168361"},
+    "A": {"A": "1", "mA": "1/1000", "uA": "1/1000000"},
+    "N": {"N": "1", "kN": "1000", "MN": "1000000", "daN": "10", "lbf": "4.4482216152605"},
+    "s": {"s": "1", "ms": "1/1000", "us": "1/1000000", "ns": "1/1000000000", "min": "60", "h": "3600"},
+}.items() for name, factor in factors.items()}
 SPELLINGS = {"µm": "um", "μm": "um", "µs": "us", "μs": "us", "µA": "uA", "μA": "uA", "in": "inch", "sec": "s",
              "seconds": "s", "second": "s", "msec": "ms", "usec": "us", "pa": "Pa", "kpa": "kPa", "mpa": "MPa",
              "Bar": "bar", "BAR": "bar", "MM": "mm", "a": "A", "ma": "mA", "n": "N", "kn": "kN", "S": "s", "MS": "ms",
@@ -344,6 +296,10 @@ def convert_to_si(values: Floats, unit: Unit) -> Floats:
         return values / float(unit.factor.denominator)
     return values * float(unit.factor)
 
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Times
+# ---------------------------------------------------------------------------------------------------------------------
 
 def compute_times(base: TimeBase, samples: int, column: Floats | None, where: object, field: str) -> Floats:
     """Times (s) of so many samples; `column` holds the values of the base's source.

@@ -122,4 +122,4 @@ def _open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | Non
         return open_can_log(source, Path(args.dbc) if args.dbc else dbc.DBC)
     if chosen is None:
         return open_measurement(source)
-    return open_measurement(source, chosen.separator, chosen.decimal, chosen.name_line)
+    return open_measurement(source, chosen.separator, chosen.decimal, chosen.header)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdi.trace.importing.conversion import Imported, Samples, import_measurement, place_samples
-from fdi.trace.importing.formats import ArrayMeasurement, Channel, open_measurement
+from fdi.trace.importing.formats import Channel, ChannelReader, open_measurement
 from fdi.trace.importing.guess import guess_map
 from fdi.trace.importing.import_map import parse_map
 from plant.errors import InputError
@@ -30,7 +30,7 @@ def convert(tmp_path: Path, text: str, **columns: np.ndarray) -> Imported:
     (tmp_path / "x.bin").write_bytes(b"x")
     known = {"com": XJ, "xj": XJ, "cor": XJ} | columns
     channels = {name: Channel(np.asarray(values, float)) for name, values in known.items()}
-    measurement = ArrayMeasurement(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), channels)
+    measurement = ChannelReader(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), channels.__getitem__)
     return import_measurement(measurement, parse_map(text + MAP, tmp_path / "map.toml"), 1e-3)
 
 
@@ -91,13 +91,13 @@ def test_what_would_fold_is_filtered_first() -> None:
     t = np.arange(20_000) * 1e-4
     slow, ripple = np.sin(2 * math.pi * 10.0 * t), 0.3 * np.sin(2 * math.pi * 4900.0 * t)
     rows = np.arange(2000) * 1e-3
-    placed = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", None, "")
-    assert placed.how == "low-pass filtered, every 10th sample"
-    assert np.abs(placed.x - slow[::10])[20:-20].max() < 3e-3
-    raw = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", False, "")
-    assert np.abs(raw.x - slow[::10]).max() > 0.1
-    quiet = place_samples(Samples(t, slow), rows, 1e-3, "auto", None, "")
-    assert quiet.how == "every 10th sample" and np.array_equal(quiet.x, slow[::10])
+    x, how = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", None, "")
+    assert how == "low-pass filtered, every 10th sample"
+    assert np.abs(x - slow[::10])[20:-20].max() < 3e-3
+    raw, _ = place_samples(Samples(t, slow + ripple), rows, 1e-3, "auto", False, "")
+    assert np.abs(raw - slow[::10]).max() > 0.1
+    quiet, how = place_samples(Samples(t, slow), rows, 1e-3, "auto", None, "")
+    assert how == "every 10th sample" and np.array_equal(quiet, slow[::10])
 
 
 def test_held_answers_of_the_controller_keep_their_cycle() -> None:
@@ -105,8 +105,8 @@ def test_held_answers_of_the_controller_keep_their_cycle() -> None:
     t = np.arange(4000) * 2.5e-4
     answer = np.repeat(np.arange(1001.0), 4)[2:4002]  # the first two samples are of the cycle before
     rows = t[0] + np.arange(1000) * 1e-3
-    placed = place_samples(Samples(t, answer), rows, 1e-3, "auto", None, "answer")
-    assert np.array_equal(placed.x[:-1], np.arange(1.0, 1000.0))
+    x, _ = place_samples(Samples(t, answer), rows, 1e-3, "auto", None, "answer")
+    assert np.array_equal(x[:-1], np.arange(1.0, 1000.0))
 
 
 def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
@@ -163,10 +163,10 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("\n".join(lines))
     guessed = guess_map(open_measurement(tmp_path / "x.csv"))
     signals = parse_map(guessed.text, tmp_path / "x.map.toml").signals
-    scaling = signals["xj"].term.scaling
+    scaling = signals["xj"].term
     assert scaling.scale == pytest.approx(0.005, rel=0.01) and scaling.offset == pytest.approx(-5.0, rel=0.02)
     assert signals["xj"].sensor.quantum == pytest.approx(5e-6, rel=0.01)
-    assert signals["cor"].term.scaling.sign == 1.0 and guessed.chosen["xj"] == ("Ist [counts]", "unsure")
+    assert signals["cor"].term.sign == 1.0 and guessed.chosen["xj"] == ("Ist [counts]", "unsure")
     assert guessed.left == {"Kraft [kN]": "always 0; by its name it would be load"}
 
 
