@@ -10,6 +10,7 @@ The queue does not delay a reaction: `override_control` changes the control word
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from collections.abc import Callable
 from functools import cache
 from math import nan
@@ -19,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from plant.compile import compile_function
-from plant.errors import RigError
 from rig.network import codec
 from rig.network.frame import Frame
 from rig.network.link import LinkWire
@@ -52,13 +52,14 @@ def open_loop(master: Master, faults: Schedule, log: CycleObserver, bus: str, pe
 def compile_cycle(realtime: bool) -> Any:
     """Compile the cycle of a pace: some seconds on a new machine, half a second afterwards."""
     play = compile_function(hc.play_cycles_in_real_time if realtime else hc.play_cycle_in_lockstep)
-    port, buffers = make_closed_port(), hc.make_buffers(1, 1, 1, 1)
-    play(port, buffers) if realtime else play(port, buffers, 0)  # fails at once, on a bus that is not there
+    buffers = hc.make_buffers(1, 1, 1, 1)
+    buffers.words[hc.PERIOD] = 1
+    play(make_closed_port(), buffers, *() if realtime else (0,))  # fails at once, on a bus that is not there
     return play
 
 
-class HardLoop:
-    """Cycles in compiled code; the interface is that of `CycleLoop`. Call `close` when done.
+class HardLoop(Loop):
+    """Cycles in compiled code. Call `close` when done.
 
     Raises RigError from `cycle`, `serve` and `finish` when the bus is gone.
     """
@@ -80,7 +81,6 @@ class HardLoop:
         self._words = self._buffers.words
         self._inputs = [CycleInput(0, 0.0, 0.0, 0)] * (9 * ahead)  # of all rows that are not yet logged, and the queue
         self._thread: threading.Thread | None = None
-        self._status = hc.WAITING
         self._idle_phase = 0
         self._pending: tuple[int, Signals, Timing] | None = None  # lockstep: a row that the next cycle hands out
         self._k = 0
@@ -88,7 +88,6 @@ class HardLoop:
         self._came_at: int | None = None  # wall time of the service frame under way
         self._last_t_ns = 0
         self._reported = False  # an EMCY of the plant has come in this cycle
-        self.scheduler = ""
         self._write_frame, master.hooks.on_frame = master.hooks.on_frame, self._keep_frame
         self._receive, wire.receive = wire.receive, self._receive_service
         wire.link.leave_out(RECEIVED)
@@ -99,12 +98,12 @@ class HardLoop:
 
     @property
     def k(self) -> int:
-        """The cycle to come."""
+        """See `Loop`."""
         return int(self._words[hc.CYCLES]) if self._realtime else self._k
 
     @property
     def queued(self) -> int:
-        """The cycle of the input that `cycle` takes next."""
+        """See `Loop`."""
         return self.k + self.waiting
 
     @property
@@ -114,16 +113,16 @@ class HardLoop:
 
     @property
     def overruns(self) -> int:
-        """Due times missed, late cycles, and cycles for which no input was queued."""
+        """See `Loop`."""
         return int(self._words[hc.OVERRUNS])
 
     @property
     def underruns(self) -> int:
-        """Cycles for which no input was queued; they repeat the last one."""
+        """See `Loop`."""
         return int(self._words[hc.UNDERRUNS])
 
     def now(self) -> int:
-        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
+        """See `Loop`."""
         return self._wire.clock.now() if self._realtime else self._t_ns
 
     def cycle(self, step: CycleInput) -> None:
@@ -133,7 +132,9 @@ class HardLoop:
             self._run_one()
             return
         if self._thread is None:
-            self._start_thread()
+            self._words[hc.DUE] = self._origin + self._wire.clock.now() + 20 * self._period
+            self._thread = threading.Thread(target=self._run_thread, name="cycle", daemon=True)
+            self._thread.start()
         while self.waiting >= self._ahead:
             self.serve()
 
@@ -142,20 +143,17 @@ class HardLoop:
         near = self.waiting <= 2  # the end of the queue: the next input must come within a period
         self._wire.poll(self._period * (0.1e-9 if near else 1e-9))
         self._drain()
-        self._tick()
-        if self._thread is not None and not self._thread.is_alive():
-            self._check_status()
+        self._set_rig_faults(self.k)
+        self._master.tick()
+        self._require_bus()
 
     def override_control(self, word: int) -> None:
-        """Use this control word in all cycles already queued, from the next one on."""
+        """See `Loop`."""
         self._words[hc.OVERRIDE] = word
         self._words[hc.OVERRIDE_LIMIT] = self._words[hc.TAIL]
 
     def wait_until_played(self, stop: Callable[[], bool]) -> bool:
-        """Wait until all inputs are taken; False when `stop()` came true before.
-
-        The queue may then run empty: until the next input the last one is repeated.
-        """
+        """See `Loop`. The queue may then run empty: until the next input the last one is repeated."""
         self._words[hc.MAY_IDLE_AT] = self._words[hc.TAIL]
         while self.waiting:
             self.serve()
@@ -164,33 +162,26 @@ class HardLoop:
         return True
 
     def hold(self, phase: int) -> float:
-        """Discard the inputs not yet taken; until the next input the last one is repeated, logged under `phase`.
-
-        Returns its demand, m.
-        """
+        """See `Loop`; the last input is repeated until the next one."""
         self._idle_phase = phase
-        self._words[hc.CANCEL_WANTED] += 1
-        while self._is_running() and self._words[hc.CANCEL_DONE] != self._words[hc.CANCEL_WANTED]:
+        self._words[hc.MAY_IDLE_AT] = self._words[hc.TAIL]
+        self._words[hc.CANCEL] = self._is_running()
+        while self._is_running() and self._words[hc.CANCEL]:
             self.serve()
-        if not self._is_running():
-            self._words[hc.TAIL] = self._words[hc.HEAD]
-            self._words[hc.CANCEL_DONE] = self._words[hc.CANCEL_WANTED]
         return self._inputs[self._words[hc.POSITION] % len(self._inputs)].demand if self.k else 0.0
 
     def finish(self) -> None:
-        """Play what is queued, wait for the answers of the last cycle and log it."""
+        """See `Loop`."""
         self._words[hc.FINISH] = 1
         while self._is_running():
             self.serve()
-        if self._thread is not None:
-            self._check_status()
+        self._require_bus()
         self._drain()
         self._log_pending()
 
     def close(self) -> None:
         """End the thread at the end of its cycle and give the bus back."""
-        self._words[hc.CANCEL_WANTED] += 1
-        self._words[hc.FINISH] = 1
+        self._words[hc.CANCEL] = self._words[hc.FINISH] = 1
         if self._thread is not None:
             self._thread.join()
         self._bus.close()
@@ -224,71 +215,53 @@ class HardLoop:
         """
         is_second = isinstance(self._faults.find_action("sync", k), Double)
         cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
-        actions = {name: [self._faults.find_action(name, each) for each in cycles]
-                   for name in ("feedback", "valve_state")}
-        if self._realtime or not (is_second or any(isinstance(each[0], Double) for each in actions.values())):
+        feedback, valve = ([self._faults.find_action(name, each) for each in cycles]
+                           for name in ("feedback", "valve_state"))
+        if self._realtime or not (is_second or any(isinstance(each[0], Double) for each in (feedback, valve))):
             return 0, 0
-        sent = {name: [0 if isinstance(action, Drop | Delay) else 2 if isinstance(action, Double) else 1
-                       for action in each] for name, each in actions.items()}
-        answered = sum(count for count, action in zip(sent["feedback"], actions["feedback"], strict=True)
-                       if not isinstance(action, Cut))
-        return sum(map(sum, sent.values())), answered
-
-    def _await_short_drive(self) -> None:
-        """Lockstep: a fault cuts a drive frame; the plant's services report it, beside its cycle."""
-        k = self._k
-        is_first = isinstance(self._faults.find_action("drive", k), Cut) and not isinstance(
-            self._faults.find_action("drive", k - 1), Cut)
-        if is_first:
-            self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
+        copies = {Drop: 0, Delay: 0, Double: 2}
+        answered = sum(copies.get(type(action), 1) for action in feedback if not isinstance(action, Cut))
+        return sum(copies.get(type(action), 1) for action in feedback + valve), answered
 
     def _run_one(self) -> None:
         """Lockstep: one cycle, with the services meanwhile, so that Ctrl-C and EMCYs are not kept waiting."""
         self._log_pending()
         self._set_rig_faults(self._k)
         self._reported = False
-        status = hc.WAITING
-        while status == hc.WAITING:
-            status = self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US)
-            self._wire.poll(0.0)
-            if self._wire.is_node_gone():  # it will not answer; the others can within a period
-                limit = self._origin + self._wire.clock.now() + self._period
-                self._words[hc.ANSWER_LIMIT] = min(self._words[hc.ANSWER_LIMIT], limit)
-                self._words[hc.GRACE] = self._period
-        if status < 0:
-            raise self._bus.explain_failure(status)
-        self._await_short_drive()
+        while self._play(self._bus.port, self._buffers, self._origin + self._wire.clock.now() + 50_000 * _US):
+            self._serve_lockstep()
+        self._serve_lockstep()
+        self._require_bus()
+        is_cut = [isinstance(self._faults.find_action("drive", k), Cut) for k in (self._k - 1, self._k)]
+        if is_cut == [False, True]:  # the first drive frame that a fault cuts: the plant reports it, beside its cycle
+            self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
         self._drain()
         self._master.tick()
         self._k += 1
         self._t_ns += self._period
 
-    def _start_thread(self) -> None:
-        words = self._words
-        words[hc.DUE] = self._origin + self._wire.clock.now() + 20 * self._period
-        self._thread = threading.Thread(target=self._run_thread, name="cycle", daemon=True)
-        self._thread.start()
+    def _serve_lockstep(self) -> None:
+        self._wire.poll(0.0)
+        if self._wire.is_node_gone():  # it will not answer; the others can within a period
+            limit = self._origin + self._wire.clock.now() + self._period
+            self._words[hc.ANSWER_LIMIT] = min(self._words[hc.ANSWER_LIMIT], limit)
+            self._words[hc.GRACE] = self._period
 
     def _run_thread(self) -> None:
         with enter_loop_thread(from_last=1) as self.scheduler:
-            self._status = self._play(self._bus.port, self._buffers)
+            self._play(self._bus.port, self._buffers)
 
     def _is_running(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
 
-    def _check_status(self) -> None:
-        if self._status < 0:
-            raise self._bus.explain_failure(self._status)
-        if self._status == hc.WAITING:
-            raise RigError("internal error: the cycle thread ended by itself")
+    def _require_bus(self) -> None:
+        if self._words[hc.FAILURE] and not self._is_running():
+            raise self._bus.explain_failure(int(self._words[hc.FAILURE]))
 
     def _warm_up(self) -> None:
-        """Set the cycle's times, and play some cycles without sending: code and memory are then in place."""
+        """Play some cycles without sending, then set the cycle's times: code and memory are in place at the start."""
         words, period = self._words, self._period
-        words[hc.PERIOD], words[hc.GRACE] = period, _US
-        words[hc.SPINS_ALWAYS] = len(list_cpus()) > 1
-        words[hc.LEAD], words[hc.SPIN] = min(200 * _US, period // 4), min(80 * _US, period // 8)
-        words[hc.DRY] = 1
+        words[hc.DRY], words[hc.PERIOD] = 1, period
         for _ in range(10):
             self._push(CycleInput(0, 0.0, 0.0, 0))
             words[hc.DUE] = self._origin + self._wire.clock.now() + period
@@ -297,17 +270,12 @@ class HardLoop:
         words[hc.FINISH] = 1
         if self._realtime:
             self._play(self._bus.port, self._buffers)
-        kept = {each: int(words[each]) for each in (hc.PERIOD, hc.LEAD, hc.SPIN, hc.SPINS_ALWAYS)}
         words[:] = 0
-        for each, value in kept.items():
-            words[each] = value
-        words[hc.GRACE], words[hc.MAY_IDLE_AT] = self._wire.grace_ns, -1
+        words[hc.PERIOD], words[hc.GRACE], words[hc.MAY_IDLE_AT] = period, self._wire.grace_ns, -1
+        words[hc.SPINS_ALWAYS] = len(list_cpus()) > 1
+        words[hc.LEAD], words[hc.SPIN] = min(200 * _US, period // 4), min(80 * _US, period // 8)
 
     # ------------------------------------------------------------------------------------ from the cycle
-
-    def _tick(self) -> None:
-        self._set_rig_faults(self.k)
-        self._master.tick()
 
     def _set_rig_faults(self, k: int) -> None:
         """The faults of the rig itself that do not concern the cycle: its heartbeat, and what else it hears."""
@@ -351,22 +319,18 @@ class HardLoop:
     def _release_frames(self, until_ns: int) -> None:
         """Write the frames up to that time, in the order of their times."""
         self._frames.sort(key=itemgetter(0))
-        count = 0
-        for t_ns, frame in self._frames:
-            if t_ns > until_ns:
-                break
-            count += 1
-            if frame.t_ns < self._last_t_ns:  # the kernel's clock was set, or two sockets differ by a microsecond
-                frame = Frame(self._last_t_ns, frame.cob_id, frame.data)
-            self._last_t_ns = frame.t_ns
-            self._write_frame(frame)
+        count = bisect_right(self._frames, until_ns, key=itemgetter(0))
+        for _, frame in self._frames[:count]:
+            # The kernel's clock may have been set, or two sockets differ by a microsecond.
+            self._last_t_ns = max(self._last_t_ns, frame.t_ns)
+            self._write_frame(Frame(self._last_t_ns, frame.cob_id, frame.data))
         del self._frames[:count]
 
     def _take_row(self, row: list[int]) -> None:
         step = self._inputs[row[hc.INPUT] % len(self._inputs)]
         phase = self._idle_phase if row[hc.INPUT_HELD] and self._idle_phase else step.phase
         came = row[hc.ANSWERS]
-        has_xj, has_xs, has_cor = came & hc.XJ_CAME, came & hc.XS_CAME, came & hc.COR_CAME
+        has_xj, has_xs, has_cor = came & hc.FEEDBACK_CAME, came & hc.VALVE_CAME, came & hc.DRIVE_CAME
         signals = Signals(
             row[hc.CYCLE], phase, codec.position(codec.raw_position(step.demand)),
             codec.position(row[hc.XJ]) if has_xj else nan, codec.current(row[hc.COR]) if has_cor else nan,
@@ -391,9 +355,5 @@ class HardLoop:
 
 def _read_ring(ring: np.ndarray, first: int, last: int) -> list[list[int]]:
     """Entries `first` to `last` - 1 of a ring."""
-    start, stop = first % len(ring), last % len(ring)
-    if first == last:
-        return []
-    rows = ring[start:stop] if start < stop else np.concatenate((ring[start:], ring[:stop]))
-    values: list[list[int]] = rows.tolist()
-    return values
+    entries: list[list[int]] = ring[np.arange(first, last) % len(ring)].tolist()
+    return entries

@@ -9,10 +9,11 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 from __future__ import annotations
 
 import heapq
+from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable
 from math import nan
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,11 +23,25 @@ from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
 from rig.recorder import Signals, Timing
-from rig.run.priority import name_scheduler
 from rig.sequences.faults import Delay, Drop, Schedule, apply_action
 
-_XJ, _XS, _COR = 1, 2, 4  # answers of a cycle that have come
-_ALL = _XJ | _XS | _COR
+
+class _Answer(NamedTuple):
+    """One of the frames that nodes send in a cycle: where its values go, in the row and in the timing."""
+
+    bit: int
+    unpack: Callable[[bytes], tuple[Any, ...]]
+    fields: tuple[str, ...]
+    response: str
+    is_numbered: bool = True  # it carries the number of its cycle
+
+
+_ANSWERS = {
+    codec.FEEDBACK: _Answer(1, codec.unpack_feedback, ("xj", "p12"), "feedback_response", is_numbered=False),
+    codec.VALVE_STATE: _Answer(2, codec.unpack_valve_state, ("xs", "flags"), "valve_response"),
+    codec.DRIVE: _Answer(4, codec.unpack_drive, ("cor", "status"), "response"),
+}
+_ALL = 7  # answers have come
 
 
 class CycleObserver(Protocol):
@@ -45,64 +60,68 @@ class CycleInput(NamedTuple):
     control: int  # control word
 
 
-class Loop(Protocol):
-    """What the session needs of a cycle loop. A loop may run behind the inputs that it was given (`waiting`)."""
+class Loop(ABC):
+    """What the session needs of a cycle loop. One that queues its inputs runs behind them and overrides more."""
 
     kind: str  # "soft" or "hard" real time
+    scheduler = ""  # how the kernel schedules the thread of the cycle, if it has one of its own
 
     @property
+    @abstractmethod
     def k(self) -> int:
         """The cycle to come."""
 
     @property
+    @abstractmethod
+    def overruns(self) -> int:
+        """Due times missed, cycles late by more than half a period, and cycles for which no input was given in time."""
+
+    @property
+    @abstractmethod
+    def underruns(self) -> int:
+        """Cycles for which no input was given in time; they repeat the last one."""
+
+    @property
     def queued(self) -> int:
         """The cycle of the input that `cycle` takes next."""
+        return self.k
 
-    @property
-    def overruns(self) -> int:
-        """Due times missed, and cycles late by more than half a period."""
-
-    @property
-    def underruns(self) -> int:
-        """Cycles for which no input was given in time; they repeat the last one, and count as overruns."""
-
-    @property
-    def scheduler(self) -> str:
-        """How the kernel schedules the thread of the cycle; empty before it has run."""
-
+    @abstractmethod
     def now(self) -> int:
-        """Time for the log, ns since the run began."""
+        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
 
+    @abstractmethod
     def cycle(self, step: CycleInput) -> None:
         """Run one cycle, or queue it; cycles that are complete go to the log."""
 
-    def override_control(self, word: int) -> None:
+    @abstractmethod
+    def finish(self) -> None:
+        """Play what is queued, wait for the answers of the last cycle and log it."""
+
+    @abstractmethod
+    def hold(self, phase: int) -> float:
+        """Discard the inputs not yet taken and repeat the last one under `phase`; return its demand, m."""
+
+    def override_control(self, word: int) -> None:  # noqa: B027 - nothing is queued
         """Use this control word in all cycles already queued, from the next one on."""
 
     def wait_until_played(self, stop: Callable[[], bool]) -> bool:
         """Wait until all inputs are taken; False when `stop()` came true before."""
+        return True
 
-    def hold(self, phase: int) -> float:
-        """Discard the inputs not yet taken and repeat the last one under `phase`; return its demand, m."""
-
-    def finish(self) -> None:
-        """Play what is queued, wait for the answers of the last cycle and log it."""
-
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - nothing to give back
         """Give back what the loop holds, whatever happened."""
 
 
-class CycleLoop:
+class CycleLoop(Loop):
     """Runs cycles one by one and passes each to `log` when it is complete. In real time it is soft: Python is in it."""
 
     kind = "soft"
-    underruns = 0  # it waits for its inputs
+    k = overruns = underruns = 0
 
     def __init__(self, master: Master, faults: Schedule, log: CycleObserver, period_ns: int, realtime: bool) -> None:
         self._master, self._wire = master, master.wire
         self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
-        self.k = 0  # the cycle to come
-        self.overruns = 0
         self._open: tuple[int, Signals, Timing] | None = None  # the cycle under way
         self._seen = 0
         self._wall = WallClock()
@@ -110,36 +129,15 @@ class CycleLoop:
         self._sync = 0
         self._held: list[tuple[int, int, bytes]] = []  # late commands: due, cycle, frame
         self._demand = 0.0  # m, of the last cycle
-        read = {codec.FEEDBACK: self._feedback, codec.VALVE_STATE: self._valve, codec.DRIVE: self._drive}
-        master.hooks.on_cyclic.update(read)
-
-    @property
-    def queued(self) -> int:
-        """See `Loop`: nothing is queued here."""
-        return self.k
-
-    @property
-    def scheduler(self) -> str:
-        """See `Loop`."""
-        return name_scheduler()
+        master.hooks.on_cyclic.update(dict.fromkeys(_ANSWERS, self._take_answer))
 
     def now(self) -> int:
-        """Time for the log, ns since the run began: in lockstep that of the cycle under way or to come."""
+        """See `Loop`."""
         return self._wire.clock.now() if self._realtime else self._t_ns
 
-    def override_control(self, word: int) -> None:
-        """See `Loop`; nothing is queued here."""
-
-    def wait_until_played(self, stop: Callable[[], bool]) -> bool:
-        """See `Loop`; nothing is queued here."""
-        return True
-
     def hold(self, phase: int) -> float:
-        """See `Loop`; nothing is queued here, and the next cycle follows at once."""
+        """See `Loop`; the next cycle follows at once."""
         return self._demand
-
-    def close(self) -> None:
-        """See `Loop`; nothing to give back."""
 
     def cycle(self, step: CycleInput) -> None:
         """One cycle; the cycle before, which it closes, goes to the log."""
@@ -150,7 +148,8 @@ class CycleLoop:
         began = self._wall.now()
         row = Signals(k, step.phase, codec.position(codec.raw_position(step.demand)), nan, nan, nan, nan,
                       step.load, step.control, 0, 0)
-        timing = Timing(k, self._overrun(lateness), lateness * 1e-9, nan, nan)
+        is_overrun = 2 * lateness > self._period  # it leaves the controller too little of the cycle to answer in
+        timing = Timing(k, is_overrun, lateness * 1e-9, nan, nan)
         self._open, self._seen = (self._t_ns, row, timing), 0
         master.silent = not self._faults.is_heartbeat_alive("rig", k)
         master.is_deaf = self._faults.is_bus_off("rig", k)
@@ -180,13 +179,9 @@ class CycleLoop:
         self._wire.run_until(self._t_ns)
         late = self._wire.clock.now() - self._t_ns
         lost = late // self._period
-        self.overruns += max(lost, self._overrun(late))
+        self.overruns += max(lost, 2 * late > self._period)
         self._t_ns += lost * self._period
         return late
-
-    def _overrun(self, late_ns: int) -> bool:
-        """Late by more than half a cycle: the controller is left too little of it to answer in."""
-        return 2 * late_ns > self._period
 
     def _send_sync(self) -> int | None:
         """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
@@ -219,37 +214,23 @@ class CycleLoop:
         while self._held and self._held[0][0] < before_ns:
             self._master.send(codec.COMMAND, heapq.heappop(self._held)[2])
 
-    def _feedback(self, frame: Frame) -> None:
-        if self._open is not None and not self._seen & _XJ and len(frame.data) == 8:
-            row = self._open[1]
-            row.xj, row.p12 = codec.unpack_feedback(frame.data)
-            self._open[2].feedback_response = self._since_sync(frame)
-            self._note_answer(_XJ, frame)
-
-    def _valve(self, frame: Frame) -> None:
-        if self._open is not None and len(frame.data) == 8:
-            _, row, timing = self._open
-            state = codec.unpack_valve_state(frame.data)
-            if state.cycle == row.cycle & 0xFFFF:
-                if not self._seen & _XS:
-                    timing.valve_response = self._since_sync(frame)
-                row.xs, row.flags = state.spool, state.flags
-                self._note_answer(_XS, frame)
-
-    def _drive(self, frame: Frame) -> None:
-        if self._open is not None and len(frame.data) == 8:  # of several the last: the plant latches that one
-            _, row, timing = self._open
-            drive = codec.unpack_drive(frame.data)
-            if drive.cycle == row.cycle & 0xFFFF:
-                row.cor, row.status = drive.current, drive.status
-                if not self._seen & _COR:
-                    timing.response = self._since_sync(frame)
-                self._note_answer(_COR, frame)
-
-    def _note_answer(self, what: int, frame: Frame) -> None:
-        complete, self._seen = self._seen == _ALL, self._seen | what
-        if self._seen == _ALL and not complete and self._open is not None:
-            self._open[2].work = self._since_sync(frame)
+    def _take_answer(self, frame: Frame) -> None:
+        """Put an answer into the row under way: the first feedback, and of the others the last of this cycle."""
+        if self._open is None or len(frame.data) != 8:
+            return
+        _, row, timing = self._open
+        answer, seen = _ANSWERS[frame.cob_id], self._seen
+        first, second, *cycle = answer.unpack(frame.data)
+        is_first = not seen & answer.bit
+        if cycle != [row.cycle & 0xFFFF] if answer.is_numbered else not is_first:
+            return
+        setattr(row, answer.fields[0], first)
+        setattr(row, answer.fields[1], second)
+        self._seen |= answer.bit
+        if is_first:
+            setattr(timing, answer.response, self._since_sync(frame))
+        if self._seen == _ALL != seen:
+            timing.work = self._since_sync(frame)
 
     def _since_sync(self, frame: Frame) -> float:
         """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
