@@ -1,7 +1,6 @@
 """Buses: the embedded one, that needs nothing from the machine, and python-can's, opened from one line of text."""
 from __future__ import annotations
 
-import ipaddress
 import os
 import socket
 from collections import deque
@@ -12,12 +11,12 @@ from typing import TypeVar
 import can
 
 from plant.errors import InputError, RigError
+from rig.network.can_interface import UdpBus
 from rig.network.frame import Frame, Node, Send
-from rig.network.udp import LoopbackBus
+from rig.network.udp import GROUP, is_group
 
 BUS_VARIABLE = "EHA_RIG_BUS"  # environment: what `auto` takes
 BITRATE = 1_000_000  # bit/s
-_GROUP = "239.74.163.2"  # python-can's IPv4 default
 _NETWORK = Path("/sys/class/net")
 _ARPHRD_CAN = "280"
 _SPECS = "auto, embedded, virtual[:NAME], udp_multicast[:GROUP], socketcan:INTERFACE or a python-can INTERFACE:CHANNEL"
@@ -107,7 +106,7 @@ def open_can(spec: str) -> can.BusABC:
         if kind == "virtual":
             return can.Bus(interface="virtual", channel=channel)
         if kind == "udp_multicast":
-            return LoopbackBus(channel)
+            return UdpBus(channel)
         return can.Bus(interface=kind, channel=channel, bitrate=BITRATE)
     except (can.CanError, OSError, ImportError, ValueError) as error:
         raise RigError(f"{spec}: {error}".replace("\n", " ")) from error
@@ -154,13 +153,9 @@ def parse_spec(spec: str, where: str) -> tuple[str, str]:
     if kind == "virtual":
         return kind, channel or "eha-rig"
     if kind == "udp_multicast":
-        group = channel or _GROUP
-        try:
-            if ipaddress.IPv4Address(group).is_multicast:
-                return kind, group
-        except ValueError:
-            pass
-        raise InputError(where, spec, "an IPv4 multicast group, such as udp_multicast:239.0.0.1")
+        if not is_group(channel or GROUP):
+            raise InputError(where, spec, "an IPv4 multicast group, such as udp_multicast:239.0.0.1")
+        return kind, channel or GROUP
     if kind in can.VALID_INTERFACES and channel:
         return kind, channel
     raise InputError(where, spec, _SPECS)

@@ -14,15 +14,15 @@ from can.interfaces.socketcan import SocketcanBus
 
 from plant.errors import RigError
 from rig.network.bus import EmbeddedBus
+from rig.network.can_interface import UdpBus
 from rig.network.clock import Clock, WallClock
 from rig.network.frame import Frame, Node, Send
-from rig.network.udp import LoopbackBus
+from rig.network.udp import SO_RXQ_OVFL, SO_TIMESTAMPNS, set_receive_options
 
 _CAN_FRAME = struct.Struct("=IB3x8s")  # linux/can.h
 _TIMESPEC = struct.Struct("@qq")
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
-_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 35, 40, 33  # asm-generic/socket.h
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_JOIN_FILTERS = 101, 1, 6  # linux/can/raw.h
@@ -47,8 +47,7 @@ class Link:
         self._foreign = 0  # bits of a COB-ID that a frame must not have
         if isinstance(bus, SocketcanBus):
             self._socket = bus.socket
-            _enlarge_receive_buffer(self._socket)
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+            set_receive_options(self._socket)
 
     @property
     def overflows(self) -> int:
@@ -96,7 +95,7 @@ class Link:
         self._set_filters()
 
     def _set_filters(self) -> None:
-        if isinstance(self._bus, LoopbackBus):
+        if isinstance(self._bus, UdpBus):
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
             exact = _IDENTIFIER | _EXTENDED | _REMOTE
@@ -121,7 +120,7 @@ class Link:
         return frames
 
     def _take_messages(self, timeout: float) -> Iterator[can.Message]:
-        if isinstance(self._bus, LoopbackBus):
+        if isinstance(self._bus, UdpBus):
             yield from self._bus.receive_waiting(timeout)
             return
         message = self._bus.recv(timeout)
@@ -141,17 +140,20 @@ class Link:
                 return frames
             t_ns = self._clock()
             for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
+                if kind == SO_TIMESTAMPNS:
                     seconds, ns = _TIMESPEC.unpack(value)
                     t_ns = max(self._latest, min(t_ns, seconds * 1_000_000_000 + ns - epoch))
-                elif kind == _SO_RXQ_OVFL:
+                elif kind == SO_RXQ_OVFL:
                     self._in_kernel = int.from_bytes(value, "little")
             self._latest = t_ns
             identifier, length, payload = _CAN_FRAME.unpack(data)
             if identifier < _ERROR:
                 frames.append(Frame(t_ns, identifier, payload[:length]))
+            elif identifier & _ERROR:
+                self.error_frames += 1
+                self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
             else:
-                self._count(identifier, payload)
+                self.dropped += 1
 
     def _find_epoch(self) -> int:
         """Wall clock minus the link's clock, ns. A thread that is interrupted between the two reads them again."""
@@ -166,24 +168,6 @@ class Link:
                 break
         return epoch
 
-    def _count(self, identifier: int, payload: bytes) -> None:
-        """Count an error frame or a frame of a kind that the bench does not use."""
-        if identifier & _ERROR:
-            self.error_frames += 1
-            self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
-        else:
-            self.dropped += 1
-
-
-def _enlarge_receive_buffer(raw: socket.socket, size: int = 4 << 20) -> None:
-    """Room for thousands of frames: by default the kernel drops what comes after 477 of them.
-
-    `size` in bytes; beyond the system's limit only with the right to (CAP_NET_ADMIN).
-    """
-    try:
-        raw.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
-    except OSError:
-        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
 
 
 MS = 1_000_000  # ns
@@ -284,8 +268,7 @@ class LinkWire:
 
         A node that is gone must not make clean-up last minutes.
         """
-        self.clock: Clock = clock
-        self._wall = clock
+        self.clock = clock
         self.link, self._grace, self._patience = link, grace, patience
         self._missed = 0  # cycles in a row without all frames
         self.receive: Callable[[Frame], None] = _ignore_frame
@@ -329,11 +312,6 @@ class LinkWire:
     def close(self) -> None:
         """See `Wire`."""
         self.link.close()
-
-    @property
-    def origin_ns(self) -> int:
-        """Zero of the wire's clock on CLOCK_MONOTONIC, ns."""
-        return self._wall.origin_ns
 
     @property
     def grace_ns(self) -> int:

@@ -9,7 +9,7 @@ import contextlib
 import struct
 from collections.abc import Callable, Container
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import canopen
 from canopen.emcy import EmcyError
@@ -475,8 +475,7 @@ class CheckedSdoClient(SdoClient):
         response: bytes = self.responses.get_nowait()
         code, problem = find_problem(sdo_request, response)
         if problem:
-            self._send_abort(code)
-            raise ConfirmationError(f"{self._describe_transfer()}: {problem}")
+            self._refuse(problem, code)
         if response[0] == _ABORT:
             raise SdoAbortedError(int.from_bytes(response[4:], "little"))
         return response
@@ -488,13 +487,14 @@ class CheckedSdoClient(SdoClient):
         if response[0] & 2:  # expedited
             data = response[4:8 - (response[0] >> 2 & 3)] if response[0] & 1 else response[4:]
         else:
-            announced = size if response[0] & 1 else None
-            data = self._upload_segments(announced)
-        expected = self._find_size(index, subindex)
-        if expected and response[0] & 3 == 2 and len(data) > expected:
-            data = data[:expected]  # expedited without a length: the object's own length counts
-        if expected and len(data) != expected:
-            raise ConfirmationError(f"{self._describe_transfer()}: {len(data)} bytes, expected {expected}")
+            data = self._upload_segments(size if response[0] & 1 else None)
+        variable = self.od.get_variable(index, subindex)
+        if variable is not None and variable.fixed_size:
+            expected = len(variable) // 8
+            if response[0] & 3 == 2:  # expedited without a length: the object's own length counts
+                data = data[:expected]
+            if len(data) != expected:
+                self._refuse(f"{len(data)} bytes, expected {expected}")
         return data
 
     def _upload_segments(self, announced: int | None) -> bytes:
@@ -506,11 +506,10 @@ class CheckedSdoClient(SdoClient):
             toggle ^= _TOGGLE
             last = response[0] & 1
             if len(data) > (self.largest_upload if announced is None else announced):
-                self._send_abort(_LENGTH_WRONG)
                 most = f"{self.largest_upload} bytes" if announced is None else f"the {announced} bytes announced"
-                raise ConfirmationError(f"{self._describe_transfer()}: more than {most}")
+                self._refuse(f"more than {most}", _LENGTH_WRONG)
         if announced is not None and len(data) != announced:
-            raise ConfirmationError(f"{self._describe_transfer()}: {len(data)} bytes, {announced} were announced")
+            self._refuse(f"{len(data)} bytes, {announced} were announced")
         return bytes(data)
 
     def download(self, index: int, subindex: int, data: bytes, force_segment: bool = False) -> None:
@@ -528,26 +527,15 @@ class CheckedSdoClient(SdoClient):
             self.request_response(bytes((command,)) + part.ljust(7, b"\0"))
             toggle ^= _TOGGLE
 
-    def open(self, *args: Any, **options: Any) -> Any:
-        """Refuse the library's streams, and with them block transfer: `upload` and `download` do all.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError("SDO by upload and download only")
-
-    def _find_size(self, index: int, sub: int) -> int:
-        """Length in bytes of an object of the node's EDS, 0 if it has no fixed one or is not in the EDS."""
-        variable = self.od.get_variable(index, sub)
-        return len(variable) // 8 if variable is not None and variable.fixed_size else 0
-
     def _send_abort(self, code: int) -> None:
         self.send_request(bytes((_ABORT,)) + self._object + code.to_bytes(4, "little"))
 
-    def _describe_transfer(self) -> str:
-        """Node and object, as a message begins."""
+    def _refuse(self, problem: str, code: int = 0) -> NoReturn:
+        """Give the transfer up, with an abort unless it is over."""
+        if code:
+            self._send_abort(code)
         index, sub = struct.unpack("<HB", self._object)
-        return f"node {self.rx_cobid - 0x600}, SDO of object 0x{index:04X} sub {sub}"
+        raise ConfirmationError(f"node {self.rx_cobid - 0x600}, SDO of object 0x{index:04X} sub {sub}: {problem}")
 
 
 def find_problem(request: bytes, response: bytes) -> tuple[int, str]:

@@ -33,11 +33,11 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import can
+import msgpack  # type: ignore[import-untyped]
 import numpy as np
 from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ from plant.compile import LibraryFunction, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
 from rig.network.bus import parse_spec, require_interface
-from rig.network.udp import GIVE, TAKE, TURN_LIMIT_NS, Turn
+from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_NS, Turn, set_receive_options
 
 # status of receive_frame
 TIMEOUT, FRAME, WOKEN = 0, 1, 2
@@ -62,10 +62,9 @@ KINDS = {"socketcan": SOCKETCAN, "udp_multicast": UDP}
 # The port's memory, as words of 8 bytes. First single numbers ..
 _KIND, _RX, _TX, _TURN, _ERROR = range(5)
 _IN_KERNEL, _IN_CONTROLLER, _ERROR_FRAMES, _DROPPED, _UNSENT = range(5, 10)
-_OWN, _COUNTS_LOSSES = 15, 16  # UDP: own port, network order; whether the kernel's count is of losses alone
-_STAMPED, _PAYLOAD_WORD, _LAST_LENGTH = 17, 18, 19  # whether kernel times are used; payload, and length of the last
 _LATEST = 10  # time of the last frame: of two frames in a queue the second is not the earlier one
-_ID_AT, _LENGTH_AT, _DATA_AT, _TAIL = range(11, 15)  # byte offsets in the datagram to be sent; length of its end
+_OWN, _COUNTS_LOSSES = 11, 12  # UDP: own port, network order; whether the kernel's count is of losses alone
+_STAMPED, _PAYLOAD_WORD = 13, 14  # whether kernel times are used; a payload on its way in or out
 # .. then what the kernel reads and writes (asm-generic, 64 bit), as byte offsets
 _MESSAGE, _VECTOR, _POLL, _TIME, _ERRNO, _LIMIT = 256, 320, 336, 352, 368, 384
 _TAKE, _GIVE, _EVENT, _SENDER = 400, 416, 424, 432
@@ -73,15 +72,11 @@ _CONTROL, _ALLOWED, _IN, _OUT = 512, 1024, 2048, 4096
 _CONTROL_SIZE, _IN_SIZE, _OUT_SIZE, _SENDER_SIZE = 256, 2048, 512, 16
 _CAN_SIZE = 16  # struct can_frame
 
-_SOL_SOCKET, _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE = 1, 35, 40, 33
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER = 101, 1, 2
 _DONTWAIT, _POLLIN = 0x40, 1
 _EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
-_TRUNCATED = 0x20  # MSG_TRUNC
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
-_RECEIVE_BUFFER = 8 << 20  # bytes asked for
-_RECEIVE_TIMEOUT = struct.pack("@qq", 0, 20_000)  # struct timeval, s and us: the longest that `await_frame` waits
 
 _recvmsg = LibraryFunction("recvmsg", "qiqi")
 _send = LibraryFunction("send", "qiqqi")
@@ -92,7 +87,6 @@ _clock_gettime = LibraryFunction("clock_gettime", "iiq")
 _clock_nanosleep = LibraryFunction("clock_nanosleep", "iiiqq")
 _errno_location = LibraryFunction("__errno_location", "q")
 _memcpy = LibraryFunction("memcpy", "qqqq")
-_memcmp = LibraryFunction("memcmp", "iqqq")
 
 
 class Port(NamedTuple):
@@ -266,10 +260,10 @@ def _find_time(port: Port) -> int:
     wall = -1
     while place + 16 <= end:
         size = words[place // 8]
-        if port.halves[place // 4 + 2] == _SOL_SOCKET:
-            if port.halves[place // 4 + 3] == _SO_TIMESTAMPNS:
+        if port.halves[place // 4 + 2] == socket.SOL_SOCKET:
+            if port.halves[place // 4 + 3] == SO_TIMESTAMPNS:
                 wall = words[place // 8 + 2] * 1_000_000_000 + words[place // 8 + 3]
-            elif port.halves[place // 4 + 3] == _SO_RXQ_OVFL and words[_COUNTS_LOSSES]:
+            elif port.halves[place // 4 + 3] == SO_RXQ_OVFL and words[_COUNTS_LOSSES]:
                 words[_IN_KERNEL] = _integer(port.halves[place // 4 + 4]) & 0xFFFFFFFF
         if size < 16:
             break
@@ -300,11 +294,7 @@ def _find_clock_distance(port: Port) -> int:
 def _decode(port: Port, size: int) -> tuple[int, int, int, int]:
     """(kind, COB-ID, length, payload) of what came."""
     if port.words[_KIND] == UDP:
-        if port.halves[(_MESSAGE + 48) // 4] & _TRUNCATED:
-            return _ERROR_FRAME, 0, 0, 0
-        if _has_own_layout(port, size):
-            return _decode_own_layout(port, size)
-        return decode_datagram(port.octets, _IN, size)
+        return decode_datagram(port, size)
     if size != _CAN_SIZE:
         return _OTHER, 0, 0, 0
     identifier = _integer(port.halves[_IN // 4]) & 0xFFFFFFFF
@@ -360,174 +350,83 @@ def _transmit(port: Port, size: int) -> int:
 
 # ---------------------------------------------------------------------------------------- datagrams of python-can
 
-_NAMES = ("arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "dlc", "data",
-          "timestamp", "channel", "bitrate_switch", "error_state_indicator")
-_ID, _EXTENDED, _REMOTE, _IS_ERROR, _FD, _DLC, _PAYLOAD = range(7)
-_KEYS = np.array([list(name.encode().ljust(24, b"\0")) for name in _NAMES], np.uint8)
-_KEY_LENGTHS = np.array([len(name) for name in _NAMES])
+# A datagram is a msgpack map, always with the same keys in the same order; an example tells which.
+_EXAMPLE = pack_message(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8))))
+_ID_AT, _LENGTH_AT, _DATA_AT = (_EXAMPLE.index(text) + len(text) for text in (b"\xcd", b"\xa3dlc", b"\xc4\x08"))
+_TAIL = len(_EXAMPLE) - _DATA_AT - 8  # bytes after the payload
+_NAMES = list(msgpack.unpackb(_EXAMPLE))
+_KEYS = [msgpack.packb(name) for name in _NAMES]
+_KEY_BYTES, _KEY_LENGTHS = np.frombuffer(b"".join(_KEYS), np.uint8), np.array([len(key) for key in _KEYS])
+_ID, _EXTENDED, _REMOTE, _IS_ERROR, _FD, _DLC, _PAYLOAD = (_NAMES.index(name) for name in (
+    "arbitration_id", "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "dlc", "data"))
+_FALSE, _BYTES, _TEXT = 0xC2, 0xC4, 0xD9  # msgpack's first byte of a value; of the last two the length follows
+_SIZES = np.full(256, -1)  # bytes after the first byte
+_SIZES[:0x80] = _SIZES[[0xC0, 0xC2, 0xC3]] = 0  # a small number, nothing, false, true
+_SIZES[0xA0:0xC0], _SIZES[0xCA:0xD0] = np.arange(32), (4, 8, 1, 2, 4, 8)  # a short text; floats, unsigned numbers
 
 
 def encode_datagram(port: Port, cob_id: int, length: int, data: int) -> int:
     """Write a frame into the port's buffer, as python-can's udp_multicast packs it; its length in bytes."""
-    octets, words = port.octets, port.words
-    place = _OUT + words[_ID_AT]
-    octets[place], octets[place + 1] = cob_id >> 8, cob_id & 0xFF
-    octets[_OUT + words[_LENGTH_AT]] = length
-    place = _OUT + words[_DATA_AT]
-    octets[place - 1] = length
-    words[_PAYLOAD_WORD] = data
-    base = octets.ctypes.data
+    octets, base, place = port.octets, port.octets.ctypes.data, _OUT + _DATA_AT
+    octets[_OUT + _ID_AT], octets[_OUT + _ID_AT + 1] = cob_id >> 8, cob_id & 0xFF
+    octets[_OUT + _LENGTH_AT] = octets[place - 1] = length
+    port.words[_PAYLOAD_WORD] = data
     _memcpy(base + place, base + 8 * _PAYLOAD_WORD, length)
-    if words[_LAST_LENGTH] != length:
-        words[_LAST_LENGTH] = length
-        _memcpy(base + place + length, base + _OUT + _OUT_SIZE - words[_TAIL], words[_TAIL])
-    return _integer(place + length + words[_TAIL] - _OUT)
-
-
-def _has_own_layout(port: Port, size: int) -> bool:
-    """Whether a datagram differs from ours only in identifier, length and payload: most do, and are read at once."""
-    words, base = port.words, port.octets.ctypes.data
-    id_at, length_at, data_at = words[_ID_AT], words[_LENGTH_AT], words[_DATA_AT]
-    length = size - data_at - words[_TAIL]
-    if not 0 <= length <= 8 or port.octets[_IN + length_at] != length or port.octets[_IN + data_at - 1] != length:
-        return False
-    if _memcmp(base + _IN, base + _OUT, id_at) != 0:
-        return False
-    if _memcmp(base + _IN + id_at + 2, base + _OUT + id_at + 2, length_at - id_at - 2) != 0:
-        return False
-    if _memcmp(base + _IN + length_at + 1, base + _OUT + length_at + 1, data_at - length_at - 2) != 0:
-        return False
-    return bool(_memcmp(base + _IN + data_at + length, base + _OUT + _OUT_SIZE - words[_TAIL], words[_TAIL]) == 0)
-
-
-def _decode_own_layout(port: Port, size: int) -> tuple[int, int, int, int]:
-    """As `decode_datagram`, for what `_has_own_layout`."""
-    words, octets = port.words, port.octets
-    place = _IN + words[_ID_AT]
-    cob_id = _integer(octets[place]) << 8 | _integer(octets[place + 1])
-    if cob_id > 0x7FF:
-        return _ERROR_FRAME, 0, 0, 0
-    length = _integer(size - words[_DATA_AT] - words[_TAIL])
-    words[_PAYLOAD_WORD] = 0
-    _memcpy(octets.ctypes.data + 8 * _PAYLOAD_WORD, octets.ctypes.data + _IN + words[_DATA_AT], length)
-    return _DATA, cob_id, length, _integer(words[_PAYLOAD_WORD])
+    _memcpy(base + place + length, base + _OUT + _OUT_SIZE - _TAIL, _TAIL)
+    return _integer(_DATA_AT + length + _TAIL)
 
 
 @keep_apart
-def decode_datagram(octets: NDArray[np.uint8], start: int, size: int) -> tuple[int, int, int, int]:
-    """(kind, COB-ID, length, payload) of a msgpack map as python-can's udp_multicast packs it, keys in any order.
+def decode_datagram(port: Port, size: int) -> tuple[int, int, int, int]:
+    """(kind, COB-ID, length, payload) of `size` bytes in the port's buffer, as python-can's udp_multicast packs them.
 
-    What is no such map, or contradicts itself, counts as an error frame, as in `udp.LoopbackBus`.
+    What is laid out otherwise, or contradicts itself, counts as an error frame, as in `UdpBus`.
     """
-    end = start + size
-    pairs, place = _read_map_head(octets, start, end)
-    cob_id, dlc, flags = -1, -1, 0
-    payload, length = 0, 0
-    for _ in range(pairs):
-        key, place = _read_key(octets, place, end)
-        kind, value, span, place = _read_value(octets, place, end)
-        if place < 0 or key < 0:
+    octets, place, end, at = port.octets, _IN + 1, _IN + size, 0
+    cob_id, dlc, payload, length, flags = -1, -1, 0, -1, 0
+    if octets[_IN] != 0x80 | len(_KEY_LENGTHS):
+        return _ERROR_FRAME, 0, 0, 0
+    for key in range(len(_KEY_LENGTHS)):
+        for _ in range(_KEY_LENGTHS[key]):
+            if octets[place] != _KEY_BYTES[at]:
+                return _ERROR_FRAME, 0, 0, 0
+            place, at = place + 1, at + 1
+        first = _integer(octets[place])
+        place += 1
+        count = _integer(_SIZES[first])
+        if first in (_BYTES, _TEXT):
+            count = _integer(octets[place])
+            place += 1
+        if count < 0 or place + count > end:
             return _ERROR_FRAME, 0, 0, 0
-        if key == _PAYLOAD:
-            if kind != _BYTES and kind != _NOTHING:
-                return _ERROR_FRAME, 0, 0, 0
-            payload, length = value, span
-        elif key == _ID:
-            if kind != _NUMBER:
-                return _ERROR_FRAME, 0, 0, 0
-            cob_id = value
+        if key == _ID:
+            cob_id = _read_number(octets, first, place, count)
         elif key == _DLC:
-            if kind == _NUMBER:
-                dlc = value
-            elif kind != _NOTHING:
-                return _ERROR_FRAME, 0, 0, 0
-        elif key <= _FD and value:
+            dlc = _read_number(octets, first, place, count)
+        elif key == _PAYLOAD:
+            payload, length = place, count if first == _BYTES else -1
+        elif key in (_EXTENDED, _REMOTE, _IS_ERROR, _FD) and first != _FALSE:
             flags |= 1 << key
-    if pairs < 0 or place != end:
+        place += count
+    if place != end or dlc < 0 or length < 0 or flags & 1 << _IS_ERROR:
         return _ERROR_FRAME, 0, 0, 0
-    if flags & 1 << _IS_ERROR:
-        return _ERROR_FRAME, 0, 0, 0
-    if dlc < 0:
-        dlc = length
     if flags:
         return _OTHER, 0, 0, 0
     if cob_id < 0 or cob_id > 0x7FF or length > 8 or dlc != length:
         return _ERROR_FRAME, 0, 0, 0
-    bits = 0
-    for i in range(length):
-        value = _integer(octets[payload + i])
-        bits |= (value ^ 0x80) - 0x80 << 8 * i if i == 7 else value << 8 * i
-    return _DATA, cob_id, length, bits
+    port.words[_PAYLOAD_WORD] = 0
+    _memcpy(octets.ctypes.data + 8 * _PAYLOAD_WORD, octets.ctypes.data + payload, length)
+    return _DATA, cob_id, length, _integer(port.words[_PAYLOAD_WORD])
 
 
-def _read_map_head(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
-    """(number of pairs, place behind the head); -1 pairs for what is no small map."""
-    if place >= end or octets[place] & 0xF0 != 0x80:
-        return -1, place
-    return _integer(octets[place] & 0x0F), place + 1
-
-
-def _read_key(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
-    """(index in `_NAMES`, place behind the key); -1 for what is no such text."""
-    if place < 0 or place >= end or octets[place] & 0xE0 != 0xA0:
-        return -1, -1
-    length = _integer(octets[place] & 0x1F)
-    place += 1
-    if place + length > end:
-        return -1, -1
-    for key in range(len(_KEY_LENGTHS)):
-        if _KEY_LENGTHS[key] == length:
-            i = 0
-            while i < length and octets[place + i] == _KEYS[key, i]:
-                i += 1
-            if i == length:
-                return key, place + length
-    return -1, place + length
-
-
-_NUMBER, _NOTHING, _BYTES, _TEXT = range(4)  # kinds of value
-
-
-def _read_value(octets: NDArray[np.uint8], place: int, end: int) -> tuple[int, int, int, int]:
-    """(kind, number or place of the bytes, their length, place behind the value); place -1 for any other value."""
-    if place < 0 or place >= end:
-        return 0, 0, 0, -1
-    first = _integer(octets[place])
-    place += 1
+def _read_number(octets: NDArray[np.uint8], first: int, place: int, count: int) -> int:
+    """An unsigned number of `count` bytes, or the first byte itself; -1 for another kind of value."""
     if first < 0x80:
-        return _NUMBER, first, 0, place
-    if first == 0xC0:
-        return _NOTHING, 0, 0, place
-    if first == 0xC2 or first == 0xC3:
-        return _NUMBER, first - 0xC2, 0, place
-    if 0xCC <= first <= 0xCF:  # unsigned, 1 to 8 bytes
-        value, place = _read_big_endian(octets, place, 1 << first - 0xCC, end)
-        return _NUMBER, value, 0, place
-    if first == 0xCA or first == 0xCB:  # float: a time stamp
-        value, place = _read_big_endian(octets, place, 1 << first - 0xC8, end)
-        return _TEXT, value, 0, place
-    length = -1
-    kind = _TEXT
-    if first & 0xE0 == 0xA0:
-        length = first & 0x1F
-    elif first == 0xC4 or first == 0xC5:
-        length, place = _read_big_endian(octets, place, 1 << first - 0xC4, end)
-        kind = _BYTES
-    elif first == 0xD9 or first == 0xDA:
-        length, place = _read_big_endian(octets, place, 1 << first - 0xD9, end)
-    if place < 0 or length < 0 or place + length > end:
-        return 0, 0, 0, -1
-    return kind, place, length, place + length
-
-
-def _read_big_endian(octets: NDArray[np.uint8], place: int, length: int, end: int) -> tuple[int, int]:
-    """(number, place behind it)."""
-    value = 0
-    if place + length > end:
-        return value, -1
-    for i in range(length):
+        return first
+    value = 0 if 0xCC <= first <= 0xCF else -1
+    for i in range(count):
         value = value << 8 | _integer(octets[place + i])
-    return value, place + length
+    return value
 
 
 # ---------------------------------------------------------------------------------------- opening
@@ -553,19 +452,25 @@ class RawBus:
             raise InputError("--bus", spec, "socketcan:INTERFACE or udp_multicast[:GROUP] on a little-endian machine")
         self.spec = spec
         self.port = _make_port()
-        self._sockets: list[socket.socket] = []
         self._turn: Turn | None = None
-        self._set_kernel_filter: Callable[[Sequence[int]], None]
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        words = self.port.words
+        words[_KIND], words[_LATEST] = KINDS[kind], time.monotonic_ns()
+        words[_STAMPED] = words[_COUNTS_LOSSES] = True
         try:
-            (self._open_socketcan if kind == "socketcan" else self._open_udp)(channel, cob_ids)
+            with contextlib.ExitStack() as stack:
+                self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+                stack.callback(os.close, self._wake)
+                self._rx, tx = (_open_socketcan if kind == "socketcan" else self._open_udp)(channel, stack)
+                words[_RX], words[_TX] = self._rx.fileno(), tx.fileno()
+                self.port.halves[_POLL // 4: _POLL // 4 + 4] = self._rx.fileno(), _POLLIN, self._wake, _POLLIN
+                self._allow(range(0x800))
+                if cob_ids is not None:
+                    self.set_filter(cob_ids)
+                elif kind == "socketcan":
+                    self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", 0x1FFFFFFF))
+                self._opened = stack.pop_all()
         except OSError as error:
-            self.close()
             raise RigError(f"{spec}: {error.strerror}") from error
-        except BaseException:
-            self.close()
-            raise
-        self._prepare(KINDS[kind], cob_ids)
 
     def __enter__(self) -> RawBus:
         return self
@@ -609,53 +514,16 @@ class RawBus:
 
     def close(self) -> None:
         """Give the bus back. No thread may be using the port any more."""
-        for each in self._sockets:
-            each.close()
-        if self._turn is not None:
-            self._turn.close()
-        if self._wake >= 0:
-            os.close(self._wake)
-        self._sockets, self._turn, self._wake = [], None, -1
+        self._opened.close()
+        self._turn = None
 
-    def _open_socketcan(self, channel: str, cob_ids: Sequence[int] | None) -> None:
-        require_interface(channel)
-        raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        self._sockets.append(raw)
-        self._set_kernel_filter = partial(_filter_socketcan, raw)
-        if cob_ids is not None:
-            self._set_kernel_filter(cob_ids)
-        else:
-            raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", 0x1FFFFFFF))
-        set_receive_options(raw)
-        raw.bind((channel,))
-        self.port.words[_RX] = self.port.words[_TX] = raw.fileno()
-
-    def _open_udp(self, group: str, cob_ids: Sequence[int] | None) -> None:
-        tx = udp.open_sender()
-        self._sockets.append(tx)
-        rx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sockets.append(rx)
-        own = tx.getsockname()[1]
-        self._set_kernel_filter = partial(udp.attach_filter, rx, own)
-        if cob_ids is not None:
-            self._set_kernel_filter(cob_ids)
-        set_receive_options(rx)
-        self.port.words[_OWN] = socket.htons(own)
-        udp.join_group(rx, group, udp.PORT)
+    def _open_udp(self, group: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
+        """Sockets that receive and send."""
+        rx, tx, self._turn = udp.open_sockets(group, udp.PORT, stack)
+        self.port.words[_OWN] = socket.htons(tx.getsockname()[1])
         tx.connect((group, udp.PORT))
-        self._turn = Turn(group, udp.PORT)
-        self.port.words[_RX], self.port.words[_TX] = rx.fileno(), tx.fileno()
         self.port.words[_TURN] = self._turn.identifier
-        _prepare_datagram(self.port)
-
-    def _prepare(self, kind: int, cob_ids: Sequence[int] | None) -> None:
-        """Fill in what is the same for both kinds of bus."""
-        words, halves = self.port.words, self.port.halves
-        words[_KIND], words[_LATEST] = kind, time.monotonic_ns()
-        words[_STAMPED] = 1
-        words[_COUNTS_LOSSES] = kind == SOCKETCAN or cob_ids is None
-        halves[_POLL // 4: _POLL // 4 + 4] = words[_RX], _POLLIN, self._wake, _POLLIN
-        self._allow(cob_ids)
+        return rx, tx
 
     def set_filter(self, cob_ids: Sequence[int]) -> None:
         """Receive these COB-IDs from now on. Another thread may be receiving.
@@ -663,11 +531,17 @@ class RawBus:
         Raises:
             RigError: the kernel refuses.
         """
+        is_socketcan = bool(self.port.words[_KIND] == SOCKETCAN)
         try:
-            self._set_kernel_filter(cob_ids)
+            if is_socketcan:
+                exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
+                filters = b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids)
+                self._rx.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, filters)
+            else:
+                udp.attach_filter(self._rx, socket.ntohs(int(self.port.words[_OWN])), cob_ids)
         except OSError as error:
             raise RigError(f"{self.spec}: {error.strerror}") from error
-        self.port.words[_COUNTS_LOSSES] = self.port.words[_KIND] == SOCKETCAN
+        self.port.words[_COUNTS_LOSSES] = is_socketcan
         self._allow(cob_ids)
 
     def use_kernel_times(self, is_wanted: bool) -> None:
@@ -676,17 +550,20 @@ class RawBus:
         """
         self.port.words[_STAMPED] = is_wanted
 
-    def _allow(self, cob_ids: Sequence[int] | None) -> None:
+    def _allow(self, cob_ids: Sequence[int]) -> None:
         """One bit a COB-ID, for the frames that the kernel lets through."""
         allowed = np.zeros(0x800, np.uint8)
-        allowed[slice(None) if cob_ids is None else list(cob_ids)] = 1
+        allowed[list(cob_ids)] = 1
         self.port.octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
 
 
-def _filter_socketcan(raw: socket.socket, cob_ids: Sequence[int]) -> None:
-    """Let only these data frames through."""
-    exact = 0x7FF | 0xC0000000  # the identifier, and neither extended nor remote
-    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"".join(struct.pack("=II", cob_id, exact) for cob_id in cob_ids))
+def _open_socketcan(channel: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
+    """The socket that receives and sends, twice."""
+    require_interface(channel)
+    raw = stack.enter_context(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW))
+    set_receive_options(raw)
+    raw.bind((channel,))
+    return raw, raw
 
 
 def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None) -> RawBus:
@@ -697,19 +574,6 @@ def open_raw_bus(spec: str, cob_ids: Sequence[int] | None = None) -> RawBus:
 def can_open(spec: str) -> bool:
     """Whether compiled loops can use this bus; the others are for python-can, in soft real time."""
     return spec.partition(":")[0] in KINDS and sys.byteorder == "little" and sys.platform == "linux"
-
-
-def set_receive_options(raw: socket.socket) -> None:
-    """A large receive buffer (beyond the system's limit where the rights allow), a limit for waiting in the kernel, the
-    kernel's time of each frame and the count of its losses.
-    """
-    try:
-        raw.setsockopt(_SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
-    except OSError:
-        raw.setsockopt(_SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-    raw.setsockopt(_SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_TIMEOUT)
-    raw.setsockopt(_SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-    raw.setsockopt(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
 
 def _make_port() -> Port:
@@ -724,6 +588,8 @@ def _make_port() -> Port:
     for place, operations in ((_TAKE, TAKE), (_GIVE, GIVE)):
         octets = operations.view(np.uint8)
         port.octets[place: place + octets.size] = octets
+    port.octets[_OUT: _OUT + len(_EXAMPLE)] = np.frombuffer(_EXAMPLE, np.uint8)  # for `encode_datagram` to fill in
+    port.octets[_OUT + _OUT_SIZE - _TAIL: _OUT + _OUT_SIZE] = np.frombuffer(_EXAMPLE[-_TAIL:], np.uint8)
     return port
 
 
@@ -732,16 +598,3 @@ def make_closed_port() -> Port:
     port = _make_port()
     port.words[_RX] = port.words[_TX] = -1
     return port
-
-
-def _prepare_datagram(port: Port) -> None:
-    """Lay out python-can's datagram of a frame with an identifier of two bytes; `encode_datagram` fills it in."""
-    message = can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(0xF0, 0xF8)))
-    data = pack_message(message)
-    identifier, payload = data.index(b"\xcd\x07\xff") + 1, data.index(bytes(message.data))
-    tail = data[payload + 8:]
-    port.words[_ID_AT], port.words[_LENGTH_AT] = identifier, data.index(b"\xa3dlc") + 4
-    port.words[_DATA_AT], port.words[_TAIL] = payload, len(tail)
-    port.octets[_OUT: _OUT + len(data)] = np.frombuffer(data, np.uint8)
-    port.words[_LAST_LENGTH] = 8
-    port.octets[_OUT + _OUT_SIZE - len(tail): _OUT + _OUT_SIZE] = np.frombuffer(tail, np.uint8)

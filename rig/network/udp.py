@@ -8,10 +8,11 @@ the others have it. The turn to send (turn.py) keeps the next frame back until t
 """
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
+import ipaddress
 import os
-import select
 import socket
 import struct
 import zlib
@@ -19,113 +20,24 @@ from collections.abc import Collection
 from ctypes import addressof, c_char
 from pathlib import Path
 
-import can
 import numpy as np
-from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
 from plant.errors import RigError
 
-PORT = 43113  # python-can's
+GROUP, PORT = "239.74.163.2", 43113  # python-can's defaults
 _LOOPBACK = socket.inet_aton("127.0.0.1")
 _IP_MULTICAST_ALL = 49  # linux/in.h; without it a socket hears the groups other programs joined
-_SO_ATTACH_FILTER = 26  # asm-generic/socket.h
-_SO_RXQ_OVFL = 40  # asm-generic/socket.h: count of datagrams the kernel dropped
-_BUFFER = 4 << 20  # bytes asked for; a burst beyond the buffer is lost
+_SO_ATTACH_FILTER, _SO_RCVBUFFORCE, SO_TIMESTAMPNS, SO_RXQ_OVFL = 26, 33, 35, 40  # asm-generic/socket.h
+_RECEIVE_BUFFER = 8 << 20  # bytes asked for
+_RECEIVE_TIMEOUT = struct.pack("@qq", 0, 20_000)  # struct timeval, s and us: the longest that `await_frame` waits
 
 
-class LoopbackBus(can.BusABC):
-    """A python-can bus on one IPv4 multicast group, loopback only. `overflows` counts the frames the kernel dropped."""
-
-    def __init__(self, group: str, port: int = PORT) -> None:
-        self.channel_info = f"udp_multicast {group}:{port} on the loopback interface"
-        self.overflows = 0
-        self._is_filtered = False
-        self._destination = group, port
-        try:
-            self._tx = open_sender()
-            self._rx = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            try:
-                self._rx.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-                self._rx.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
-                join_group(self._rx, group, port)
-                self._turn = Turn(group, port)
-            except OSError:
-                self._tx.close()
-                self._rx.close()
-                raise
-        except OSError as error:
-            raise can.CanInitializationError(f"{group}: {error.strerror}") from error
-        self._own = self._tx.getsockname()
-        super().__init__(channel=group)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        while select.select([self._rx], [], [], timeout)[0]:
-            data, ancillary, _, sender = self._rx.recvmsg(4096, socket.CMSG_SPACE(4))
-            self._count_losses(ancillary)
-            if sender != self._own:
-                return _decode_message(data), False
-            timeout = 0.0  # what is behind our own frame has come already; recv() waits again if nothing has
-        return None, False
-
-    def receive_waiting(self, timeout: float) -> list[can.Message]:
-        """All messages that are waiting; if there are none, wait up to `timeout` seconds for the first.
-
-        One wait for all of them: python-can waits, and asks the clock, for each. Raises OSError when the bus is gone.
-        """
-        messages: list[can.Message] = []
-        if timeout > 0 and not select.select([self._rx], [], [], timeout)[0]:
-            return messages
-        while True:
-            try:
-                data, ancillary, _, sender = self._rx.recvmsg(4096, socket.CMSG_SPACE(4), socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return messages
-            self._count_losses(ancillary)
-            if sender != self._own:
-                messages.append(_decode_message(data))
-
-    def _count_losses(self, ancillary: list[tuple[int, int, bytes]]) -> None:
-        for level, kind, value in ancillary:
-            if (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL) and not self._is_filtered:
-                (self.overflows,) = struct.unpack("=I", value)
-
-    def leave_out(self, cob_ids: Collection[int]) -> None:
-        """Let the kernel drop the frames with these COB-IDs: one that Python decodes costs 30 us.
-
-        `overflows` is not counted any more: to the kernel a frame that was filtered out is one that was lost.
-        """
-        self._is_filtered = True
-        attach_filter(self._rx, self._own[1], cob_ids, left_out=True)
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        data = pack_message(msg)
-        try:
-            self._turn.take()
-            try:
-                self._tx.sendto(data, self._destination)
-            finally:
-                self._turn.give()
-        except RigError as error:
-            raise can.CanOperationError(str(error)) from error
-        except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error.strerror}") from error
-
-    def fileno(self) -> int:
-        return self._rx.fileno()
-
-    def shutdown(self) -> None:
-        super().shutdown()
-        self._rx.close()
-        self._tx.close()
-        self._turn.close()
-
-
-def _decode_message(data: bytes) -> can.Message:
-    """The frame in a datagram; a datagram without a valid frame becomes an error frame."""
+def is_group(text: str) -> bool:
+    """Whether a text is an IPv4 multicast group."""
     try:
-        return unpack_message(data, check=True)
-    except Exception:  # msgpack and can.Message raise various exceptions on foreign bytes
-        return can.Message(is_error_frame=True)
+        return ipaddress.IPv4Address(text).is_multicast
+    except ValueError:
+        return False
 
 
 def open_sender() -> socket.socket:
@@ -169,12 +81,31 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
     rx.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(program), addressof(code)))
 
 
-def join_group(rx: socket.socket, group: str, port: int) -> None:
-    """Let a socket hear the group, on 127.0.0.1 alone. Raises OSError."""
+def open_sockets(group: str, port: int, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket, Turn]:
+    """A socket that hears the group, on 127.0.0.1 alone, one that sends to it, and the turn. Raises OSError."""
+    tx = stack.enter_context(open_sender())
+    rx = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    set_receive_options(rx)
     rx.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     rx.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
     rx.bind((group, port))
     rx.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + _LOOPBACK)
+    turn = Turn(group, port)
+    stack.callback(turn.close)
+    return rx, tx, turn
+
+
+def set_receive_options(raw: socket.socket) -> None:
+    """A large receive buffer (beyond the system's limit where the rights allow), a limit for waiting in the kernel, the
+    kernel's time of each frame and the count of its losses. By default the kernel keeps 477 frames.
+    """
+    try:
+        raw.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+    except OSError:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_TIMEOUT)
+    raw.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
 
 
 TURN_LIMIT_NS = 1_000_000_000  # a turn takes 20 us; one that takes a second is held by a stopped or foreign program

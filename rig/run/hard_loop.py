@@ -74,7 +74,7 @@ class HardLoop(Loop):
         self._master, self._wire, self._bus = master, wire, bus
         self._faults, self._log, self._period, self._realtime = faults, log, period_ns, realtime
         self._ahead = ahead if realtime else 1
-        self._origin = wire.origin_ns
+        self._origin = wire.clock.origin_ns
         bus.use_kernel_times(realtime)
         self._play = compile_cycle(realtime)
         self._buffers = hc.make_buffers(ahead, 8 * ahead, 64 * ahead, 1100)

@@ -9,6 +9,7 @@ import pytest
 from bus_stations import spec
 
 from plant import Model
+from rig.network import codec
 from rig.network.bus import open_can
 from rig.network.clock import VirtualClock, WallClock
 from rig.network.frame import Frame
@@ -97,15 +98,24 @@ def alone() -> Master:
     return Master(EmbeddedWire(VirtualClock(), []), lambda: 0)
 
 
-def test_bring_up(wire: Wire) -> None:
-    """Boot-up, scenario, gains, heartbeats, start: what a run begins with."""
+def test_bring_up_and_some_cycles(wire: Wire) -> None:
+    """Boot-up, scenario, gains, heartbeats, start: what a run begins with; then SYNCs that all nodes answer."""
     master = Master(wire, wire.clock.now)
+    assert master.is_present(PLANT, 60.0) and master.is_present(CONTROLLER, 60.0)
     seen: list[tuple[int, int]] = []
+    frames: list[int] = []
     master.hooks.on_state = lambda node, state: seen.append((node, state))
+    master.hooks.on_frame = lambda frame: frames.append(frame.cob_id)
     master.reset()
-    master.configure(SCENARIO, read_gains(Model()), 1_000_000)
+    master.configure(SCENARIO, read_gains(Model()), 0)
     master.start()
     assert wire.wait(lambda: set(master.states.values()) == {5}, 60.0)
+    cycle = {codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE}
+    for k in range(20):
+        frames.clear()
+        master.send(codec.COMMAND, codec.pack_command(1e-3, 7, k))
+        master.send(codec.SYNC, b"")
+        assert wire.wait(lambda: cycle <= set(frames), 60.0)
     master.stop()
     assert wire.wait(lambda: set(master.states.values()) == {127}, 60.0)
     for node in (CONTROLLER, PLANT):
@@ -128,11 +138,6 @@ def test_a_rig_that_stood_still_knows_how_long_answers_may_have_waited(wire: Wir
     for time in times.values():
         assert time.seconds >= time.waited >= 1.1
     assert wire.stalled_ns >= 1_100_000_000
-
-
-def test_who_answers(wire: Wire) -> None:
-    master = Master(wire, wire.clock.now)
-    assert master.is_present(PLANT, 60.0) and master.is_present(CONTROLLER, 60.0)
 
 
 def test_refusals_name_node_and_object(wire: Wire) -> None:
@@ -174,19 +179,13 @@ def test_a_short_sdo_response_is_none() -> None:
         master.configure(SCENARIO, None, 0)
 
 
-def test_emergencies_come_and_go() -> None:
+@pytest.mark.parametrize("end", [Frame(0, 0x083, bytes(8)), Frame(0, 0x703, bytes(1))], ids=["EMCY", "boot-up"])
+def test_emergencies_come_and_go(end: Frame) -> None:
+    """An EMCY without an error ends them, and so does a boot-up: no EMCY says so."""
     master = alone()
     master.receive(Frame(0, 0x083, bytes.fromhex("5082110100000000")))
     assert master.list_errors() == [3]
-    master.receive(Frame(0, 0x083, bytes(8)))
-    assert master.list_errors() == []
-
-
-def test_a_boot_up_ends_the_errors_of_a_node() -> None:
-    """No EMCY says so: the error register of a node that was reset is zero."""
-    master = alone()
-    master.receive(Frame(0, 0x082, bytes.fromhex("3081110000000000")))
-    master.receive(Frame(0, 0x702, bytes(1)))
+    master.receive(end)
     assert master.list_errors() == []
 
 
