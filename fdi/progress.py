@@ -4,11 +4,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import count
 
+# Called with the name of the stage that begins and the share of the whole work done so far, 0 to 1.
+#
+# 0 also stands for "unknown": a bar then shows the stage and the time alone.
 Progress = Callable[[str, float], None]
-"""Called with the name of the stage that begins and the share of the whole work done so far, 0 to 1.
-
-0 also stands for "unknown": a bar then shows the stage and the time alone.
-"""
 
 
 def ignore_progress(stage: str, share: float) -> None:

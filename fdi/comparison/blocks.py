@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.noise import find_floors, floor_from_data
 from fdi.estimation.replay import BRIDGED_ROWS, Columns, align_columns, differentiate
@@ -34,13 +33,10 @@ from fdi.thresholds import (
     SPOOL_FITS_RATIO,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
-from fdi.trace.trace import Trace, bridge_gaps, hold_last, rms, shift_rows
+from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, rms, shift_rows
 from plant.controller import compute_answers
 from plant.forced import compute_flow_balance, compute_force_balance
 from plant.model import Model
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SPAN = 0.02  # s; the flow is compared over the ram's way in it: longer adds up noise of XS, shorter shows that of XJ
 MEAN = 0.011  # s, over which the direction of motion is told

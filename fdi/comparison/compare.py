@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.comparison import blocks
 from fdi.comparison.blocks import ControllerBlock
@@ -57,10 +56,8 @@ from fdi.thresholds import (
     UNDECIDED_SHARE,
 )
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace, rms
+from fdi.trace.trace import Flags, Floats, Trace, rms
 from plant.model import Model
-
-Floats = NDArray[np.float64]
 
 BALANCED = "eha"  # the plant whose metering edges and ram the balances of `plant.forced` are
 STAGES = 7
@@ -163,9 +160,9 @@ def _widen_by_guess(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Flo
     return {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
 
 
-def _find_undecided(replay: Replay) -> NDArray[np.bool_]:
+def _find_undecided(replay: Replay) -> Flags:
     """Rows that hang on a knife's edge, unless that is half the trace."""
-    out: NDArray[np.bool_] = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
+    out: Flags = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     return out
 
 

@@ -22,10 +22,7 @@ from fdi.estimation.noise import solve_yule_walker
 from fdi.estimation.replay import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
 from fdi.trace.sections import describe_section, find_sections
-from fdi.trace.trace import Trace, hold_last
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from fdi.trace.trace import Flags, Floats, Trace, hold_last
 
 SMOOTH = 0.021  # s of measured position that a speed is taken from
 REVERSES = 5e-4  # m/s in the other direction make a reversal; a ram at rest trembles by less

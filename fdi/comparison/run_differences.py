@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.noise import FINEST, floor_from_data
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Check, Trace, rms
+from fdi.trace.trace import Check, Flags, Floats, Trace, rms
 
-Floats = NDArray[np.float64]
 COMPARED = ("xj", "p12", "xs", "cor", "load")
 SAME_COMMAND = 1.5e-7  # m; the bus carries steps of 1e-7 m
 
@@ -242,15 +240,15 @@ def _share_rows(a: Trace, b: Trace, offset: float) -> _Rows:
     return _Rows(slower[(slower >= low) & (slower <= high)], offset, a, b)
 
 
-def _find_common_rows(rows: _Rows) -> NDArray[np.bool_]:
+def _find_common_rows(rows: _Rows) -> Flags:
     """The rows in which both commands are known and equal."""
     first, second = rows.sample("com")
     with np.errstate(invalid="ignore"):
-        agrees: NDArray[np.bool_] = np.abs(first - second) <= SAME_COMMAND
+        agrees: Flags = np.abs(first - second) <= SAME_COMMAND
     return agrees
 
 
-def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: NDArray[np.bool_],
+def _list_notes(reference: Run, other: Run, offset: float, rows: _Rows, agrees: Flags,
                 is_same: bool) -> Iterator[str]:
     """What a reader must know before trusting the differences."""
     a, b = reference.trace, other.trace

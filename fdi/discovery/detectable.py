@@ -13,27 +13,25 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit, fit_unknowns
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import DETECTABLE_MARGIN, GAIN_DETECTED
+from fdi.trace.trace import Floats
 from plant.effects import CATALOGUE
 from plant.model import Model
 from plant.threads import map_in_threads
-
-Floats = NDArray[np.float64]
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
 REFIT_ROUNDS = 4
 SMALLEST_FOUND = 0.022  # of the smallest start: `explain` hardly finds smaller sizes, whatever they gain
 SMALLEST_TRIED = 0.008  # of the smallest start
+# How much larger these effects must be than others: a fit to a real run makes up for more of them than the fits here.
+#
+# From 15 effects hidden in units of their own.
 FOUND_LATE = {"flow_force": 7.0, "coil_lag": 3.5, "transport_delay": 4.0}
-"""How much larger these effects must be than others: a fit to a real run makes up for more of them than the fits here.
-
-From 15 effects hidden in units of their own."""
 WITHOUT_SIZE = ("Hz", "rad")  # units of parameters that say where an effect is and not how large
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.discovery.detectable import Detectable, find_hidden_effects
 from fdi.discovery.search import Hypothesis, Search, Sensitivity, WholeRuns, compute_sensitivity
@@ -29,12 +28,10 @@ from fdi.thresholds import (
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
-from fdi.trace.trace import Trace, hold_last
+from fdi.trace.trace import Floats, Trace, hold_last
 from plant.controller import compute_answers
 from plant.effects import CATALOGUE
 from plant.model import Model, list_searched_effects
-
-Floats = NDArray[np.float64]
 
 FINE = 20  # steps a cycle of the last fits
 TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less

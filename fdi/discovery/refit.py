@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.discovery.explain import find_marks, measure_gain, measure_holdout
 from fdi.discovery.search import Hypothesis, Prospect, Search, WholeRuns, choose_search_excerpt, scan_effects
@@ -23,13 +22,11 @@ from fdi.estimation.unknowns import (
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import GAIN_SEEN, WHITE_SQUARE_POOR
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Flags, Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.lanes import list_kernel_variants
 from plant.model import Model, list_offered_effects
-
-Floats = NDArray[np.float64]
 
 FIRST, THEN = 4, 6  # rounds of a first fit, along the parameters and along principal directions
 LAST_FIT_ROUNDS, EARLIER_FIT_ROUNDS = 8, 2  # of the last fit, and of those before it in the ledger
@@ -228,7 +225,7 @@ def _begin_fits(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
     return sorted(fits, key=lambda f: f.cost)[:2]
 
 
-def _have_priors(free: Sequence[Free]) -> NDArray[np.bool_]:
+def _have_priors(free: Sequence[Free]) -> Flags:
     """Of which unknowns it is known where a healthy unit has them."""
     return np.array([np.isfinite(f.prior) for f in free])
 

@@ -6,16 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.likelihood import Problem
 from fdi.output import write_text
 from fdi.thresholds import PATTERN_EXPLAINED_SHARE, PATTERN_VISIBLE_RATIO
 from fdi.trace.signals import OUTPUTS
-from fdi.trace.trace import Trace
-
-Floats = NDArray[np.float64]
+from fdi.trace.trace import Flags, Floats, Trace
 
 KNOTS = 15  # of a curve
 SPATIAL_TURNS = 3.0  # over the range of the position: a slower wave is a trend, for example a spring
@@ -211,7 +208,7 @@ class Balance(NamedTuple):
     missing: Floats
     noise: float  # RMS that sensor noise alone gives
     ratio: float  # RMS of what is missing over that
-    smooth: NDArray[np.bool_]  # (n,) rows in which no signal moves faster than smoothing can follow
+    smooth: Flags  # (n,) rows in which no signal moves faster than smoothing can follow
 
     @property
     def size(self) -> float:
@@ -279,14 +276,14 @@ def compute_balances(search: Search, h: Hypothesis, unseen: Problem | None = Non
     return sorted(found, key=lambda b: -b.ratio), States(*(x[kept] for x in states))
 
 
-def find_followed_rows(x: Floats, noise: float, share: float = 0.03) -> NDArray[np.bool_]:
+def find_followed_rows(x: Floats, noise: float, share: float = 0.03) -> Flags:
     """Rows of a signal (n,) that the smoothing polynomials follow: to its noise, or to a share of its local swing."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d  # here, as it takes a second to import
 
     window = ACCELERATION_WINDOW
     swing = maximum_filter1d(x, 3 * window) - minimum_filter1d(x, 3 * window)
     off = np.abs(x - _smooth(x, window)) > 6.0 * noise + share * swing
-    followed: NDArray[np.bool_] = ~(maximum_filter1d(off.astype(np.int8), window).astype(bool))
+    followed: Flags = ~(maximum_filter1d(off.astype(np.int8), window).astype(bool))
     return followed
 
 
@@ -301,7 +298,7 @@ def measure_way(position: Floats, speed: Floats, least: float = 3e-4) -> Floats:
     return way
 
 
-def find_smooth_rows(trace: Trace) -> NDArray[np.bool_]:
+def find_smooth_rows(trace: Trace) -> Flags:
     """All rows; of an excerpt those that smoothing does not carry across a joint, and that are compared at all."""
     if not trace.parts:
         return np.ones(len(trace), bool)

@@ -44,13 +44,11 @@ from fdi.thresholds import (
     WHITE_SQUARE_POOR,
 )
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Floats, Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Part
 from plant.model import Model
 from plant.threads import R, T, count_threads, map_in_threads
-
-Floats = NDArray[np.float64]
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage

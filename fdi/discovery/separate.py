@@ -7,7 +7,6 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import fit_unknowns
@@ -16,10 +15,8 @@ from fdi.estimation.noise import Noise
 from fdi.estimation.replay import hold_inputs
 from fdi.thresholds import MISFIT_DISCRIMINATES
 from fdi.trace.signals import OUTPUTS
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Floats, Trace
 from plant.lanes import Lanes
-
-Floats = NDArray[np.float64]
 
 SECONDS = 3.0
 

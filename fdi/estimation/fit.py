@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scale_noise, scaled_bounds
 from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
-
-Floats = NDArray[np.float64]
+from fdi.trace.trace import Floats
 
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FIT_ROUNDS = 12

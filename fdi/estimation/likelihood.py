@@ -12,16 +12,13 @@ from functools import cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.noise import Noise
 from fdi.thresholds import ANCHOR_RATE, BLOCK_FITTED_SQUARE
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Floats, Trace
 from plant.lanes import Lanes, Part
 from plant.model import Model
 from plant.threads import map_in_threads
-
-Floats = NDArray[np.float64]
 
 HUM = (50.0, 60.0, 100.0, 120.0, 150.0, 180.0, 400.0)  # Hz
 BLOCK = 100  # cycles

@@ -17,18 +17,15 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import BLOCK, Problem, limit_dynamic_friction, remove_mains, sum_blocks
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import ANCHOR_RATE, RESIDUAL_HELD_OUT
-from fdi.trace.trace import PER_ROW, Trace
+from fdi.trace.trace import PER_ROW, Flags, Floats, Trace
 from plant.lanes import TURN, Lanes, Part
 from plant.model import Model
-
-Floats = NDArray[np.float64]
 
 LONGEST_WHOLE = 20.0  # s; a shorter recording is fitted whole
 PIECE = 3.0  # s
@@ -169,7 +166,7 @@ def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float],
     return information, misfit, measured
 
 
-def _choose_pieces(information: Floats, full: NDArray[np.bool_]) -> list[int]:
+def _choose_pieces(information: Floats, full: Flags) -> list[int]:
     """The pieces that together say most, the first first."""
     alike = 20.0  # neighbouring samples that say the same thing
     total, chosen = np.eye(information.shape[1]), list[int]()

@@ -28,12 +28,10 @@ from fdi.thresholds import (
     REPEAT_FLOOR_RATIO,
 )
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace, rms
+from fdi.trace.trace import Flags, Floats, Trace, rms
 from plant.effects import CATALOGUE, combine_laws
 from plant.model import Model
 from plant.state import Input
-
-Floats = NDArray[np.float64]
 
 WINDOW = 100  # samples; shorter than stick-slip events are apart, longer than two periods of hum
 QUIET = 0.2  # the part of all windows that the first guess rests on
@@ -223,7 +221,7 @@ def _measure_loudness(x: Floats) -> Floats:
     return out
 
 
-def _fit_phasors(x: Floats, rows: NDArray[np.bool_], frequencies: Floats, period: float) -> NDArray[np.complex128]:
+def _fit_phasors(x: Floats, rows: Flags, frequencies: Floats, period: float) -> NDArray[np.complex128]:
     """Amplitude and phase of sines in the chosen windows of x, which are freed of their mean and slope first."""
     t = np.arange(WINDOW) - (WINDOW - 1) / 2
     pieces = _cut_windows(x, WINDOW)

@@ -18,7 +18,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Problem, limit_dynamic_friction
@@ -36,14 +35,12 @@ from fdi.thresholds import (
     UNDECIDED_SMALLEST,
 )
 from fdi.trace.signals import OUTPUTS, SIGNALS
-from fdi.trace.trace import PER_ROW, Trace, bridge_gaps, hold_last, hold_next, rms
+from fdi.trace.trace import PER_ROW, Flags, Floats, Trace, bridge_gaps, hold_last, hold_next, rms
 from plant.errors import InputError
 from plant.lanes import Lanes
 from plant.model import Model
 from plant.plants import MODULES
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Columns = dict[str, Floats]  # by signal, (n,)
 
 REPLAY_STEPS, FINEST_REPLAY_STEPS = 50, 800  # a cycle

@@ -27,8 +27,7 @@ from fdi.estimation.likelihood import (
 )
 from fdi.progress import NO_STAGE, Stage
 from fdi.thresholds import CONVERGED_GAIN, FLAT_DIRECTION_MISFIT, PRIORS_KNOW_MORE_MISFIT
-
-Floats = NDArray[np.float64]
+from fdi.trace.trace import Flags, Floats
 
 TRIED = 0.01  # of the logarithms: a way along a direction that is said to be flat
 # A stop of the spool that moves by chance can hide a flat direction in one of these trials, hardly in all four.
@@ -160,8 +159,8 @@ def _list_tangents(free: Sequence[Free], x: Floats, directions: Sequence[Directi
     return np.array(ways).reshape(-1, len(x))
 
 
-def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: NDArray[np.bool_],
-                 allowed: float | Floats = FLAT_DIRECTION_MISFIT) -> NDArray[np.bool_]:
+def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: Flags,
+                 allowed: float | Floats = FLAT_DIRECTION_MISFIT) -> Flags:
     """Which directions a trial replay finds flat at `x` (p,), (k,).
 
     Args:

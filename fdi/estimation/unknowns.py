@@ -4,14 +4,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.likelihood import Free
 from fdi.thresholds import HEALTHY_TOLERANCES
+from fdi.trace.trace import Floats
 from plant.effects import CATALOGUE, Effect
 from plant.model import Model, find_quantity, list_offered_effects, list_searched_effects
-
-Floats = NDArray[np.float64]
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
 WITHOUT_NOISE = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}

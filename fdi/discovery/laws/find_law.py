@@ -36,9 +36,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.trace import Trace
-
-Floats = NDArray[np.float64]
+from fdi.trace.trace import Floats, Trace
 
 MOST_TERMS = 3
 PROPOSED = 14  # terms of each balance that a replay looks at
@@ -120,9 +118,9 @@ class LawSearch:
     curve: LawCurve | None = None
 
 
+# Balances that need a signal, and why.
 HIDDEN = {"force": ("p12", "a missing force and a missing flow look alike without P12"),
           "current": ("xs", "the current balance needs XS")}
-"""Balances that need a signal, and why."""
 
 
 def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, holdout: Trace | None,

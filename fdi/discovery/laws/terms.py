@@ -21,14 +21,15 @@ from fdi.estimation.fit import Value
 from fdi.output import write_text
 from plant.effects import CATALOGUE, Effect, effect
 
+# The states in a formula, and what they are in a law; `way` is the distance since the ram's last reversal, m.
 STATES = {"position": "s.jack_position", "speed": "s.jack_speed", "pressure": "s.pressure",
           "spool": "s.spool_position", "spool_speed": "s.spool_speed", "current": "u.current", "time": "u.t",
           "way": "way"}
-"""The states in a formula, and what they are in a law; `way` is the distance since the ram's last reversal, m."""
 
 UNITS = {"position": "m", "speed": "m/s", "pressure": "Pa", "spool": "m", "spool_speed": "m/s", "current": "A",
          "time": "s", "way": "m"}
 
+# The ways in which a term enters its balance: the balance, what the factor is multiplied by there, in words.
 PARTS = {"load": ("force", "1", "a force against extension"),
          "damping": ("force", "speed", "a resistance times the ram's speed"),
          "dry": ("force", "direction", "a dry friction"),
@@ -36,7 +37,6 @@ PARTS = {"load": ("force", "1", "a force against extension"),
          "conductance": ("flow", "pressure", "a leakage across the piston times the pressure"),
          "area": ("flow", "speed", "a displacement times the ram's speed"),
          "current": ("current", "1", "a current that does not reach the torque motor")}
-"""The ways in which a term enters its balance: the balance, what the factor is multiplied by there, in words."""
 
 
 class Shape(NamedTuple):
@@ -181,8 +181,8 @@ def find_states(term: Term) -> list[str]:
     return [state for state in STATES if state in words]
 
 
+# Where the terms of a balance act; a law of forces alone acts at `load`.
 PORTS = {"force": "jack_drag", "flow": "valve", "current": "current"}
-"""Where the terms of a balance act; a law of forces alone acts at `load`."""
 
 IMPORTS = """from math import exp, pi, sin, sqrt, tanh
 from typing import Annotated, NamedTuple
@@ -378,8 +378,8 @@ def _return_current(parts: Sequence[str], _: bool) -> list[str]:
     return ["    return x - lost"]
 
 
+# Names of the effects, by balance.
 LIBRARY = {place: f"{place}_library" for place in ("force", "flow", "current")}
-"""Names of the effects, by balance."""
 
 
 def name_parameter(term: Term, field: str) -> str:
