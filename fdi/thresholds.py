@@ -156,12 +156,6 @@ HELD_OUT_UNDECIDED_SHARE = 0.7
 # after the first hidden effects: a load of 3.6 N gained 65 and was found.
 GAIN_DETECTED = 100.0
 
-# The size of an effect that counts as detectable, over the one that gains `GAIN_DETECTED`.
-#
-# Three margins were tried, 2, 2.6 and 3: of effects hidden at 1.5 times the size, 21 of 26, 22 of 25 and 20 of 26 were
-# named. Wanted were nine of ten, so `rig explain` shows no sizes (docs/statistics.md).
-DETECTABLE_MARGIN = 2.0
-
 # Mean square of whitened residuals from which on a last fit is tried again from a healthy unit.
 WHITE_SQUARE_POOR = 1.02
 

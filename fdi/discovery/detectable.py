@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from fdi.estimation.fit import Fit, fit_unknowns
 from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
-from fdi.thresholds import DETECTABLE_MARGIN, GAIN_DETECTED
+from fdi.thresholds import GAIN_DETECTED
 from fdi.trace.trace import Floats
 from plant.effects import CATALOGUE
 from plant.model import Model
@@ -26,12 +26,6 @@ from plant.threads import map_in_threads
 
 FITTED_STEPS, SIMULATED_STEPS = 10, 13  # a cycle: of the fit, and of the run that stands for the measurement
 REFIT_ROUNDS = 4
-SMALLEST_FOUND = 0.022  # of the smallest start: `explain` hardly finds smaller sizes, whatever they gain
-SMALLEST_TRIED = 0.008  # of the smallest start
-# How much larger these effects must be than others: a fit to a real run makes up for more of them than the fits here.
-#
-# From 15 effects hidden in units of their own.
-FOUND_LATE = {"flow_force": 7.0, "coil_lag": 3.5, "transport_delay": 4.0}
 WITHOUT_SIZE = ("Hz", "rad")  # units of parameters that say where an effect is and not how large
 
 
@@ -48,60 +42,33 @@ class Direction(NamedTuple):
     most: float
 
 
-class Detectable(NamedTuple):
-    """The smallest size of an effect, from its off value, that the test shows; infinite if none of usual size does."""
+class Blind(NamedTuple):
+    """An effect that the tolerances make up for, so that a test does not show it at any usual size."""
 
     effect: str
-    size: float
-    usual: float  # the largest usual size
+    parameter: str
+    usual: float  # distance from the off value, the largest that is usual
+    unit: str
+    revealed_by: str  # what would show it
 
 
-def find_detectable_sizes(problem: Problem, fit: Fit, effects: Iterable[str], gain: float = GAIN_DETECTED,
-                          count: int = 8) -> list[Detectable]:
-    """The smallest size of each effect that the test shows.
-
-    It is `DETECTABLE_MARGIN` times that at which the effect gains `gain`, more for those in `FOUND_LATE`. Of the two
-    signs of an effect the one that needs the larger size counts.
+def find_hidden_effects(problem: Problem, fit: Fit, effects: Iterable[str]) -> list[Blind]:
+    """The effects that do not gain `GAIN_DETECTED` even at their largest usual size, with one sign at least.
 
     Args:
         problem: of which the first run counts.
         fit: where nothing but noise is left.
         effects: names of the catalogue.
-        gain: in -2 log likelihood, on that run.
-        count: sizes tried of each effect, before two finer ones.
     """
-    ways = [way for name in effects for way in _list_directions(name, problem.model)]
-    test = _VirtualTest(problem, fit)
-    ladders = [np.geomspace(SMALLEST_TRIED * way.least, way.most, count) for way in ways]
-    tried = _measure_ladders(test, ways, ladders, gain)
-    finer = [_choose_finer_sizes(pairs, gain) for pairs in tried]
-    for pairs, more in zip(tried, _measure_ladders(test, ways, finer, gain), strict=True):
-        pairs += more
-    smallest: dict[str, Detectable] = {}
-    for way, pairs in zip(ways, tried, strict=True):
-        margin = DETECTABLE_MARGIN * FOUND_LATE.get(way.effect, 1.0)
-        size = max(margin * _interpolate_size(pairs, gain), SMALLEST_FOUND * way.least)
-        size = np.inf if size > way.most else size
-        before = smallest.get(way.effect, Detectable(way.effect, 0.0, 0.0))
-        smallest[way.effect] = Detectable(way.effect, max(size, before.size), max(way.most, before.usual))
-    return list(smallest.values())
+    ways = [way for name in effects for way in list_directions(name, problem.model)]
+    won = VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways]) if ways else []
+    usual = {way.effect: way.most for way, gained in zip(ways, won, strict=True) if gained < GAIN_DETECTED}
+    firsts = {effect: CATALOGUE[effect].fitted[0] for effect in usual}
+    return [Blind(effect, first, usual[effect], CATALOGUE[effect].parameters[first].unit, CATALOGUE[effect].revealed_by)
+            for effect, first in firsts.items()]
 
 
-def find_hidden_effects(problem: Problem, fit: Fit, effects: Iterable[str], gain: float = GAIN_DETECTED
-                        ) -> list[Detectable]:
-    """The effects that do not gain `gain` even at their largest usual size, with one sign at least.
-
-    The arguments are those of `find_detectable_sizes`, which takes four times as long.
-    """
-    ways = [way for name in effects for way in _list_directions(name, problem.model)]
-    if not ways:
-        return []
-    won = _VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways], gain)
-    hidden = {way.effect: way.most for way, gained in zip(ways, won, strict=True) if gained < gain}
-    return [Detectable(effect, np.inf, usual) for effect, usual in hidden.items()]
-
-
-def _list_directions(effect: str, model: Model) -> list[Direction]:
+def list_directions(effect: str, model: Model) -> list[Direction]:
     """One for each sign of the first parameter."""
     entry = CATALOGUE[effect]
     first = entry.fitted[0]
@@ -117,59 +84,6 @@ def _list_directions(effect: str, model: Model) -> list[Direction]:
     return list(found.values())
 
 
-def _measure_ladders(test: _VirtualTest, ways: Sequence[Direction], ladders: Sequence[Iterable[float]], gain: float
-                     ) -> list[list[tuple[float, float]]]:
-    """(size, gain) of each effect at each of its sizes."""
-    flat = [(k, float(size)) for k, sizes in enumerate(ladders) for size in sizes]
-    found: list[list[tuple[float, float]]] = [[] for _ in ways]
-    if flat:
-        won = test.measure_gains([ways[k] for k, _ in flat], [size for _, size in flat], gain)
-        for (k, size), gained in zip(flat, won, strict=True):
-            found[k].append((size, gained))
-    return found
-
-
-def find_least_gains(tried: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Pairs of a size and what it gains, in rising order, each with the least that this size or a larger one gains.
-
-    A fit that has not found the best tolerances makes an effect look visible. What tolerances make up for at one size
-    they make up for at smaller ones.
-    """
-    found, least = [], np.inf
-    for size, won in sorted(tried, reverse=True):
-        least = min(least, won)
-        found.append((size, least))
-    return found[::-1]
-
-
-def _choose_finer_sizes(tried: Sequence[tuple[float, float]], gain: float) -> list[float]:
-    """Two sizes between the largest that gains less than `gain` and the next one."""
-    envelope = find_least_gains(tried)
-    below = [k for k, (_, won) in enumerate(envelope) if won < gain]
-    if not below or below[-1] + 1 == len(envelope):
-        return []
-    low, high = envelope[below[-1]][0], envelope[below[-1] + 1][0]
-    return [float(size) for size in np.geomspace(low, high, 4)[1:3]]
-
-
-def _interpolate_size(tried: Sequence[tuple[float, float]], gain: float) -> float:
-    """The size from which on all sizes gain `gain`; infinite where the largest does not."""
-    envelope = find_least_gains(tried)
-    below = [k for k, (_, won) in enumerate(envelope) if won < gain]
-    if not below:
-        return envelope[0][0]
-    if below[-1] + 1 == len(envelope):
-        return np.inf
-    (low, low_gain), (high, high_gain) = envelope[below[-1]:below[-1] + 2]
-    return float(low * (high / low) ** _interpolate_share(low_gain, high_gain, gain))
-
-
-def _interpolate_share(low: float, high: float, gain: float) -> float:
-    """How far between two gains, in their logarithms, a third one lies."""
-    before = max(low, 0.02 * gain)
-    return float(np.log(gain / before) / np.log(high / before))
-
-
 @dataclass
 class SimulatedRun(Problem):
     """A problem whose `run`, (s, n) SI, stands for the measurement, where something was measured."""
@@ -181,7 +95,7 @@ class SimulatedRun(Problem):
         return super().subtract_measurements(predicted - self.run + self.trace.measurements)
 
 
-class _VirtualTest:
+class VirtualTest:
     """Simulated runs of a plant at the values of a fit, and what a fit of the tolerances leaves of them."""
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
@@ -192,11 +106,10 @@ class _VirtualTest:
         self.prior = np.array([f.prior**-2 for f in fit.free])
         self.bounds = scaled_bounds(fit.free)
 
-    def measure_gains(self, ways: Sequence[Direction], sizes: Sequence[float], enough: float, rounds: int = 6
-                      ) -> list[float]:
+    def measure_gains(self, ways: Sequence[Direction], sizes: Sequence[float]) -> list[float]:
         """What each effect gains in -2 log likelihood over a fit of the tolerances.
 
-        A fit takes so many rounds, fewer where the gain falls below `enough` or no longer falls.
+        A fit takes six rounds, fewer where the gain falls below `GAIN_DETECTED` or no longer falls.
         """
         names, rows = self._list_values(ways, sizes)
         run = self._predict_values(self.simulated, names, rows)
@@ -210,8 +123,8 @@ class _VirtualTest:
         every = np.arange(len(ways))
         x, white, cost = begun[every, best], left[every, best], costs[every, best]
         still = np.arange(len(ways))
-        for _ in range(rounds):
-            still = still[cost[still] - known[still] - with_effect[still] > enough]
+        for _ in range(6):
+            still = still[cost[still] - known[still] - with_effect[still] > GAIN_DETECTED]
             if not len(still):
                 break
             steps = np.array([self._list_steps(white[k], x[k]) for k in still])
@@ -227,8 +140,8 @@ class _VirtualTest:
 
         def refit(k: int) -> float:
             """With slopes of its own, as a fit to a measured run has them."""
-            beyond_doubt = 1000.0  # times `enough`: no refit takes as much
-            if not enough < cost[k] - known[k] - with_effect[k] < beyond_doubt * enough:
+            beyond_doubt = 1000.0 * GAIN_DETECTED  # no refit takes as much
+            if not GAIN_DETECTED < cost[k] - known[k] - with_effect[k] < beyond_doubt:
                 return float(cost[k])
             own_run = SimulatedRun(**vars(self.problem), run=run[k])
             return min(float(cost[k]), fit_unknowns(own_run, self.fit.free, x[k], REFIT_ROUNDS).cost)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.discovery.detectable import Detectable, find_hidden_effects
+from fdi.discovery.detectable import Blind, find_hidden_effects
 from fdi.discovery.search import Hypothesis, Search, Sensitivity, WholeRuns, compute_sensitivity
 from fdi.estimation.likelihood import Problem, compute_typical_rms
 from fdi.estimation.long_recordings import is_long
@@ -62,7 +62,7 @@ class Explanation:
     blind: Sensitivity
     search: Search = field(repr=False)
     unseen: Mapping[tuple[str, ...], HeldOut] = field(default_factory=dict)  # of the best hypotheses
-    hidden: tuple[Detectable, ...] = ()  # effects that tolerances make up for; none where more than noise is left
+    hidden: tuple[Blind, ...] = ()  # effects that tolerances make up for; none where more than noise is left
     excerpt: str = ""  # which part of a long recording was fitted
 
 
@@ -226,7 +226,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, hold
         verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
-    hidden: tuple[Detectable, ...] = ()
+    hidden: tuple[Blind, ...] = ()
     if verdict in NOISE_LEFT:
         progress("what this test cannot see", 0.94)
         hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fdi.discovery.detectable import Detectable
+from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
 from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.refit import lean_model
@@ -190,16 +190,6 @@ class Candidate(NamedTuple):
         return max(self.ratios.values(), default=math.inf)
 
 
-class Blind(NamedTuple):
-    """An effect that the tolerances make up for, so that this test does not show it at any usual size."""
-
-    effect: str
-    parameter: str
-    usual: float  # distance from the off value, the largest that is usual
-    unit: str
-    revealed_by: str  # what would show it
-
-
 class Suspicious(NamedTuple):
     """A parameter of the reference model further off than a healthy unit has it."""
 
@@ -257,10 +247,9 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
         baseline["error"]["cor"], baseline["floor"]["cor"] = e.marks.controller * unit, unit
     best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
     model = e.search.problem.model
-    blind = tuple(_describe_blind(d) for d in e.hidden)
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
-    return Answer(e, tuple(_list_candidates(e, seed)), baseline, blind, noiseless, suspicious,
+    return Answer(e, tuple(_list_candidates(e, seed)), baseline, e.hidden, noiseless, suspicious,
                   tuple(_list_ledger(e, hand)), pattern, separate or {})
 
 
@@ -343,12 +332,6 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
     return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
                      max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), 1e-300),
                      "explains" if p.effect in e.effects else "no")
-
-
-def _describe_blind(d: Detectable) -> Blind:
-    entry = CATALOGUE[d.effect]
-    first = entry.fitted[0]
-    return Blind(d.effect, first, d.usual, entry.parameters[first].unit, entry.revealed_by)
 
 
 def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]

@@ -3,10 +3,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fdi.discovery.detectable import find_hidden_effects
+from fdi.estimation.fit import fit_unknowns
+from fdi.estimation.likelihood import Problem
+from fdi.estimation.noise import white_noise
+from fdi.estimation.replay import hold_inputs
+from fdi.estimation.unknowns import complete_model, list_all_unknowns, silence_readings
+from fdi.trace.trace import Trace
+from plant import Model, simulate
 from plant.effects import CATALOGUE
-from plant.model import Model
 from studies import detectable_sizes
 from studies.hidden_effects.hidden import NOT_SIMULATED
 from studies.hidden_effects.truth import parameter_names
@@ -35,6 +43,28 @@ def test_the_table_counts_by_effect_and_size() -> None:
     table = detectable_sizes.format_table(rows).splitlines()
     assert table[2] == "| `null_bias` | 1e-06 to 2e-06 A | 1 of 2 | 0 of 1 |"
     assert table[3] == "| `sensor_gain` | none | 0 of 0 | 0 of 0 |"
+
+
+def test_tolerances_make_up_for_a_clogged_filter_and_the_loop_for_an_offset() -> None:
+    """Were the tolerances of a healthy unit held, a clogging of 0.001 would show; a load shows by its pressure."""
+    t = np.arange(4000) * 1e-3
+    com = np.where(t < 2.0, 4e-3 * np.sign(np.sin(2 * np.pi * t)), 2e-3 * np.sin(2 * np.pi * 1.5 * t))
+    model, effects = Model(), ("constant_load", "filter_clogging", "sensor_offset")
+    trace = hold_inputs(Trace.from_columns(simulate(model, com, seed=3)._asdict(), 1e-3, {}))
+    noise = tuple(white_noise(x) for x in (2e-6, 2e4, 1e-6))
+    problem = Problem(complete_model(model), trace, noise, bare=silence_readings(model), workers=2)
+    fit = fit_unknowns(problem, list_all_unknowns(model), rounds=3)
+    assert [(h.effect, h.usual) for h in find_hidden_effects(problem, fit, effects)] == [("sensor_offset", 2e-4)]
+    sizes = detectable_sizes.find_detectable_sizes(problem, fit, effects)
+    assert sizes["filter_clogging"] > 0.03 and sizes["sensor_offset"] == np.inf, sizes
+    alone = 10.0 * 2e4 / np.sqrt(4000.0) * model["jack.area"]  # N: gain 100 if nothing else could move
+    assert alone < sizes["constant_load"] < 20.0 * alone
+
+
+def test_a_failed_fit_to_a_small_size_makes_no_small_size_visible() -> None:
+    """What tolerances make up for at a size of 3 they make up for at 2."""
+    assert detectable_sizes.find_least_gains([(1.0, 2.0), (3.0, 40.0), (2.0, 500.0), (4.0, 900.0)]) == [
+        (1.0, 2.0), (2.0, 40.0), (3.0, 40.0), (4.0, 900.0)]
 
 
 @pytest.mark.slow

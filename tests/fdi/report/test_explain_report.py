@@ -8,8 +8,9 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
+from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Marks
-from fdi.discovery.explain_runs import Answer, Blind, Candidate, Suspicious
+from fdi.discovery.explain_runs import Answer, Candidate, Suspicious
 from fdi.discovery.runs import Source
 from fdi.discovery.update_model import ModelUpdate, Provenance, Row
 from fdi.estimation.fit import Value

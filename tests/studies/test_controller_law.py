@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from places import SHARED
 
-from fdi.comparison.blocks import fit_directional_gains
+from studies.servo_ledger import fit_directional_gains
 
 DATA = SHARED / "data" / "electrohydrostatic_rig_raw"
 real = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measurements at {DATA.name}: they belong to others")
