@@ -111,8 +111,7 @@ def difference_over(x: Floats, rows: int) -> Floats:
 
 def _flag_within(bad: Flags, rows: int) -> Flags:
     total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(bad)])
-    out: Flags = total[rows + 1:] > total[:-rows - 1]
-    return out
+    return total[rows + 1:] > total[:-rows - 1]
 
 
 def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
@@ -138,8 +137,7 @@ def _find_resolved(speed: Floats, period: float) -> Flags:
     wide[2:-2] = (speed[4:] - speed[:-4]) / (4 * period)
     apart = np.abs(near - wide)
     most_apart = 4.0  # standard deviations by which accelerations over two and four samples may differ
-    out: Flags = apart <= most_apart * float(np.median(apart)) / 0.6745
-    return out
+    return apart <= most_apart * float(np.median(apart)) / 0.6745
 
 
 def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False

@@ -219,14 +219,12 @@ def fit_whitener(x: Floats) -> Floats:
     covariance = correlate(x, x, 0, whitening_order) / len(x)
     covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
     weights = solve_yule_walker(covariance, by_elimination=True)
-    out: Floats = np.concatenate([WHITE, -weights])
-    return out
+    return np.concatenate([WHITE, -weights])
 
 
 def apply_whitener(x: Floats, by: Floats) -> Floats:
     """x (n,) through the filter of a colour; NaN counts as 0."""
-    out: Floats = np.convolve(np.nan_to_num(x), by)[:len(x)]
-    return out
+    return np.convolve(np.nan_to_num(x), by)[:len(x)]
 
 
 def _examine_signal(trace: Trace, residual: Floats, difference: Floats | None,
@@ -268,16 +266,14 @@ def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
         return sums
     n = len(x) + len(y)
     whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
-    out: Floats = whole[np.arange(first, last + 1) % n]
-    return out
+    return whole[np.arange(first, last + 1) % n]
 
 
 def _correlate_piece(x: Floats, y: Floats, last: int) -> Floats:
     """Sums of x_{k + lag} y_k for lags 0..last."""
     n = 1 << int(len(x) + last).bit_length()
     whole = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
-    out: Floats = whole[:last + 1]
-    return out
+    return whole[:last + 1]
 
 
 def _measure_memory(correlation: Floats) -> int:
@@ -408,5 +404,4 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
 
 def _fill(position: Floats) -> Floats:
     known = np.flatnonzero(~np.isnan(position))
-    filled: Floats = np.interp(np.arange(len(position)), known, position[known])
-    return filled
+    return np.interp(np.arange(len(position)), known, position[known])

@@ -349,5 +349,4 @@ def _compute_terms(signals: Floats, current: Floats, load: Floats, p: Mapping[st
 def _compute_pump_flow(speed: Floats, v: Floats, p12: Floats, p: Mapping[str, float]) -> Floats:
     """Flow that a pump at motor `speed` (n,) delivers and the jack does not take, m3/s."""
     area = p["jack.area"] * np.where(speed < 0.0, p["pump.area_ratio"], 1.0)
-    left: Floats = p["pump.displacement"] * speed - area * v - p["jack.leakage"] * p12
-    return left
+    return p["pump.displacement"] * speed - area * v - p["jack.leakage"] * p12

@@ -111,16 +111,14 @@ def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
 
 def _compute_covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
     flat = (jacobian * np.sqrt(compute_weights(white))).reshape(len(free), -1)
-    inverse: Floats = np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior_weights(free))), np.float64)
-    return inverse
+    return np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior_weights(free))), np.float64)
 
 
 def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
     widest = np.array([f.step for f in free])
     difference_width_sd = 3.0  # of a parameter: differences wide enough for stick-slip, narrow at the end
     wanted = difference_width_sd / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    widths: Floats = np.clip(wanted, 0.01 * widest, widest)  # times the first width
-    return widths
+    return np.clip(wanted, 0.01 * widest, widest)  # times the first width
 
 
 def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, damping: float) -> Floats:

@@ -97,8 +97,7 @@ class Problem:
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.cor, trace.load, trace.position, self.anchor, trace.parts,
                                       trace.chambers)
-        signals: Floats = trace.pass_sensors(out).transpose(0, 2, 1)
-        return signals
+        return trace.pass_sensors(out).transpose(0, 2, 1)
 
     def compute_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """Model minus measurement for scaled unknowns `x` (m, p): (m, s, n), SI units, NaN where not measured."""
@@ -159,8 +158,7 @@ def remove_mains(residuals: Floats, period: float) -> Floats:
     """Residuals (.., n) without the steady lines of the mains."""
     lines = mains_waves(residuals.shape[-1], period)
     complete = residuals if np.isfinite(residuals).all() else np.nan_to_num(residuals)
-    left: Floats = residuals - (complete @ lines) @ lines.T
-    return left
+    return residuals - (complete @ lines) @ lines.T
 
 
 @cache
@@ -171,8 +169,7 @@ def mains_waves(n: int, period: float) -> Floats:
     """
     t = 2.0 * np.pi * period * np.arange(n)
     lines = [f for f in HUM if f < 0.45 / period]
-    waves: Floats = np.linalg.qr(np.column_stack([w(f * t) for f in lines for w in (np.sin, np.cos)]))[0]
-    return waves
+    return np.linalg.qr(np.column_stack([w(f * t) for f in lines for w in (np.sin, np.cos)]))[0]
 
 
 def sum_blocks(white: Floats) -> Floats:

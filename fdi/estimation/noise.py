@@ -179,8 +179,7 @@ def _mean_square(part: float, freedom: float) -> float:
 
 def _cut_windows(x: Floats, window: int) -> Floats:
     n = len(x) // window * window
-    out: Floats = x[:n].reshape(-1, window)
-    return out
+    return x[:n].reshape(-1, window)
 
 
 def _measure_freedom(pieces: Floats) -> float:

@@ -189,8 +189,7 @@ def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Fla
     starts = np.arange(0, n, window)
     sizes = np.diff(np.append(starts, n))
     power = np.add.reduceat(moved**2, starts, axis=1).max(axis=0) / sizes
-    out: Flags = np.repeat(power > floor**2, sizes)
-    return out
+    return np.repeat(power > floor**2, sizes)
 
 
 def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
@@ -250,8 +249,7 @@ def differentiate(x: Floats, size: int, order: int) -> Floats:
     """First or second derivative of x (n,) per sample, of the parabola through `size` samples (Savitzky and Golay)."""
     k = np.arange(size) - size // 2
     weights = np.linalg.pinv(np.vander(k.astype(float), 3, increasing=True))[order] * order
-    out: Floats = np.correlate(np.pad(x, size // 2, "edge"), weights, "valid")
-    return out
+    return np.correlate(np.pad(x, size // 2, "edge"), weights, "valid")
 
 
 class Scatter(NamedTuple):

@@ -189,8 +189,7 @@ def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
         return jacobian
     rows = jacobian.reshape(len(jacobian), -1)
     basis = np.linalg.qr(flat)[0]
-    left: Floats = (rows - basis @ (basis.T @ rows)).reshape(jacobian.shape)
-    return left
+    return (rows - basis @ (basis.T @ rows)).reshape(jacobian.shape)
 
 
 def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> Fit:
@@ -248,8 +247,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     is_full = np.abs(steps).max(axis=2) >= 0.9 * whole
     limits = np.array([allowed if flat in others else FLAT_DIRECTION_MISFIT for flat in every])
     flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full, limits)]
-    found: Floats = flat_ways[_find_independent(flat_ways)].T
-    return found
+    return flat_ways[_find_independent(flat_ways)].T
 
 
 def _get_power(powers: Mapping[str, float], f: Free) -> float:
@@ -501,8 +499,7 @@ def invert_hessian(hessian: Floats) -> Floats:
     """
     diagonal = np.diag(hessian)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    covariance: Floats = scale[:, None] * np.linalg.pinv(scale[:, None] * hessian * scale) * scale
-    return covariance
+    return scale[:, None] * np.linalg.pinv(scale[:, None] * hessian * scale) * scale
 
 
 def start_fit(free: Sequence[Free], x: Floats) -> Fit:

@@ -653,8 +653,7 @@ class _Remover:
         self.y = self.remove(rows.missing[:, None])[:, 0]
 
     def remove(self, columns: Floats) -> Floats:
-        left: Floats = columns - self._wide @ (self._inverse @ (self._wide.T @ columns))
-        return left
+        return columns - self._wide @ (self._inverse @ (self._wide.T @ columns))
 
 
 def _fit_term(term: Term, rows: Rows, remover: _Remover) -> Proposal | None:
