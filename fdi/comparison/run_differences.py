@@ -137,8 +137,10 @@ def sample_column(trace: Trace, name: str, t: Floats) -> Floats:
     nearest: Floats = np.rint(rows)
     values = trace.column(name)
     if not len(t) or float(np.abs(rows - nearest).max()) < 0.01:
-        return np.asarray(values[np.clip(nearest.astype(int), 0, len(values) - 1)])
-    return np.interp(rows, np.arange(len(values)), values)
+        picked: Floats = values[np.clip(nearest.astype(int), 0, len(values) - 1)]
+        return picked
+    between: Floats = np.interp(rows, np.arange(len(values)), values)
+    return between
 
 
 def _subtract(reference: Run, other: Run) -> RunPair:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.discovery.detectable import Blind, find_hidden_effects
-from fdi.discovery.search import Hypothesis, Search, Sensitivity, WholeRuns, compute_sensitivity
-from fdi.estimation.likelihood import Problem, compute_typical_rms
-from fdi.estimation.long_recordings import is_long
+from fdi.discovery.residual_pattern import is_periodic_in_position
+from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity, WholeRuns, compute_sensitivity
+from fdi.estimation.likelihood import compute_typical_rms
 from fdi.estimation.replay import find_undecided_rows
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
@@ -33,8 +33,6 @@ from plant.controller import compute_answers
 from plant.effects import CATALOGUE
 from plant.model import Model, list_searched_effects
 
-FINE = 20  # steps a cycle of the last fits
-TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
 LONG = 10  # rounds of a last fit on which a verdict hangs alone
 
@@ -67,8 +65,7 @@ class Explanation:
 
 
 def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Trace | None = None,
-            progress: Progress = ignore_progress, workers: int | None = None, whole: WholeRuns | None = None
-            ) -> Explanation:
+            progress: Progress = ignore_progress, whole: WholeRuns | None = None) -> Explanation:
     """The verdict on a model and a measured run.
 
     Args:
@@ -77,14 +74,12 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
         repeats: further runs of the same command: they tell noise from physics.
         holdout: a run of another command: it tells physics from luck.
         progress: called with each stage and the share done, 0 to 1.
-        workers: threads; default one a core.
         whole: the recordings that `est` and `repeats` were cut from, where they were: what is found is judged on them.
     """
     marks = find_marks(model, [whole.est, *whole.repeats] if whole else [est, *repeats])
     candidates = [e.name for e in list_searched_effects(model.plant)
                   if e.port not in ("command", "reading") and e.starts]
-    search = Search(model, est, repeats, candidates, workers)
-    search.whole = whole
+    search = Search(model, est, repeats, candidates, holdout=holdout, whole=whole)
     if marks.step:
         search.coarse = {"xj": marks.rounding}
     progress("fitting the tolerances", 0.03)
@@ -92,17 +87,14 @@ def explain(model: Model, est: Trace, repeats: Sequence[Trace] = (), holdout: Tr
     if base.is_at_floor:
         search.learn_noise(base)
         base = search.refit_hypothesis(base)
-    levels = _search_levels(search, base, holdout, progress)
-    return _conclude(search, levels, marks, holdout, progress)
+    return _conclude(search, _search_levels(search, base, progress), marks, progress)
 
 
-def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, progress: Progress
-                   ) -> list[list[Hypothesis]]:
+def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list[list[Hypothesis]]:
     """Hypotheses with 0, 1, 2 .. effects, best first in each level."""
     levels, beam = [[base]], [base]
-    most_effects = 3  # effects looked for one after the other
-    shares = (0.07, 0.3, 0.4, 0.5)  # of the whole work, before each of them
-    for count in range(1, most_effects + 1):
+    shares = (0.07, 0.3, 0.4, 0.5)  # of the whole work, before each of three effects and after them
+    for count in (1, 2, 3):
         fits = 40 if count == 1 else 20 * len(beam)
         search.stage = Stage(progress, f"looking for effect {count}", shares[count - 1], shares[count], fits)
         tried: list[Hypothesis] = []
@@ -119,8 +111,8 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
             levels[0] = [search.refit_base(base, tried[:1])]
-        done = search.reaches_floor(tried[0], FINE, TRUEST)
-        if not done and count == 2 and levels[1][0].is_near_floor and not _is_significant(levels[1][0], tried[0]):
+        done = search.reaches_floor(tried[0])
+        if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
             # no second effect is missing, but stops that the fit of the first one missed
             levels[1] = _drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
             levels.append(tried)
@@ -129,12 +121,14 @@ def _search_levels(search: Search, base: Hypothesis, holdout: Trace | None, prog
             # a fit in a local minimum leads the scan astray, and far tolerances may stand in for an effect
             tried = _drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
         if count == 2 and not done and _takes_fair_share(search, levels[1][0], tried[0]) and not \
-                search.reaches_floor(tried[0], FINE, TRUEST):
+                search.reaches_floor(tried[0]):
             tried = _search_other_valleys(search, levels, tried)
         levels.append(tried)
-        if done or tried[0].is_at_floor or not _is_significant(levels[-2][0], tried[0]):
+        before = levels[-2][0]
+        if done or tried[0].is_at_floor or measure_gain(before, tried[0]) <= GAIN_SEEN:
             break
-        if count > 1 and not _is_way_on(search, levels, holdout):  # two large effects each help little alone
+        # the first effect is no such way: two large effects each help little alone
+        if count > 1 and not (_takes_fair_share(search, before, tried[0]) and _improves(search, before, tried[0])):
             break
         beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
     return levels
@@ -152,25 +146,19 @@ def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], tried:
     return _drop_duplicates([*found[len(singles):], *tried])
 
 
-def _is_way_on(search: Search, levels: Sequence[Sequence[Hypothesis]], holdout: Trace | None) -> bool:
-    """Whether the last effect is a way to go on: it takes a fair part of what was left, on the held-out run as well."""
-    before, after = levels[-2][0], levels[-1][0]
-    if not _takes_fair_share(search, before, after):
-        return False
-    return holdout is None or _improves(search, before, after, holdout)
-
-
 def _takes_fair_share(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
     """Whether an effect takes away a fair part of what was left: less is what fits win by luck."""
     noise = float(np.isfinite(search.problem.trace.measurements).sum())
     return before.cost - after.cost >= FURTHER_EFFECT_SHARE * (before.cost - noise)
 
 
-def _improves(search: Search, before: Hypothesis, after: Hypothesis, holdout: Trace) -> bool:
-    """Whether a hypothesis leaves less of a held-out run than another, in the typical block, all signals together."""
+def _improves(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
+    """Whether a hypothesis leaves less of the held-out run than another, in the typical block, all signals together."""
+    if search.holdout is None:
+        return True
     floor = search.estimate_floor(after)
-    noise = np.array([floor[s] for s in holdout.outputs])
-    left = [compute_typical_rms(_compute_unseen_residuals(search, h, holdout)) / noise for h in (before, after)]
+    noise = np.array([floor[s] for s in search.holdout.outputs])
+    left = [compute_typical_rms(search.replay_holdout(h)[1]) / noise for h in (before, after)]
     excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
     return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
@@ -193,54 +181,46 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
     return min(own, nearer + 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
 
 
-def _is_significant(parent: Hypothesis, h: Hypothesis, least: float = GAIN_SEEN) -> bool:
-    return measure_gain(parent, h) > least
-
-
-def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, holdout: Trace | None, progress: Progress
-              ) -> Explanation:
+def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, progress: Progress) -> Explanation:
     depth = _choose_depth(search, levels)
-    search.refine_steps(FINE, TRUEST)
+    search.refine_steps(FINE)
     base, close = _finish_fits(search, levels, depth, progress)
     floor = search.estimate_floor(close[0] if close else base)
     if search.measure_solver_error(close[0] if close else base, floor) > SOLVER_ERROR_SHARE:
         finest_fit_steps = 50  # a cycle: FINE is not enough, for example for a resonance of trapped oil
-        search.refine_steps(finest_fit_steps, TRUEST)
+        search.refine_steps(finest_fit_steps)
         base = search.finish_hypothesis(base, 2)
         close = [search.finish_hypothesis(h, n) for h, n in zip(close, (6, 2), strict=False)]
         base, close = _doubt_small_gain(search, base, close, depth)
     depth = depth if close else 0
     tried = [] if len(levels) == 1 else levels[depth or -1]
     others = [h for h in tried if h.effects not in [c.effects for c in close]]
-    ledger = [base, *(_find_parent(levels, close[0], i) for i in range(1, depth)), *close[:1]]
+    parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = search.judge_on_all([base, *close], FINE)
-    if search.whole and close:
-        ledger = [base, *ledger[1:-1], close[0]]
-    held = {h.effects: measure_holdout(search, h, holdout) for h in [base, *close, *others[:3]]} if holdout else {}
-    unseen = {h.effects: _judge_unseen_run(search, h, holdout, floor) for h in close} if holdout else {}
-    holding = [h for h in close if not holdout or unseen[h.effects].holds]
-    part = bool(close) and (holdout is None or _improves(search, base, close[0], holdout))
+    ledger = [base, *parents, *close[:1]]
+    held = {h.effects: search.measure_holdout(h) for h in [base, *close, *others[:3]]}
+    unseen = {h.effects: _judge_unseen_run(search, h, floor) for h in close}
+    holding = [h for h in close if unseen[h.effects].holds]
+    part = bool(close) and _improves(search, base, close[0])
     verdict, named = decide_verdict(base, close, holding, part, marks, floor)
-    if verdict == "PARTLY" and close and _is_named_for_a_period(search, base, close[0]):
+    if verdict == "PARTLY" and close and is_periodic_in_position(search, base, close[0]):
         named = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if named else "UNEXPLAINED"
     explained = close[0] if close and verdict == "EXPLAINED" else base
     blind = compute_sensitivity(search.problem, explained.fit, search.effects)
-    hidden: tuple[Blind, ...] = ()
-    if verdict in NOISE_LEFT:
-        progress("what this test cannot see", 0.94)
-        hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
-        hidden = tuple(find_hidden_effects(search.problem, explained.fit, hard_to_see))
-    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks,
-                       blind, search, unseen, hidden)
+    progress("what this test cannot see", 0.94)
+    hard_to_see = [e for e in search.effects if CATALOGUE[e].revealed_by and e not in named]
+    hidden = find_hidden_effects(search.problem, explained.fit, hard_to_see if verdict in NOISE_LEFT else ())
+    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks, blind, search,
+                       unseen, tuple(hidden))
 
 
 def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
     """How many effects the last fits have; `_prune_level` may put a better hypothesis first in that level."""
     firsts = [level[0] for level in levels]
-    depth = max((i for i in range(1, len(levels)) if _is_significant(firsts[i - 1], firsts[i])
+    depth = max((i for i in range(1, len(levels)) if measure_gain(firsts[i - 1], firsts[i]) > GAIN_SEEN
                  and (i == 1 or _takes_fair_share(search, firsts[i - 1], firsts[i]))), default=0)
-    if depth > 1 and levels[1][0].is_at_floor and not _is_significant(levels[1][0], levels[depth][0], GAIN_CONVINCES):
+    if depth > 1 and firsts[1].is_at_floor and measure_gain(firsts[1], firsts[depth]) <= GAIN_CONVINCES:
         depth = 1
     if depth == 0 and len(levels) > 1 and (levels[0][0].is_far or not levels[0][0].is_at_floor):
         depth = 1  # a unit that is hardly healthy, or more than noise left: only fits taken to the end tell what helps
@@ -278,7 +258,7 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
         return base, close
     base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
     base = search.leave_out_effects(base, close[0])
-    return base, [] if depth == 1 and not _is_significant(base, close[0]) else close
+    return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
 
 
 def shows_effect(model: Model, h: Hypothesis) -> bool:
@@ -300,15 +280,11 @@ def _prune_level(search: Search, levels: list[list[Hypothesis]], depth: int) -> 
     """The depth, after what was added first and is no longer wanted has gone: a later effect may do alone."""
     while depth > 1:
         best = search.drop_each_effect(levels[depth][0])[0]
-        if _is_significant(best, levels[depth][0], GAIN_CONVINCES):
+        if measure_gain(best, levels[depth][0]) > GAIN_CONVINCES:
             break
         depth -= 1
         levels[depth] = _drop_duplicates([best, *levels[depth]])
     return depth
-
-
-def _find_parent(levels: list[list[Hypothesis]], h: Hypothesis, depth: int) -> Hypothesis:
-    return next((p for p in levels[depth] if p.effects == h.effects[:depth]), levels[depth][0])
 
 
 def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Sequence[Hypothesis], part: bool,
@@ -349,21 +325,16 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
 
-def _is_named_for_a_period(search: Search, base: Hypothesis, best: Hypothesis) -> bool:
-    from fdi.discovery.residual_pattern import is_periodic_in_position  # takes half a second to import
-
-    return is_periodic_in_position(search, base, best)
-
-
 def _measure_excess(h: Hypothesis, floor: Mapping[str, float]) -> float:
     """How far above the floor what is left is, in all signals together."""
     return float(np.sqrt(np.mean([max((e / floor[s]) ** 2 - 1.0, 0.0) for s, e in h.errors.items()])))
 
 
-def _judge_unseen_run(search: Search, h: Hypothesis, trace: Trace, floor: Mapping[str, float]) -> HeldOut:
+def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
     """Whether noise alone is left of the held-out run; if not of all of it, of what does not hang on a small stop."""
-    problem = _make_unseen_problem(search, trace)
-    left = problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+    if search.holdout is None:
+        return HeldOut(True)
+    (problem, left), trace = search.replay_holdout(h), search.holdout
     if _is_noise(left, trace, floor):
         return HeldOut(True)
     undecided = find_undecided_rows(problem, h.fit, floor)
@@ -377,21 +348,6 @@ def _judge_unseen_run(search: Search, h: Hypothesis, trace: Trace, floor: Mappin
 
 def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
     return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, compute_typical_rms(left), strict=True))
-
-
-def measure_holdout(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
-    """RMS residual on a run that the fit never saw, SI units."""
-    residuals = _compute_unseen_residuals(search, h, trace)
-    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(trace.outputs, residuals, strict=True)}
-
-
-def _compute_unseen_residuals(search: Search, h: Hypothesis, trace: Trace) -> Floats:
-    left: Floats = _make_unseen_problem(search, trace).compute_residuals(h.fit.free, h.fit.x[None])[0]
-    return left
-
-
-def _make_unseen_problem(search: Search, trace: Trace) -> Problem:
-    return replace(search.problem, trace=trace, steps=FINE if is_long(trace) else TRUEST, also=(), _lanes={})
 
 
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)

@@ -5,16 +5,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
+from fdi.discovery.laws.find_law import LawSearch, find_law_beside
 from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.refit import lean_model
+from fdi.discovery.residual_pattern import Pattern, find_pattern, write_effect
 from fdi.discovery.runs import Runs
 from fdi.discovery.search import Hypothesis, WholeRuns, choose_search_excerpt, compute_p_value
+from fdi.discovery.separate import find_separation
 from fdi.estimation.fit import Fit, Value
 from fdi.estimation.likelihood import limit_friction_values
 from fdi.estimation.long_recordings import PIECE, can_be_cut, cut_excerpt, make_excerpt
@@ -29,17 +32,11 @@ from fdi.thresholds import (
     RESIDUAL_IS_NOISE,
     SUSPICIOUS_TOLERANCES,
 )
-from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.lanes import Lanes, compile_kernels
 from plant.model import Model, find_quantity, list_searched_effects
 from plant.run import report_law_errors
 from plant.starts import ensure_starts
-
-if TYPE_CHECKING:
-    from fdi.discovery.laws.find_law import LawSearch
-    from fdi.discovery.residual_pattern import Pattern
-
 
 PATTERN_VERDICTS = ("UNEXPLAINED", "PARTLY")  # after these the shape of the residual is reported
 
@@ -63,28 +60,27 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
         InputError: a user's effect that cannot be compiled and run, or a file that cannot be written.
     """
     prepare_effects(runs, progress=progress)
-    explanation = explain_recording(runs, progress)
-    law = look_for_law(explanation, runs.holdout, progress)
+    e = explain_recording(runs, progress)
+    is_left, law = e.verdict in PATTERN_VERDICTS, None
+    # the terms of laws have been tried on the reference model's balances only
+    if is_left and not e.base.is_at_floor and runs.model.plant == "eha":
+        law = find_law_beside(e, progress)
     progress("writing the answer", 0.97)
-    holding = law.law if law is not None and law.law is not None and law.law.holds else None
+    found = law.law if law is not None and law.law is not None and law.law.holds else None
     file = effect_file or law_file
-    names = write_law_file(file, holding.terms, holding.values, holding.reason) if holding is not None and file else {}
-    shape = look_for_pattern(explanation, None if holding else effect_file)
-    is_pattern_reported = shape is not None and explanation.verdict in PATTERN_VERDICTS
-    pattern = str(shape) if is_pattern_reported else ""
-    answer = assess_explanation(explanation, seed, pattern, discriminate(explanation))
-    return replace(answer, law=law, law_effects=tuple(names.values())), shape
-
-
-def look_for_law(explanation: Explanation, holdout: Trace | None, progress: Progress) -> LawSearch | None:
-    """The law behind what the catalogue leaves; None where it leaves nothing, and for plants driven by a pump."""
-    if explanation.verdict not in PATTERN_VERDICTS or explanation.base.is_at_floor:
-        return None
-    if explanation.search.model.plant != "eha":
-        return None  # the terms have been tried on the reference model's balances only
-    from fdi.discovery.laws.find_law import find_law_beside  # takes half a second to import
-
-    return find_law_beside(explanation, holdout, progress)
+    names = write_law_file(file, found.terms, found.values, found.reason) if found is not None and file else {}
+    shape = None
+    if is_left or (effect_file and found is None):
+        shape = find_pattern(e.search, e.ledger[-1])
+        if effect_file and found is None:
+            write_effect(shape, effect_file)
+    separation = None
+    if e.verdict == "AMBIGUOUS":
+        equal = [h for h in e.ranked if h.is_at_floor and set(h.effects) <= set(e.effects)]
+        separation = find_separation(e.search, equal)
+    answer = assess_explanation(e, seed)
+    return replace(answer, pattern=str(shape) if is_left else "", separate=separation._asdict() if separation else {},
+                   law=law, law_effects=tuple(names.values())), shape
 
 
 def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: int = 2) -> Explanation:
@@ -142,33 +138,6 @@ def _compile_kernels(model: Model, effects: Sequence[str]) -> None:
     usual = np.array([model[name] for name in names])
     rows = usual + np.vstack([0.0 * usual, np.diag([sizes.get(n, x) - x for n, x in zip(names, usual, strict=True)])])
     Lanes(model, names, 1, 1).replay(rows, np.zeros(2), np.zeros(2))
-
-
-def look_for_pattern(explanation: Explanation, effect_file: str | Path | None = None) -> Pattern | None:
-    """The shape of the residual, where no effect explains all of it or an effect file is wanted; else None.
-
-    Raises:
-        InputError: an effect file that cannot be written.
-    """
-    if explanation.verdict not in PATTERN_VERDICTS and not effect_file:
-        return None
-    from fdi.discovery.residual_pattern import find_pattern, write_effect  # takes half a second to import
-
-    shape = find_pattern(explanation.search, explanation.ledger[-1])
-    if effect_file:
-        write_effect(shape, str(effect_file))
-    return shape
-
-
-def discriminate(explanation: Explanation) -> dict[str, Any]:
-    """The sensor or the command that would discriminate between equal explanations; {} if there is none or no need."""
-    if explanation.verdict != "AMBIGUOUS":
-        return {}
-    from fdi.discovery.separate import find_separation
-
-    equal = [h for h in explanation.ranked if h.is_at_floor and set(h.effects) <= set(explanation.effects)]
-    separation = find_separation(explanation.search, equal)
-    return separation._asdict() if separation else {}
 
 
 class Candidate(NamedTuple):
@@ -237,8 +206,7 @@ class Answer:
         return tuple(found.values())
 
 
-def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separate: Mapping[str, Any] | None = None
-                       ) -> Answer:
+def assess_explanation(e: Explanation, seed: int) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
     hand = _list_firmware_marks(e)
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
@@ -250,7 +218,7 @@ def assess_explanation(e: Explanation, seed: int = 0, pattern: str = "", separat
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, e.hidden, noiseless, suspicious,
-                  tuple(_list_ledger(e, hand)), pattern, separate or {})
+                  tuple(_list_ledger(e, hand)))
 
 
 def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:

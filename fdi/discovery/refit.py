@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi.discovery.explain import find_marks, measure_gain, measure_holdout
+from fdi.discovery.explain import find_marks, measure_gain
 from fdi.discovery.search import Hypothesis, Prospect, Search, WholeRuns, choose_search_excerpt, scan_effects
 from fdi.estimation.fit import Fit, continue_fit, linearise
 from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
@@ -74,7 +74,7 @@ class Refit:
 
 def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
                   holdout: Trace | None = None, progress: Progress = ignore_progress,
-                  begin: Mapping[str, float] | None = None, done: int = 0, workers: int | None = None) -> Refit:
+                  begin: Mapping[str, float] | None = None, done: int = 0) -> Refit:
     """Add effects to a model in this order.
 
     Args:
@@ -86,7 +86,6 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
         progress: called with each stage and the share done, 0 to 1.
         begin: parameters of an earlier fit with the first `done` effects: these come in together, from there.
         done: how many.
-        workers: threads; default one a core.
 
     Raises:
         InputError: an effect that cannot be added to this model or be fitted to these runs.
@@ -102,8 +101,7 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
         est, *repeats = (cut_excerpt(run, excerpt) for run in (est, *repeats))
         said = excerpt.describe(whole.est)
     search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
-                    workers)
-    search.whole = whole
+                    holdout=holdout, whole=whole)
     model = lean_model(search.model, replayed)
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
@@ -115,7 +113,7 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     rounds = LAST_FIT_ROUNDS + EARLIER_FIT_ROUNDS * (len(chain) - 1)
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.95, rounds)
     chain = search.judge_on_all(_finish_chain(search, chain), LAST_FIT_STEPS)
-    steps = _list_steps(search, effects, done, chain, holdout)
+    steps = _list_steps(search, effects, done, chain)
     return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search, said)
 
 
@@ -246,10 +244,9 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
     return found
 
 
-def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis], holdout: Trace | None
-           ) -> tuple[Step, ...]:
+def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis]) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
-    held = [measure_holdout(search, h, holdout) if holdout else {} for h in chain]
+    held = [search.measure_holdout(h) for h in chain]
     steps, at = [Step(effects[done - 1] if done else None, chain[0], chain[0].errors, held[0])], 0
     for name in effects[done:]:
         at += CATALOGUE[name].port not in UNREPLAYED

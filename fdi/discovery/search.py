@@ -23,7 +23,7 @@ from fdi.estimation.likelihood import (
     scaled_bounds,
     span_all_rows,
 )
-from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, judge_on_all
+from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
 from fdi.estimation.unidentifiable import finish_fit, list_powers, scale_together
 from fdi.estimation.unknowns import (
@@ -52,7 +52,8 @@ from plant.threads import R, T, count_threads, map_in_threads
 
 FITTED = 8  # effects of a scan that get a full fit
 RACE = ((3, 8), (4, 4), (8, 2))  # rounds for the so many best, stage by stage
-BEAM = 3  # hypotheses from which the next missing effect is looked for
+FINE = 20  # steps a cycle of the last fits
+TRUEST = 100  # the same for what the last fits are led by, and of runs that they never saw; slopes do with less
 EASED = (30.0, 6.0)  # times the noise, stage by stage
 VALLEY_STAGES = ((30.0, 20), (6.0, 20), (2.0, 20), (1.0, 30))  # times the noise, and generations
 
@@ -121,11 +122,10 @@ def choose_search_excerpt(model: Model, trace: Trace, effects: Iterable[str], pr
 class Search:
     """The state of one search: the problem, its noise, every hypothesis tried."""
 
-    whole: WholeRuns | None = None  # None: the runs of the search are whole recordings
-
     def __init__(self, model: Model, trace: Trace, repeats: Sequence[Trace], effects: Iterable[str],
-                 workers: int | None = None) -> None:
+                 workers: int | None = None, holdout: Trace | None = None, whole: WholeRuns | None = None) -> None:
         self.workers = workers or count_threads()
+        self.holdout, self.whole = holdout, whole  # None: the runs of the search are whole recordings
         self.sensors = {name: noises.white_noise(model[SIGNALS[name].noise]) for name in OUTPUTS}
         lsb = model.values["quantisation.lsb"] if "quantisation" in model.effects else 0.0
         self.coarse = {"xj": lsb / np.sqrt(12.0)} if lsb else {}  # RMS of rounding, where a signal comes in steps
@@ -317,6 +317,21 @@ class Search:
         ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
         return Hypothesis(effects, found, errors, repeated, ratio, cost, tuple(others))
 
+    def make_unseen_problem(self, steps: int | None = None) -> Problem:
+        """The held-out run in place of the search's own."""
+        assert self.holdout is not None
+        return replace(self.problem, trace=self.holdout, steps=steps or self.problem.steps, also=(), _lanes={})
+
+    def replay_holdout(self, h: Hypothesis) -> tuple[Problem, Floats]:
+        """The held-out run, and what a hypothesis leaves of it, (s, n) SI."""
+        assert self.holdout is not None
+        problem = self.make_unseen_problem(FINE if is_long(self.holdout) else TRUEST)
+        return problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0]
+
+    def measure_holdout(self, h: Hypothesis) -> dict[str, float]:
+        """RMS residual on the run that no fit saw, SI units; {} without one."""
+        return _measure_rms(self.replay_holdout(h)[1], self.holdout.outputs) if self.holdout is not None else {}
+
     def judge_on_all(self, hypotheses: Sequence[Hypothesis], steps: int) -> list[Hypothesis]:
         """The hypotheses with their errors on all of the recordings that the runs were cut from.
 
@@ -360,16 +375,14 @@ class Search:
         near = fit_unknowns(self.problem, h.fit.free, begin, 2)
         return self.judge_fit(h.effects, finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage))
 
-    def reaches_floor(self, h: Hypothesis, steps: int, finest: int) -> bool:
+    def reaches_floor(self, h: Hypothesis) -> bool:
         """Whether a hypothesis leaves only noise, if need be with finer steps: a little more may be the solver's error.
-
-        The arguments are those of `refine_steps`.
         """
         if h.is_at_floor or not h.is_near_floor:
             return h.is_at_floor
         finer = copy(self)
         finer.stage = NO_STAGE
-        finer.refine_steps(steps, finest)
+        finer.refine_steps(FINE)
         return finer.finish_hypothesis(h, 1).is_at_floor
 
     def begin_again(self, h: Hypothesis, rounds: int = 6) -> Hypothesis:
@@ -397,7 +410,7 @@ class Search:
         typical = np.sqrt([np.nanmean(np.minimum(c**2, np.nanpercentile(c**2, 98.0))) for c in change])
         return max(float(t) / floor[s] for s, t in zip(self.problem.trace.outputs, typical, strict=True))
 
-    def refine_steps(self, steps: int, finest: int) -> None:
+    def refine_steps(self, steps: int, finest: int = TRUEST) -> None:
         """Finer steps from here on, `finest` where only slopes do not ask for them; fits to the repeats as well."""
         self.problem = replace(self.problem, steps=steps, _lanes={}, also=tuple(p.trace for p in self.repeats),
                                workers=self.workers)

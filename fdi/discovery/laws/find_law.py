@@ -36,7 +36,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace.trace import Floats, Trace
+from fdi.trace.trace import Floats
 
 MOST_TERMS = 3
 PROPOSED = 14  # terms of each balance that a replay looks at
@@ -123,20 +123,20 @@ HIDDEN = {"force": ("p12", "a missing force and a missing flow look alike withou
           "current": ("xs", "the current balance needs XS")}
 
 
-def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, holdout: Trace | None,
-             floor: Mapping[str, float], progress: Progress = ignore_progress) -> LawSearch:
+def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, floor: Mapping[str, float],
+             progress: Progress = ignore_progress) -> LawSearch:
     """The sparse law that explains the residual of `base`, if there is one that holds.
 
     Args:
-        search: the runs, with the steps of its last fits.
+        search: the runs, with the steps of its last fits. Its held-out run judges the law and takes no part in its
+            choice.
         base: the model without the law.
         catalogue: the best that the catalogue can do; the law must do better.
-        holdout: a run of another command; it judges the law and takes no part in its choice.
         floor: noise floor of each signal, SI.
         progress: called with each stage and the share done.
     """
     progress("which states the residual follows", 0.85)
-    unseen = _make_unseen_problem(search, holdout) if holdout is not None else None
+    unseen = search.make_unseen_problem() if search.holdout is not None else None
     balances, states = compute_balances(search, base, floor=floor)
     there = compute_balances(search, base, unseen, floor) if unseen is not None else None
     missing = tuple(_describe_balance(b, states, there) for b in balances)
@@ -150,25 +150,24 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, hol
         law = None
         if trial is not None:
             progress("last fit of the law", 0.93)
-            law = worker.judge_law(trial, equals, catalogue, holdout, floor)
-    errors = {}
-    if holdout is not None:
-        errors = {name: _measure(search, h, holdout) for name, h in (("base", base), ("catalogue", catalogue)) if h}
+            law = worker.judge_law(trial, equals, catalogue)
+    known = [("base", base), ("catalogue", catalogue)] if unseen is not None else []
+    errors = {name: _measure_holdout(search, h) for name, h in known if h}
     curve = None if law is None else compute_law_curve(law, search, base.effects)
     said = law.floor if law is not None and law.holds else floor
     return LawSearch(missing, hidden, law, base, catalogue, errors, said, curve)
 
 
-def find_law_beside(e: Explanation, holdout: Trace | None, progress: Progress = ignore_progress) -> LawSearch:
+def find_law_beside(e: Explanation, progress: Progress = ignore_progress) -> LawSearch:
     """The law behind what an explanation leaves.
 
     Of a part that the catalogue explains, the law is tried alone first, then beside the named effects.
     """
     best = e.ranked[0] if e.ranked else None
-    found = find_law(e.search, e.base, best, holdout, e.floor, progress)
+    found = find_law(e.search, e.base, best, e.floor, progress)
     if e.verdict != "PARTLY" or len(e.ledger) < 2 or (found.law is not None and found.law.hypothesis.is_at_floor):
         return found
-    beside = find_law(e.search, e.ledger[-1], best, holdout, e.floor, progress)
+    beside = find_law(e.search, e.ledger[-1], best, e.floor, progress)
     if beside.law is None or not beside.law.holds:
         return found
     if found.law is None or not found.law.holds or _measure_left(beside, e.floor) < _measure_left(found, e.floor):
@@ -198,14 +197,12 @@ def _screen_rows(b: Balance, states: States) -> tuple[Floats, dict[str, Floats]]
     return (np.clip(y, *np.percentile(y, [0.5, 99.5])), {name: getattr(states, name)[inner] for name in SCREENED})
 
 
-def _make_unseen_problem(search: Search, trace: Trace) -> Problem:
-    return replace(search.problem, trace=trace, also=(), _lanes={})
-
-
-def _measure(search: Search, h: Hypothesis, trace: Trace) -> dict[str, float]:
-    """RMS residual of the typical block of a held-out run, SI."""
-    left = _make_unseen_problem(search, trace).compute_residuals(h.fit.free, h.fit.x[None])[0]
-    return dict(zip(trace.outputs, compute_typical_rms(left).tolist(), strict=True))
+def _measure_holdout(search: Search, h: Hypothesis) -> dict[str, float]:
+    """RMS residual of the typical block of the held-out run, SI; {} without one."""
+    if search.holdout is None:
+        return {}
+    left = search.make_unseen_problem().compute_residuals(h.fit.free, h.fit.x[None])[0]
+    return dict(zip(search.holdout.outputs, compute_typical_rms(left).tolist(), strict=True))
 
 
 def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:
@@ -369,8 +366,7 @@ class _Worker:
             total += float(compute_misfit(there)[0])
         return total
 
-    def judge_law(self, t: Trial, equals: tuple[str, ...], catalogue: Hypothesis | None, holdout: Trace | None,
-                  floor: Mapping[str, float]) -> Law:
+    def judge_law(self, t: Trial, equals: tuple[str, ...], catalogue: Hypothesis | None) -> Law:
         """The law with last fits, fine steps and repeats, judged on the held-out run."""
         last = copy.copy(self.search)
         model = self.problem(t.terms).model
@@ -381,23 +377,23 @@ class _Worker:
         h = last.judge_on_all([h], last.problem.steps)[0]
         values = {f: _read_value(h.fit, name_parameter(term, f), unit)
                   for term in t.terms for f, unit in zip(term.fields, term.units, strict=True)}
-        left = _measure(last, h, holdout) if holdout is not None else {}
-        holds, reason = self.decide(h, left, catalogue, holdout, floor)
+        left = _measure_holdout(last, h)
+        holds, reason = self.decide(h, left, catalogue)
         return Law(t.terms, values, holds, reason, h, left, last.estimate_floor(h), equals)
 
-    def decide(self, h: Hypothesis, left: Mapping[str, float], catalogue: Hypothesis | None, holdout: Trace | None,
-               floor: Mapping[str, float]) -> tuple[bool, str]:
-        """Whether the law holds, and why."""
+    def decide(self, h: Hypothesis, left: Mapping[str, float], catalogue: Hypothesis | None) -> tuple[bool, str]:
+        """Whether the law holds, and why; `left` is its error on the held-out run."""
+        floor = self.floor
         before, after = (measure_excess(each.errors, floor) for each in (self.base, h))
         if after > ERROR_PARTLY_EXPLAINED**2 * before:
             return False, "the law lowers the error of its own run too little"
-        if holdout is None:
+        if not left:
             return True, "no held-out run: judged on pieces of the run that its fit did not see"
         unseen = measure_excess(left, floor)
-        bare = measure_excess(_measure(self.search, self.base, holdout), floor)
+        bare = measure_excess(_measure_holdout(self.search, self.base), floor)
         if unseen > ERROR_PARTLY_EXPLAINED**2 * bare:
             return False, "the law does not lower the error of the held-out run"
-        if catalogue is not None and unseen > measure_excess(_measure(self.search, catalogue, holdout), floor):
+        if catalogue is not None and unseen > measure_excess(_measure_holdout(self.search, catalogue), floor):
             return False, "an effect of the catalogue does better on the held-out run"
         return True, "the held-out run, which took no part in the choice, confirms the law"
 

@@ -202,12 +202,12 @@ def find_hidden(port: str, law: str, size: float, tmp_path: Path) -> LawSearch:
             columns = simulate(model, com, None, seed, STEPS)
             traces.append(Trace.from_columns(columns._asdict(), 1e-3, {}))
     runs = collect_runs(Model(), traces[0], traces[1:2], traces[2])
-    search = Search(runs.model, runs.est, runs.repeats, [])
+    search = Search(runs.model, runs.est, runs.repeats, [], holdout=runs.holdout)
     base = search.fit_base()
     search.learn_noise(base)
     search.refine_steps(10, 20)
     base = search.judge_fit((), base.fit)
-    return find_law(search, base, None, runs.holdout, search.estimate_floor(base))
+    return find_law(search, base, None, search.estimate_floor(base))
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
