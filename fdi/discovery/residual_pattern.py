@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,7 +44,7 @@ class Pattern(NamedTuple):
     doubt: Floats  # (k,) standard error of the height
     wave: tuple[float, float, float] | None  # amplitude, length in m or s, phase rad
     trace: Floats  # (n,) what is missing, over time
-    port: tuple[str, str] = PORTS["force"]  # where an effect puts it in, and how
+    port: tuple[str, str]  # where an effect puts it in, and how
 
     def __str__(self) -> str:
         """In words."""
@@ -56,20 +57,33 @@ class Pattern(NamedTuple):
                     f"{1e3 * length:.4g} m{STATES[self.state][0]}")
         if not self.state:
             return f"{said}; it follows none of position, speed, pressure, spool, current or time alone"
-        return f"{said}; {self.share:.0%} of it follows the {self.state}: {_describe_pattern(self)}"
-
-
-def _describe_pattern(p: Pattern) -> str:
-    unit, middle = STATES[p.state][0], float(np.interp(0.5 * (p.at[0] + p.at[-1]), p.at, p.height))
-    return (f"{p.height[0]:.3g} {p.unit} at {p.at[0]:.3g} {unit}, {middle:.3g} in the middle, "
-            f"{p.height[-1]:.3g} at {p.at[-1]:.3g} {unit}")
+        unit, first, last, height = STATES[self.state][0], self.at[0], self.at[-1], self.height
+        middle = float(np.interp(0.5 * (first + last), self.at, height))
+        return (f"{said}; {self.share:.0%} of it follows the {self.state}: {height[0]:.3g} {self.unit} at {first:.3g} "
+                f"{unit}, {middle:.3g} in the middle, {height[-1]:.3g} at {last:.3g} {unit}")
 
 
 def find_pattern(search: Search, h: Hypothesis) -> Pattern:
     """The shape of what a hypothesis leaves unexplained."""
-    found, states = compute_balances(search, h)
-    pumped = found[0].place == "flow" and "pump.displacement" in search.problem.model.values
-    return _find_shape(found[0], states)._replace(port=PUMPED if pumped else PORTS[found[0].place])
+    (best, *_), states = compute_balances(search.problem, h, search.estimate_floor(h))
+    pumped = best.place == "flow" and "pump.displacement" in search.problem.model.values
+    port = PUMPED if pumped else PORTS[best.place]
+    if best.ratio < PATTERN_VISIBLE_RATIO:
+        none = np.empty(0)
+        return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing, port)
+    missing = best.missing[EDGE:-EDGE]
+    seen = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
+    curves = {name: fit_curve(missing, x, best.noise) for name, x in seen.items()}
+    state, wave = max(curves, key=lambda n: curves[n][0]), None
+    share, at, height, doubt = curves[state]
+    waves = {name: fit_wave(missing, seen[name], best.noise) for name in ("position", "time")}
+    over = max(waves, key=lambda n: waves[n][1])
+    if waves[over][1] > max(share + 0.05, PATTERN_EXPLAINED_SHARE):
+        state, (wave, share) = over, waves[over]
+        _, at, height, doubt = fit_curve(missing, np.mod(seen[over], wave[1]), best.noise)
+    elif share < PATTERN_EXPLAINED_SHARE:
+        state = ""
+    return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, wave, best.missing, port)
 
 
 def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis) -> bool:
@@ -78,35 +92,17 @@ def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis)
     Teeth, magnets and a bent rod make such a force. A friction law that fits its mean at each speed helps a little, on
     every run, and is then named for it.
     """
-    balances, states = compute_balances(search, base)
+    balances, states = compute_balances(search.problem, base, search.estimate_floor(base))
     force = next((b for b in balances if b.place == "force"), None)
     if force is None or force.ratio < PATTERN_VISIBLE_RATIO:
         return False
-    left = next(b for b in compute_balances(search, found)[0] if b.place == "force")
+    others, _ = compute_balances(search.problem, found, search.estimate_floor(found))
+    left = next(b for b in others if b.place == "force")
     taken = 1.0 - (left.size / force.size) ** 2 if force.size else 1.0
     inner = slice(EDGE, -EDGE)
     (_, length, _), share = fit_wave(force.missing[inner], states.position[inner], force.noise)
     turns = float(np.ptp(states.position[inner])) / length
     return turns >= SPATIAL_TURNS and share >= PATTERN_EXPLAINED_SHARE and share > taken
-
-
-def _find_shape(best: Balance, states: States) -> Pattern:
-    if best.ratio < PATTERN_VISIBLE_RATIO:
-        none = np.empty(0)
-        return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing)
-    missing = best.missing[EDGE:-EDGE]
-    seen = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
-    curves = {name: fit_curve(missing, x, best.noise) for name, x in seen.items()}
-    name = max(curves, key=lambda n: curves[n][0])
-    share, at, height, doubt = curves[name]
-    waves = {name: fit_wave(missing, seen[name], best.noise) for name in ("position", "time")}
-    over = max(waves, key=lambda n: waves[n][1])
-    if waves[over][1] > max(share + 0.05, PATTERN_EXPLAINED_SHARE):
-        shape, share = waves[over]
-        _, at, height, doubt = fit_curve(missing, np.mod(seen[over], shape[1]), best.noise)
-        return Pattern(best.place, best.unit, best.size, over, share, at, height, doubt, shape, best.missing)
-    state = name if share >= PATTERN_EXPLAINED_SHARE else ""
-    return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, None, best.missing)
 
 
 def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Floats]:
@@ -232,44 +228,37 @@ class States(NamedTuple):
     acceleration: Floats
 
 
-def compute_balances(search: Search, h: Hypothesis, unseen: Problem | None = None,
-                     floor: Mapping[str, float] | None = None) -> tuple[list[Balance], States]:
+def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]) -> tuple[list[Balance], States]:
     """The balances of ram, valve and torque motor under a hypothesis, the most unbalanced first.
 
     Each is taken on the measurement and on the model's own replay, smoothed alike; the difference is what is missing.
-    Signals that were not measured are the replay's: then a place behind them cannot show anything.
-    `unseen`: the problem of another run, a held-out one; default: that of the search. `floor`: noise of each signal,
-    SI; default: what the hypothesis leaves.
+    Signals that were not measured are the replay's: then a place behind them cannot show anything. `floor`: noise of
+    each signal, SI.
     """
-    problem = unseen or search.problem
     trace = problem.trace
     names = [f.name for f in h.fit.free]
     values = {**problem.model.values, **h.fit.values}
     replay = problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     measured = replay.copy()
-    for row, signal in enumerate(trace.outputs):
-        there = ~np.isnan(trace.measurements[row])
-        measured[OUTPUTS.index(signal), there] = trace.measurements[row, there]
+    columns = trace.output_columns
+    measured[columns] = np.where(np.isnan(trace.measurements), replay[columns], trace.measurements)
     before = np.concatenate([[0.0], trace.cor[:-1]])
     period = problem.model.values["controller.period"]
-    own = _compute_terms(replay, before, trace.load, values, period)
-    seen = _compute_terms(measured, before, trace.load, values, period)
-    known = search.estimate_floor(h) if floor is None else floor
-    level = [known.get(s, 0.0) for s in OUTPUTS]
+    compute = partial(_compute_terms, current=before, load=trace.load, p=values, period=period)
+    own, seen = compute(replay), compute(measured)
+    level = [floor.get(s, 0.0) for s in OUTPUTS]
     rng = np.random.default_rng(0)
     draws = 4  # simulated runs without anything missing
     kept = find_smooth_rows(trace)
-    noisy = [_compute_terms(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None], before, trace.load,
-                            values, period) for _ in range(draws)]
+    noisy = [compute(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None]) for _ in range(draws)]
     smooth = np.logical_and.reduce([find_followed_rows(x, noise) for x, noise in zip(measured, level, strict=True)])
     found = []
-    for place, unit in ((place, unit) for place, unit in UNITS.items() if place in own):
+    for place in own:
         missing = (seen[place] - own[place])[kept]
         noise = float(np.sqrt(np.mean([_mean_square((n[place] - own[place])[kept]) for n in noisy])))
         rms = float(np.sqrt(_mean_square(missing)))
-        found.append(Balance(place, unit, missing, noise, rms / noise if noise else 0.0, smooth[kept]))
-    position = replay[0] if np.isnan(measured[0]).all() else _smooth(measured[0], SPEED_WINDOW)
-    speed = _measure_speed(measured[0], period)
+        found.append(Balance(place, UNITS[place], missing, noise, rms / noise if noise else 0.0, smooth[kept]))
+    position, speed = _smooth(measured[0], SPEED_WINDOW), _measure_speed(measured[0], period)
     states = (position, speed, measured[1], measured[2], before, trace.t, _measure_speed(measured[2], period),
               trace.com, np.clip(speed / CREEP, -1.0, 1.0), measure_way(position, speed),
               _smooth(measured[0], ACCELERATION_WINDOW, deriv=2, delta=period))
@@ -337,16 +326,12 @@ def _compute_terms(signals: Floats, current: Floats, load: Floats, p: Mapping[st
     sliding = np.clip(v / CREEP, -1.0, 1.0) * p["jack.dynamic_friction"]
     force = p["jack.area"] * smooth - p["jack.damping"] * v - load - sliding - p["jack.mass"] * a
     if "pump.displacement" in p:
-        return {"force": force, "flow": _compute_pump_flow(current, v, _smooth(p12, SPEED_WINDOW), p)}
+        area = p["jack.area"] * np.where(current < 0.0, p["pump.area_ratio"], 1.0)  # the current is the motor's speed
+        return {"force": force,
+                "flow": p["pump.displacement"] * current - area * v - p["jack.leakage"] * _smooth(p12, SPEED_WINDOW)}
     spool = _smooth(xs, SPEED_WINDOW)
     conductance = p["valve.flow_gain"] / p["valve.pressure_gain"] + p["jack.leakage"]
     flow = p["valve.flow_gain"] * spool - conductance * _smooth(p12, SPEED_WINDOW) - p["jack.area"] * v
     flapper = p["spool.end_area"] * _measure_speed(xs, period) / p["pilot.flow_gain"]
     torque = p["flapper.stiffness"] * flapper + p["feedback_spring.stiffness"] * spool
     return {"force": force, "flow": flow, "current": current - torque / p["torque_motor.gain"]}
-
-
-def _compute_pump_flow(speed: Floats, v: Floats, p12: Floats, p: Mapping[str, float]) -> Floats:
-    """Flow that a pump at motor `speed` (n,) delivers and the jack does not take, m3/s."""
-    area = p["jack.area"] * np.where(speed < 0.0, p["pump.area_ratio"], 1.0)
-    return p["pump.displacement"] * speed - area * v - p["jack.leakage"] * p12

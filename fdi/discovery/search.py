@@ -506,14 +506,14 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
              for start in (*CATALOGUE[name].starts, *find_tones(problem, fit, name))]
-    best = _pick_best(_simulate_starts(problem, fit, first, workers))
+    best = _pick_best(simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
         promising = sorted(best.values(), key=lambda t: t.cost)[:count]
         near = [(t.effect, start, t.along) for t in promising for start in _list_starts_around(problem, t, factors)]
-        best = _pick_best([*best.values(), *_simulate_starts(problem, fit, near, workers)])
+        best = _pick_best([*best.values(), *simulate_starts(problem, fit, near, workers)])
     promising = sorted(best.values(), key=lambda t: t.cost)[:LOOKED_AT[-1]]
     beside = [(t.effect, start, t.along) for t in promising for start in _list_lines_beside(problem, t)]
-    best = _pick_best([*best.values(), *_simulate_starts(problem, fit, beside, workers)])
+    best = _pick_best([*best.values(), *simulate_starts(problem, fit, beside, workers)])
     return sorted((_make_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
 
 
@@ -633,7 +633,7 @@ def _pick_best(trials: Iterable[Trial]) -> dict[str, Trial]:
     return best
 
 
-def _simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int
+def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int
                      ) -> list[Trial]:
     """The starts simulated at the fit's values, or with what goes with them, side by side."""
     if not starts:

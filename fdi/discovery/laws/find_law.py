@@ -7,7 +7,7 @@ takes no part in its choice.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fdi.discovery.explain import Explanation
 from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, name_parameter, registered_library
 from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
-from fdi.discovery.search import Hypothesis, Search, absorb_shift, prepare_slope
+from fdi.discovery.search import Hypothesis, Search, simulate_starts
 from fdi.estimation.fit import Fit, Value, continue_fit, form_normal_equations, linearise, step_within_bounds
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
 from fdi.estimation.unknowns import silence_readings
@@ -49,21 +49,11 @@ SCREENED = ("position", "speed", "pressure", "spool", "current", "command", "dir
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Terms fitted by replay: `cost` on the whole run, `unseen` on pieces left out of the fit."""
+    """Terms fitted by replay; `unseen` is -2 log likelihood on pieces left out of the fit."""
 
     terms: tuple[Term, ...]
     fit: Fit
     unseen: float = np.inf
-
-    @property
-    def cost(self) -> float:
-        """-2 log likelihood with priors."""
-        return self.fit.cost
-
-    @property
-    def size(self) -> int:
-        """Number of the law's parameters."""
-        return sum(len(t.fields) for t in self.terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +127,8 @@ def find_law(search: Search, base: Hypothesis, catalogue: Hypothesis | None, flo
     """
     progress("which states the residual follows", 0.85)
     unseen = search.make_unseen_problem() if search.holdout is not None else None
-    balances, states = compute_balances(search, base, floor=floor)
-    there = compute_balances(search, base, unseen, floor) if unseen is not None else None
+    balances, states = compute_balances(search.problem, base, floor)
+    there = compute_balances(unseen, base, floor) if unseen is not None else None
     missing = tuple(_describe_balance(b, states, there) for b in balances)
     outputs = search.problem.trace.outputs
     hidden = {place: why for place, (signal, why) in HIDDEN.items()
@@ -242,8 +232,7 @@ class _Worker:
         if self.base.is_at_floor:
             return None, ()  # what a healthy unit's tolerances have not quite reached is not a law
         start = continue_fit(self.problem(()), linearise(self.problem(()), self.base.fit.free, self.base.fit.x), 2)
-        now = Trial((), start)
-        now = replace(now, unseen=self.measure_unseen(now))
+        (now,) = self.measure_unseen([Trial((), start)])
         equals: tuple[str, ...] = ()
         samples = float(np.isfinite(self.search.problem.trace.measurements).sum())
         for count in range(MOST_TERMS):
@@ -251,20 +240,18 @@ class _Worker:
                 break  # only noise is left
             progress(f"looking for term {count + 1} of a law", 0.86 + 0.02 * count)
             tried = self.add_each_term(now)
-            if not tried or tried[0].cost > now.cost - GAIN_CONVINCES:
+            if not tried or tried[0].fit.cost > now.fit.cost - GAIN_CONVINCES:
                 break
-            close = [t for t in tried if t.cost < tried[0].cost + 0.1 * (now.cost - tried[0].cost)][:3]
-            judged = self.search.map_parallel(lambda t: replace(t, unseen=self.measure_unseen(t)), close)
-            best = min(judged, key=lambda t: t.unseen + GAIN_TIE * t.size)
-            gain = now.unseen - best.unseen
-            if gain < max(GAIN_CONVINCES, FURTHER_EFFECT_SHARE * (now.unseen - samples)):
+            limit = tried[0].fit.cost + 0.1 * (now.fit.cost - tried[0].fit.cost)
+            judged = self.measure_unseen([t for t in tried if t.fit.cost < limit][:3])
+            best = min(judged, key=lambda t: t.unseen + GAIN_TIE * sum(len(term.fields) for term in t.terms))
+            if now.unseen - best.unseen < max(GAIN_CONVINCES, FURTHER_EFFECT_SHARE * (now.unseen - samples)):
                 break
             if count == 0:
                 equals = tuple(t.terms[-1].name for t in judged if t is not best
                                and t.unseen < best.unseen + GAIN_TIE)
             now = best
-        if len(now.terms) > 1:
-            now = self.drop_terms(now)
+        now = self.drop_terms(now)
         return (now, equals) if now.terms else (None, ())
 
     def add_each_term(self, now: Trial) -> list[Trial]:
@@ -272,55 +259,30 @@ class _Worker:
 
         Tolerances that have moved to make up for what is missing hide it: proposals come from the healthy unit too.
         """
-        problem = self.problem(now.terms)
         known = np.array([np.isfinite(f.prior) for f in now.fit.free])
-        healthy = linearise(problem, now.fit.free, np.where(known, 0.0, now.fit.x))
-        ranked: list[_Ranked] = []
-        for fit in (now.fit, healthy):
-            ranked += self.rank_terms(now.terms, fit)
+        healthy = linearise(self.problem(now.terms), now.fit.free, np.where(known, 0.0, now.fit.x))
+        ranked = [each for fit in (now.fit, healthy) for each in self.rank_terms(now.terms, fit)]
         best: dict[str, _Ranked] = {}
         for each in sorted(ranked, key=lambda r: r.cost):
             best.setdefault(each.proposal.term.name, each)
-        worth = [each for each in best.values() if each.cost < now.cost - GAIN_CONVINCES][:MOST_FITTED]
+        worth = [each for each in best.values() if each.cost < now.fit.cost - GAIN_CONVINCES][:MOST_FITTED]
         fits = self.search.map_parallel(lambda each: self.fit_term(now.terms, each), worth)
-        return sorted(fits, key=lambda t: t.cost)
+        return sorted(fits, key=lambda t: t.fit.cost)
 
     def rank_terms(self, terms: tuple[Term, ...], fit: Fit) -> list[_Ranked]:
-        """Every proposal on top of a fit, with what a replay says that it would leave."""
-        worker = copy.copy(self.search)
-        worker.problem = replace(self.problem(terms), workers=self.search.workers)
-        balances, states = compute_balances(worker, Hypothesis(self.base.effects, fit, {}), floor=self.floor)
+        """Every proposal at each of `TRIED_SIZES` on top of a fit, with what a replay says that it would leave."""
+        problem = replace(self.problem(terms), workers=self.search.workers)
+        balances, states = compute_balances(problem, Hypothesis(self.base.effects, fit, {}), self.floor)
         ranked: list[_Ranked] = []
         for b in balances:
-            if b.place in self.places:
-                rows = select_rows(b, states, {**worker.problem.model.values, **fit.values})
-                proposals = propose_terms(b.place, rows, terms)[:PROPOSED]
-                ranked += self.rank_by_replay(terms, fit, b.place, proposals)
-        return ranked
-
-    def rank_by_replay(self, terms: Sequence[Term], fit: Fit, place: str, proposals: Sequence[Proposal]
-                       ) -> list[_Ranked]:
-        """Cost of each proposal at each of `TRIED_SIZES`, after the tolerances have moved linearly."""
-        if not proposals:
-            return []
-        problem = self.problem(terms, place)
-        tried = [(p, factor) for p in proposals for factor in TRIED_SIZES]
-        own = [{name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0) for f, v in p.values.items()}
-               for p, factor in tried]
-        names = list(dict.fromkeys([f.name for f in fit.free] + [n for values in own for n in values]))
-        usual = {n: problem.model.values[n] for n in names} | fit.values
-        rows = np.array([[values.get(n, usual[n]) for n in names] for values in own])
-        steep = prepare_slope(fit)
-
-        def rank_rows(part: NDArray[np.int64]) -> list[_Ranked]:
-            white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
-            shifted = [absorb_shift(fit, steep, w, set(), fit.x) for w in white]
-            return [_Ranked(cost, tried[i][0], tried[i][1], fit, x)
-                    for i, (cost, x) in zip(part.tolist(), shifted, strict=True)]
-
-        parts = np.array_split(np.arange(len(rows)), max(1, -(-len(rows) // 16)))
-        return [each for several in self.search.map_parallel(rank_rows, parts) for each in several
-                if np.isfinite(each.cost)]
+            rows = select_rows(b, states, {**problem.model.values, **fit.values})
+            proposals = propose_terms(b.place, rows, terms)[:PROPOSED] if b.place in self.places else []
+            tried = [(p, factor) for p in proposals for factor in TRIED_SIZES]
+            starts = [(p.term.name, {name_parameter(p.term, f): v * (factor if f == p.term.name else 1.0)
+                                     for f, v in p.values.items()}, False) for p, factor in tried]
+            trials = simulate_starts(self.problem(terms, b.place), fit, starts, self.search.workers)
+            ranked += [_Ranked(t.cost, *each, fit, t.x) for each, t in zip(tried, trials, strict=True)]
+        return [each for each in ranked if np.isfinite(each.cost)]
 
     def fit_term(self, terms: tuple[Term, ...], r: _Ranked) -> Trial:
         """The law with one more term, fitted with all tolerances from where the ranking has left them, or before it."""
@@ -335,8 +297,7 @@ class _Worker:
     def drop_terms(self, now: Trial) -> Trial:
         """The law without the terms that left-out pieces of the run do not want."""
         while len(now.terms) > 1:
-            shorter = [replace(t, unseen=self.measure_unseen(t))
-                       for t in self.search.map_parallel(partial(self.fit_without, now), now.terms)]
+            shorter = self.measure_unseen(self.search.map_parallel(partial(self.fit_without, now), now.terms))
             best = min(shorter, key=lambda t: t.unseen)
             if best.unseen > now.unseen + GAIN_CONVINCES:
                 break
@@ -345,26 +306,28 @@ class _Worker:
 
     def fit_without(self, now: Trial, gone: Term) -> Trial:
         """The law without a term."""
-        terms = tuple(t for t in now.terms if t is not gone)
-        own = {name_parameter(gone, f) for f in gone.fields}
-        kept = np.array([f.name not in own for f in now.fit.free])
-        free = tuple(f for f, keep in zip(now.fit.free, kept, strict=True) if keep)
-        problem = self.problem(terms)
-        return Trial(terms, continue_fit(problem, linearise(problem, free, now.fit.x[kept]), 5))
+        terms, (free, x) = tuple(t for t in now.terms if t is not gone), leave_out_terms(now.fit, [gone])
+        return Trial(terms, continue_fit(self.problem(terms), linearise(self.problem(terms), free, x), 5))
 
-    def measure_unseen(self, t: Trial) -> float:
-        """-2 log likelihood of each half of the run's pieces under a fit to the other half, one step from the whole."""
-        problem, white = self.problem(t.terms), t.fit.white
-        piece = np.arange(white.shape[1]) // max(round(FOLD_SECONDS / problem.trace.period), 1)
-        total = 0.0
-        for half in (0, 1):
-            mask = (piece % 2 == half).astype(float)
-            fitted = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
-            gradient, hessian = form_normal_equations(fitted)
-            x = step_within_bounds(fitted, hessian, gradient, 1e-3)
-            there = problem.compute_white_residuals(t.fit.free, x[None]) * (1.0 - mask)
-            total += float(compute_misfit(there)[0])
-        return total
+    def measure_unseen(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Trials with -2 log likelihood of each half of the run's pieces under a fit to the other half.
+
+        That fit is one step from the fit to the whole.
+        """
+        def measure(t: Trial) -> Trial:
+            problem, white = self.problem(t.terms), t.fit.white
+            piece = np.arange(white.shape[1]) // max(round(FOLD_SECONDS / problem.trace.period), 1)
+            total = 0.0
+            for half in (0, 1):
+                mask = (piece % 2 == half).astype(float)
+                fitted = replace(t.fit, white=white * mask, jacobian=t.fit.jacobian * mask)
+                gradient, hessian = form_normal_equations(fitted)
+                x = step_within_bounds(fitted, hessian, gradient, 1e-3)
+                there = problem.compute_white_residuals(t.fit.free, x[None]) * (1.0 - mask)
+                total += float(compute_misfit(there)[0])
+            return replace(t, unseen=total)
+
+        return self.search.map_parallel(measure, trials)
 
     def judge_law(self, t: Trial, equals: tuple[str, ...], catalogue: Hypothesis | None) -> Law:
         """The law with last fits, fine steps and repeats, judged on the held-out run."""
@@ -419,46 +382,45 @@ def _read_value(fit: Fit, name: str, unit: str) -> Value:
     return Value(value, value - half, value + half, unit)
 
 
-def remove_law(law: Law, effects: tuple[str, ...]) -> Hypothesis:
-    """The model with the tolerances that were fitted together with a law, and without the law.
-
-    Tolerances fitted without it have moved to make up for a part of what is missing.
-    """
-    fit = law.hypothesis.fit
-    own = {name_parameter(term, f) for term in law.terms for f in term.fields}
-    kept = np.array([f.name not in own for f in fit.free])
-    free = tuple(f for f, keep in zip(fit.free, kept, strict=True) if keep)
-    return Hypothesis(effects, replace(fit, free=free, x=fit.x[kept]), {})
+def leave_out_terms(fit: Fit, terms: Iterable[Term]) -> tuple[tuple[Free, ...], Floats]:
+    """The unknowns of a fit, and their values (p,), without those of some terms."""
+    own = {name_parameter(term, f) for term in terms for f in term.fields}
+    kept = [k for k, f in enumerate(fit.free) if f.name not in own]
+    return tuple(fit.free[k] for k in kept), fit.x[kept]
 
 
 def compute_law_curve(law: Law, search: Search, effects: tuple[str, ...]) -> LawCurve:
     """Bin means of what is missing without the law, and of the law, over the first term's state.
 
-    `effects` are those that the law stands beside.
+    `effects` are those that the law stands beside. The tolerances are those that were fitted together with the law:
+    fitted without it they have moved to make up for a part of what is missing.
     """
-    bare = remove_law(law, effects)
-    balances, states = compute_balances(search, bare, floor=law.floor)
+    fit = law.hypothesis.fit
+    free, x = leave_out_terms(fit, law.terms)
+    bare = Hypothesis(effects, replace(fit, free=free, x=x), {})
+    balances, states = compute_balances(search.problem, bare, law.floor)
     term = law.terms[0]
     balance = next(b for b in balances if b.place == term.place)
     rows = select_rows(balance, states, {**search.problem.model.values, **bare.fit.values})
     along = {"damping": "speed", "dry": "direction", "conductance": "pressure", "area": "speed"}.get(term.part, "")
-    own = find_states(term)
-    state = own[0] if own else (along or "time")
+    state = next(iter(find_states(term)), along or "time")
     state = "speed" if state == "direction" else state
     is_odd = bool(along) and state != along and not (along == "direction" and state == "speed")
     side = np.sign(rows.states[along]) if is_odd else 1.0
-    said = side * evaluate_law(law, term.place, rows.states)
-    x, period = rows.states[state], 0.0
+    found = {f: v.value for f, v in law.values.items()}
+    said = np.sum([found[t.name] * evaluate_columns(t, {f: found[f] for f in t.fields}, rows.states)[:, 0]
+                   for t in law.terms if t.place == term.place], axis=0)
+    over, period = rows.states[state], 0.0
     if term.is_wave and term.shape is not None:
-        shape = law.values[f"{term.name}_{term.shape.name}"].value
+        shape = found[f"{term.name}_{term.shape.name}"]
         period = shape if term.shape.kind == "period" else 1.0 / shape
-        x = np.mod(x, period)
+        over = np.mod(over, period)
     bins = 24
-    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)))
-    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
-    curves = [average_bins(place, len(edges) - 1, column) for column in (x, side * rows.missing, said)]
-    return LawCurve(term.place, balance.unit, state, along if is_odd else "", period, curves[0][0], curves[1][0],
-                    curves[1][1], curves[2][0])
+    edges = np.unique(np.quantile(over, np.linspace(0.0, 1.0, bins + 1)))
+    place = np.clip(np.searchsorted(edges, over, side="right") - 1, 0, len(edges) - 2)
+    (at, _), (height, doubt), (law_height, _) = (average_bins(place, len(edges) - 1, column)
+                                                 for column in (over, side * rows.missing, side * said))
+    return LawCurve(term.place, balance.unit, state, along if is_odd else "", period, at, height, doubt, law_height)
 
 
 def average_bins(place: NDArray[np.int64], bins: int, y: Floats, neighbours: int = 20) -> tuple[Floats, Floats]:
@@ -470,22 +432,12 @@ def average_bins(place: NDArray[np.int64], bins: int, y: Floats, neighbours: int
     return mean, np.sqrt((sums**2).sum(axis=0)) / count
 
 
-def evaluate_law(law: Law, place: str, at: Mapping[str, Floats]) -> Floats:
-    """What the law says is missing in a balance, (n,), along measured states."""
-    total = np.zeros(len(at["time"]))
-    for term in law.terms:
-        if term.place == place:
-            values = {f: law.values[f].value for f in term.fields}
-            total += values[term.name] * evaluate_columns(term, values, at)[:, 0]
-    return total
-
-
 Places = NDArray[np.int64]
 
 FOLDS = 10  # contiguous blocks of a run; each is predicted from the others
 SHIFTS = 199  # of the residual against the states, for the null
 SINGLE_BINS, PAIR_BINS = 12, 6
-FINE_BINS = 40  # of the position alone: a wave along the stroke is short
+OWN_BINS = {"position": 40}  # alone: a wave along the stroke is short
 
 
 class Dependence(NamedTuple):
@@ -517,8 +469,8 @@ def find_dependences(y: Floats, states: Mapping[str, Floats], holdout: tuple[Flo
     shifts = rng.integers(n // 20, n - n // 20, SHIFTS)
     moved = np.column_stack([y, *(np.roll(y, int(k)) for k in shifts)])
     fold = np.minimum(np.arange(n) * FOLDS // n, FOLDS - 1)
-    kinds = (SINGLE_BINS, PAIR_BINS, FINE_BINS)
-    edges = {name: {bins: _cut_range(states[name], bins) for bins in kinds} for name in names}
+    edges = {name: {bins: np.unique(np.quantile(states[name], np.linspace(0.0, 1.0, bins + 1)[1:-1]))
+                    for bins in (SINGLE_BINS, PAIR_BINS, *OWN_BINS.values())} for name in names}
     choices = [(name,) for name in names] + list(combinations(names, 2))
     shares = np.array([_predict_folds(_find_bins(c, states, edges), fold, moved) for c in choices])
     best_by_chance = shares[:, 1:].max(axis=0)
@@ -530,17 +482,9 @@ def find_dependences(y: Floats, states: Mapping[str, Floats], holdout: tuple[Flo
                        float((1 + np.sum(best_by_chance >= own[c])) / (1 + SHIFTS))) for c in ranked]
 
 
-def _cut_range(x: Floats, bins: int) -> Floats:
-    """Inner edges of bins that hold about equally many samples."""
-    return np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)[1:-1]))
-
-
 def _find_bins(choice: Sequence[str], states: Mapping[str, Floats], edges: Mapping[str, Mapping[int, Floats]]
                ) -> Places:
-    if len(choice) > 1:
-        bins = PAIR_BINS
-    else:
-        bins = FINE_BINS if choice[0] == "position" else SINGLE_BINS
+    bins = PAIR_BINS if len(choice) > 1 else OWN_BINS.get(choice[0], SINGLE_BINS)
     place = np.zeros(len(states[choice[0]]), np.int64)
     for name in choice:
         place = place * bins + np.searchsorted(edges[name][bins], states[name], side="right")
@@ -631,46 +575,38 @@ def propose_terms(place: str, rows: Rows, present: Sequence[Term] = ()) -> list[
     """Every term of a balance on its own, beside the tolerances, best first; without those that are `present`."""
     if len(rows.missing) < 20 * FOLDS:
         return []
-    terms = [t for t in TERMS if t.place == place and t not in present]
-    remover = _Remover(rows)
-    found = [p for p in (_fit_term(t, rows, remover) for t in terms) if p is not None]
-    return sorted(found, key=lambda p: -p.share)
+    remove = _make_remover(rows)
+    y = remove(rows.missing[:, None])[:, 0]
+    found = (_fit_term(t, rows, remove, y) for t in TERMS if t.place == place and t not in present)
+    return sorted((p for p in found if p is not None), key=lambda p: -p.share)
 
 
-class _Remover:
-    """Takes out of columns what tolerances of a usual size can make up for."""
-
-    def __init__(self, rows: Rows) -> None:
-        wide = rows.nuisance
-        # neighbours are alike, so noise averages out over fewer rows than there are
-        variance = rows.noise**2 * ACCELERATION_WINDOW / THINNED + 1e-300
-        self._wide = wide
-        self._inverse = np.linalg.inv(wide.T @ wide + variance * np.eye(wide.shape[1]))
-        self.y = self.remove(rows.missing[:, None])[:, 0]
-
-    def remove(self, columns: Floats) -> Floats:
-        return columns - self._wide @ (self._inverse @ (self._wide.T @ columns))
+def _make_remover(rows: Rows) -> Callable[[Floats], Floats]:
+    """A function that takes out of columns, (n, k), what tolerances of a usual size can make up for."""
+    wide = rows.nuisance
+    # neighbours are alike, so noise averages out over fewer rows than there are
+    variance = rows.noise**2 * ACCELERATION_WINDOW / THINNED + 1e-300
+    inverse = np.linalg.inv(wide.T @ wide + variance * np.eye(wide.shape[1]))
+    return lambda columns: columns - wide @ (inverse @ (wide.T @ columns))
 
 
-def _fit_term(term: Term, rows: Rows, remover: _Remover) -> Proposal | None:
-    trials = list_shapes(term, rows.states, remover.y)
-    best: tuple[float, dict[str, float]] | None = None
-    for shape in trials:
-        columns = remover.remove(evaluate_columns(term, shape, rows.states))
+def _fit_term(term: Term, rows: Rows, remove: Callable[[Floats], Floats], y: Floats) -> Proposal | None:
+    """The term with the shape that predicts `y` (n,) best: what is missing, without what tolerances make up for."""
+    best: Proposal | None = None
+    for shape in list_shapes(term, rows.states, y):
+        columns = remove(evaluate_columns(term, shape, rows.states))
         if not np.isfinite(columns).all() or np.ptp(columns, axis=0).max() == 0.0:
             continue
         size = np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
-        share, c = _predict_blocks(columns / size, remover.y)
+        share, c = _predict_blocks(columns / size, y)
         c = c / size
-        if best is None or share > best[0]:
+        if best is None or share > best.share:
             values = {term.name: float(c[0]), **shape}
             if term.is_wave:
                 values[term.name] = float(np.hypot(*c))
                 values[f"{term.name}_phase"] = float(np.arctan2(c[1], c[0]))
-            best = share, values
-    if best is None or best[1][term.name] == 0.0:
-        return None
-    return Proposal(term, best[1], best[0])
+            best = Proposal(term, values, share)
+    return best if best is not None and best.values[term.name] != 0.0 else None
 
 
 def _predict_blocks(columns: Floats, y: Floats) -> tuple[float, Floats]:

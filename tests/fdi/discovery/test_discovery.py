@@ -167,7 +167,7 @@ def test_a_curve_over_the_speed_is_found() -> None:
 def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Path) -> None:
     at = np.linspace(-0.1, 0.1, 9)
     found = Pattern("force", "N", 500.0, "position" if shape == "wave" else "speed", 0.9, at, 1e4 * at, at * 0 + 1.0,
-                    (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10))
+                    (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10), ("load", "x + {0}"))
     with restored_catalogue():
         write_effect(found, tmp_path / "found.py")
         assert len((tmp_path / "found.py").read_text().splitlines()) < 40
