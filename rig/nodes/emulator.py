@@ -62,17 +62,13 @@ class Emulator:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
-        plant, faults = Actuator(scenario.model, scenario.seed), Schedule(scenario.plan, scenario.model.values)
+        plant = Actuator(scenario.model, scenario.seed)
         plant.warm()
-        self._scenario, self._load = scenario, scenario.load()
-        self._begin(plant, faults)
+        self._begin(scenario, plant)
 
-    def _restart(self) -> None:
-        s = self._scenario
-        self._begin(Actuator(s.model, s.seed), Schedule(s.plan, s.model.values))
-
-    def _begin(self, plant: Actuator, faults: Schedule) -> None:
-        self._plant, self._faults = plant, faults
+    def _begin(self, scenario: Scenario, plant: Actuator) -> None:
+        self._faults, self._load = Schedule(scenario.plan, scenario.model.values), scenario.load()
+        self._scenario, self._plant = scenario, plant
         self._cycle = 0  # of the SYNC to come
         self._changed = -1  # the last cycle whose parameters are in force
         self._begun = False  # SYNCs are counted from the first start
@@ -96,11 +92,18 @@ class Emulator:
             for data in apply_action(action, frame.data):
                 self.device.receive(frame._replace(data=data))
             return
-        if self._is_deaf(frame):
+        is_cycle = frame.cob_id == codec.SYNC and self._begun
+        if self._faults.is_bus_off("plant", self._cycle if frame.cob_id == codec.SYNC else self._cycle - 1):
+            if is_cycle:  # it receives nothing, but its plant goes on
+                self._pass_cycle()
             return
-        if frame.cob_id == codec.SYNC and self._begun:
-            self._pass_lost_syncs()
-            if self._is_second_sync():
+        if is_cycle:
+            for _ in range(self._faults.count_lost_syncs(self._cycle)):  # time went on for the plant
+                self._pass_cycle()
+            is_second = self._synced == self._cycle - 1 and isinstance(
+                self._faults.find_action("sync", self._synced), Double)
+            self._synced = -1 if is_second else self._cycle
+            if is_second:
                 self._answer_again()
                 return
             if self.device.state is not NmtState.OPERATIONAL:
@@ -109,36 +112,16 @@ class Emulator:
         if not self._moved:  # after the answer to a SYNC has gone out
             self._move()
 
-    def _is_deaf(self, frame: Frame) -> bool:
-        """Whether a fault has the node bus-off: it receives nothing, but its plant goes on."""
-        if not self._faults.is_bus_off("plant", self._cycle if frame.cob_id == codec.SYNC else self._cycle - 1):
-            return False
-        if frame.cob_id == codec.SYNC and self._begun:
-            self._pass_cycle()
-        return True
-
-    def _pass_lost_syncs(self) -> None:
-        """Make up for the SYNCs that a fault kept from arriving since the last one: time went on for the plant."""
-        for _ in range(self._faults.count_lost_syncs(self._cycle)):
-            self._pass_cycle()
-
     def _pass_cycle(self) -> None:
         """A cycle of which the node heard no SYNC: the current stays, and is zeroed after three."""
         k = self._cycle
         if self.device.state is not NmtState.OPERATIONAL:
             self._cycle += 1
             return
-        self._miss("missing")
+        self._miss(1)
         self._change_parameters(k)
         self._plant.sample()  # the transducers go on as well
         self._move()
-
-    def _is_second_sync(self) -> bool:
-        """Whether this SYNC is the duplicate of the last one, by a fault."""
-        is_second = (self._synced == self._cycle - 1
-                     and isinstance(self._faults.find_action("sync", self._synced), Double))
-        self._synced = -1 if is_second else self._cycle
-        return is_second
 
     def _answer_again(self) -> None:
         """Send the PDOs of this SYNC once more; the plant does not move twice."""
@@ -176,7 +159,7 @@ class Emulator:
         if new is NmtState.OPERATIONAL:
             self._begun = self._first = True
         elif new is NmtState.INITIALISING:
-            self._restart()
+            self._begin(self._scenario, Actuator(self._scenario.model, self._scenario.seed))
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         if index == SCENARIO:
@@ -190,7 +173,10 @@ class Emulator:
         self._change_parameters(k)
         xj, p12, xs = self._plant.sample()
         if not isfinite(xj + p12 + xs):
-            self._stop_after_divergence()
+            # The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value. Whatever
+            # 0x1029 says, the node becomes PRE-OPERATIONAL: no feedback any more.
+            self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+            self.device.nmt.communication_error(0)
             return
         faulty = self._faults.change_signal
         od[0x2200, 0] = codec.raw_position(faulty("xj", xj, k))
@@ -219,27 +205,17 @@ class Emulator:
                 self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT)
             self._missed = 0
             return _NO_FLAGS
-        flags = Flags.DRIVE_LATE if fresh else Flags.DRIVE_MISSING
-        return flags | Flags.CURRENT_ZEROED if self._miss("late" if fresh else "missing") else flags
+        return Flags.DRIVE_LATE | self._miss(2) if fresh else Flags.DRIVE_MISSING | self._miss(1)
 
-    def _miss(self, what: str) -> bool:
-        """No answer to the last cycle; returns whether it was one too many: then there is no current."""
+    def _miss(self, counter: int) -> Flags:
+        """No answer to the last cycle; the flag if it was one too many: then there is no current."""
         self._missed += 1
-        self._count(what)
+        self._od[COUNTERS, counter] = cast(int, self._od[COUNTERS, counter]) + 1
         if self._missed < MISSED_LIMIT:
-            return False
+            return _NO_FLAGS
         self._current = 0.0
         self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
-        return True
-
-    def _stop_after_divergence(self) -> None:
-        """The simulation diverged (an extreme parameter, a division by zero): stop, send no invented value."""
-        self.device.emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
-        self.device.nmt.communication_error(0)  # PRE-OPERATIONAL, whatever 0x1029 says: no feedback any more
-
-    def _count(self, what: str) -> None:
-        sub = 1 if what == "missing" else 2
-        self._od[COUNTERS, sub] = cast(int, self._od[COUNTERS, sub]) + 1
+        return Flags.CURRENT_ZEROED
 
     def _move(self) -> None:
         """Advance the plant by one cycle under the load of this cycle."""

@@ -45,28 +45,29 @@ from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, AddedSignal
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
 EVENT_RING = 256
-_HELD = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
+_HELD_FRAMES = 4096  # late frames that can wait: two a cycle for the longest delay, and as many drives
 _ANSWER_LIMIT = 80_000_000  # ns: in lockstep the answer to a late feedback frame is waited for this long
 
 # NMT states (CiA 301), as in the heartbeat
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
 
 # The words that loop and services share. Written by the services:
-(STOP, DEMOTED, PERIOD, SYNC_ID, DRIVE_ID, DRIVE_TYPE, FEEDBACK_ID, FEEDBACK_TYPE, VALVE_ID, VALVE_TYPE, EMCY_ID,
- OTHER_REGISTER, NOISE_FILLED) = range(13)
-# .. by the loop:
-(STATE, BEGUN, FIRST, CYCLE, CHANGED, MISSED, WAITING, WAITING_DATA, CURRENT, STATUS_WORD, ANSWERED, MISSING, LATE,
- ZEROED, FEEDBACK_COUNT, VALVE_COUNT, NOISE_USED, PLANT_CYCLE, HELD, ORDER, NOW, EVENTS, RECORDED, LAST_SYNC,
- LONGEST_WAKE, LONGEST_RESPONSE, LONGEST_CYCLE, XJ, P12, XS, FLAGS, FRAME_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID,
- PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE, RESET_COMMAND, SYNCED) = range(16, 58)
+STOP, DEMOTED, PERIOD, SYNC_ID, DRIVE_ID, DRIVE_TYPE, EMCY_ID, OTHER_REGISTER, NOISE_FILLED = range(9)
+TPDOS_AT = 9  # rows of feedback and valve state, with the columns
+ID, TYPE, COUNT, DATA = range(4)  # COB-ID, -1: none; transmission type; and of the loop: SYNCs to go, payload
+# .. by the loop; from XJ on the objects from 0x2200 on:
+(XJ, P12, XS, FLAGS, FRAME_CYCLE, CURRENT, STATUS_WORD, ANSWERED, STATE, BEGUN, FIRST, CYCLE, MISSED, WAITING,
+ WAITING_DATA, MISSING, LATE, ZEROED, PLANT_CYCLE, HELD, NOW, EVENTS, RECORDED, LAST_SYNC, LONGEST_WAKE,
+ LONGEST_RESPONSE, LONGEST_CYCLE, PUSHED, PUSHED_TIME, PUSHED_ID, PUSHED_LENGTH, PUSHED_DATA, SHORT, UNSENT, FAILURE,
+ RESET_COMMAND, SYNCED) = range(17, 54)
 # .. by nobody: time of a cycle in ns, and where the tables are that depend on the plant and its faults
-(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, PARAMETER_VALUES_AT, SIGNALS, SIGNALS_AT, STUCK_AT, ADDED_AT, LOAD, LOAD_AT,
- FLAT, FLAT_AT, LIVE_AT, RECORD_SIZE, ADVANCE, READ) = range(64, 80)
+(CYCLE_TIME, PARAMETERS, PARAMETERS_AT, SIGNALS, SIGNALS_AT, VALUES_AT, LOAD, LOAD_AT, FLAT, FLAT_AT, LIVE_AT,
+ RECORD_SIZE, ADVANCE, READ) = range(64, 78)
 LEVELS_AT, SENSORS_AT = 80, 83  # of the three transducers: where their noise is in the record, their value in the state
 HITS_AT = 86  # of the kinds of frames below: where the rows begin, and behind the last where they end
 _WORDS = 96
 EVENTS_AT, _HELD_AT = _WORDS, _WORDS + EVENT_RING
-TIMES_AT = _HELD_AT + 6 * _HELD
+TIMES_AT = _HELD_AT + 4 * _HELD_FRAMES
 _TABLES_AT = TIMES_AT + 6 * RING
 _CURRENT, _PERIOD, _READINGS, _FAILURE, NOISE_AT = 0, 1, 4, 8, 16  # in the real numbers
 _REAL_TABLES_AT = NOISE_AT + NOISES * NOISE_RING
@@ -77,8 +78,10 @@ ENDED, RESET, BROKEN = 0, 1, 2
 TIMEOUT_RAISED, TIMEOUT_CLEARED, DRIVE_SHORT, DRIVE_WHOLE, DIVERGED, SYNC_MALFORMED = range(1, 7)
 COMMANDED = 256  # + the NMT command
 
-_FEEDBACK, _VALVE, _DRIVE, _SYNC, _BUS_OFF = range(5)  # what faults act on; bus-off is on the whole node
-_FRAMES = ("feedback", "valve_state", "drive", "sync")
+# What faults act on, late frames in the order of their delivery: drives first, which are for the emulator itself; valve
+# states last, because in lockstep they end the rig's wait. Bus-off is on the whole node.
+_DRIVE, _FEEDBACK, _VALVE, _SYNC, _BUS_OFF = range(5)
+_FRAMES = ("drive", "feedback", "valve_state", "sync")
 _SIGNALS = ("xj", "p12", "xs")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
@@ -96,15 +99,16 @@ Reals = NDArray[np.float64]
 class Memory(NamedTuple):
     """All that loop and services share. Two arrays: with one for each table the loop takes a minute to compile.
 
-    words: the numbers named above; a ring of events; late frames in rows of (due, order, COB-ID, length, data, which
-    frame); a ring of cycles in rows of (cycle, SYNC received, begun, sent, done, flags), times in ns; then the faults.
+    words: the numbers named above; a ring of events; late frames in rows of (which frame, due, length, data), the first
+    that was sent first; a ring of cycles in rows of (cycle, SYNC received, begun, sent, done, flags), times in ns; then
+    the faults.
 
-    The faults: parameters are rows of (place in the record, first cycle, end, number of the parameter), and of (base,
-    value, ramp in s); signals are rows of (signal, kind, first cycle, end, place among the added values), and of
-    (value, last reading) where stuck; frames are rows of (cycle, code, argument), see `Schedule.list_frame_hits`.
+    The faults: parameters are rows of (place in the record, first cycle, number of values, place of the values, one a
+    cycle); signals are rows of (signal, kind, first cycle, end, place of the added values, or of the one at which it is
+    stuck); frames are rows of (cycle, code, argument), see `Schedule.list_frame_hits`.
 
     reals: current in force, A; period, s; readings of the transducers; a ring of noise, NOISES a cycle;
-    real numbers of the faults; load, N a cycle; state and parameters of the plant.
+    values of the faults; load, N a cycle; state and parameters of the plant.
     """
 
     words: Words
@@ -179,7 +183,8 @@ def _leave_operational(m: Memory, state: int) -> None:
     words = m.words
     words[STATE] = state
     words[WAITING] = 0
-    words[FEEDBACK_COUNT], words[VALVE_COUNT] = words[FEEDBACK_TYPE], words[VALVE_TYPE]
+    for at in (TPDOS_AT, TPDOS_AT + 4):
+        words[at + COUNT] = words[at + TYPE]
 
 
 def _post_event(m: Memory, event: int) -> None:
@@ -196,7 +201,7 @@ def _take_drive(m: Memory, t_ns: int, length: int, data: int) -> None:
     code, argument = _find_action(m, _DRIVE, words[CYCLE] - 1)
     if code == DELAY:
         now = t_ns if words[PERIOD] else words[NOW]
-        _hold_frame(m, now + argument, words[DRIVE_ID], length, data, _DRIVE)
+        _hold_frame(m, _DRIVE, now + argument, length, data)
     elif code != DROP:
         length, data = change_frame(code, argument, length, data)
         _keep_drive(m, length, data)
@@ -249,16 +254,15 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     if not words[FIRST]:
         flags = _judge_drive(port, m, k, fresh)
     words[FIRST] = 0
-    if not _read_plant(m, k):
+    if not _read_plant(m, k, flags):
         _post_event(m, DIVERGED)
         _leave_operational(m, PRE_OPERATIONAL)
         return
-    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
     end = (k + 1) * words[CYCLE_TIME] - 1  # in lockstep, the last instant of this cycle
     is_crowded = not words[PERIOD] and _is_feedback_due(m, end)
-    is_fed = _send_feedback(port, m, k, t_ns)
+    is_fed = _send_due(port, m, _FEEDBACK, k, t_ns)
     if not is_crowded:
-        _send_valve_state(port, m, k, t_ns)
+        _send_due(port, m, _VALVE, k, t_ns)
     sent_ns = _read_time(port, m, t_ns)
     _advance_plant(m, k)
     words[CYCLE] = k + 1
@@ -267,12 +271,12 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
     if not words[PERIOD]:
         if is_crowded:
             _send_late_feedback(port, m, k, is_fed)
-            _send_valve_state(port, m, k, t_ns)
+            _send_due(port, m, _VALVE, k, t_ns)
         # Drives wait for the next SYNC, for that of this cycle comes before them; but not if it answers late feedback.
         is_fed = _is_feedback_due(m, end)
-        if _find_next_held(m, end, is_fed) >= 0:
-            words[NOW] = end if is_fed else words[NOW]
-            _release_until(port, m, end, is_fed)
+        if is_fed:
+            words[NOW] = end
+        _release_until(port, m, end, is_fed)
 
 
 def _wait_for_noise(port: Port, m: Memory) -> bool:
@@ -281,7 +285,7 @@ def _wait_for_noise(port: Port, m: Memory) -> bool:
     False when the loop is to end.
     """
     words = m.words
-    while words[NOISE_USED] >= words[NOISE_FILLED]:
+    while words[PLANT_CYCLE] >= words[NOISE_FILLED]:
         if words[STOP]:
             return False
         sleep_until(port, read_clock(port) + 100_000)
@@ -313,13 +317,8 @@ def _pass_cycle(port: Port, m: Memory) -> None:
     if words[STATE] == OPERATIONAL:
         if not _wait_for_noise(port, m):
             return
-        words[MISSED] += 1
-        words[MISSING] += 1
-        if words[MISSED] >= MISSED_LIMIT:
-            m.reals[_CURRENT] = 0.0
-            _announce_timeout(port, m, 1)
-        _set_parameters(m, k, words[CHANGED])
-        words[CHANGED] = k
+        _miss(port, m, MISSING)
+        _set_parameters(m, k)
         _advance_plant(m, k)
     words[CYCLE] = k + 1
 
@@ -327,13 +326,8 @@ def _pass_cycle(port: Port, m: Memory) -> None:
 @keep_apart
 def _answer_again(port: Port, m: Memory, t_ns: int) -> None:
     """Send the PDOs of the last SYNC once more; the plant does not move twice."""
-    words = m.words
-    k = words[CYCLE]
-    if words[FEEDBACK_ID] >= 0 and 1 <= words[FEEDBACK_TYPE] <= _LAST_SYNCHRONOUS:
-        _send_unless_faulty(port, m, _FEEDBACK, words[FEEDBACK_ID], join_halves(words[XJ], words[P12]), k, t_ns)
-    if words[VALVE_ID] >= 0 and 1 <= words[VALVE_TYPE] <= _LAST_SYNCHRONOUS:
-        data = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
-        _send_unless_faulty(port, m, _VALVE, words[VALVE_ID], data, k, t_ns)
+    for what in (_FEEDBACK, _VALVE):
+        _send_pdo(port, m, what, m.words[CYCLE], t_ns)
 
 
 def _read_time(port: Port, m: Memory, t_ns: int) -> int:
@@ -348,22 +342,24 @@ def _judge_drive(port: Port, m: Memory, k: int, fresh: int) -> int:
     words = m.words
     if fresh and words[ANSWERED] == (k - 1) & 0xFFFF:
         m.reals[_CURRENT] = words[CURRENT] / 1e8
-        if words[MISSED] >= MISSED_LIMIT:
-            _announce_timeout(port, m, 0)
         words[MISSED] = 0
+        _announce_timeout(port, m, 0)
         return 0
-    words[MISSED] += 1
     if fresh:
-        words[LATE] += 1
-        flags = _DRIVE_LATE
-    else:
-        words[MISSING] += 1
-        flags = _DRIVE_MISSING
-    if words[MISSED] >= MISSED_LIMIT:
-        m.reals[_CURRENT] = 0.0
-        flags |= _CURRENT_ZEROED
-        _announce_timeout(port, m, 1)
-    return flags
+        return _DRIVE_LATE | _miss(port, m, LATE)
+    return _DRIVE_MISSING | _miss(port, m, MISSING)
+
+
+def _miss(port: Port, m: Memory, counter: int) -> int:
+    """No answer to the last cycle; the flag if it was one too many: then there is no current."""
+    words = m.words
+    words[MISSED] += 1
+    words[counter] += 1
+    if words[MISSED] < MISSED_LIMIT:
+        return 0
+    m.reals[_CURRENT] = 0.0
+    _announce_timeout(port, m, 1)
+    return _CURRENT_ZEROED
 
 
 def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
@@ -381,12 +377,11 @@ def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
         _send(port, m, words[EMCY_ID], 8, data)
 
 
-def _read_plant(m: Memory, k: int) -> bool:
-    """Change the parameters of this cycle and read the transducers; False if the simulation has diverged."""
+def _read_plant(m: Memory, k: int, flags: int) -> bool:
+    """Change the parameters of this cycle, read the transducers and fill the frames; False if the plant diverged."""
     words, reals = m.words, m.reals
-    _set_parameters(m, k, words[CHANGED])
-    words[CHANGED] = k
-    noise, flat = NOISE_AT + NOISES * (words[NOISE_USED] % NOISE_RING), words[FLAT_AT]
+    _set_parameters(m, k)
+    noise, flat = NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING), words[FLAT_AT]
     if words[READ]:
         base = reals.ctypes.data
         _call_read(words[READ], base + 8 * _READINGS, base + 8 * _FAILURE,
@@ -404,6 +399,9 @@ def _read_plant(m: Memory, k: int) -> bool:
     words[XJ] = _count(_disturb(m, 0, xj, k) * 1e7)
     words[P12] = _count(_disturb(m, 1, p12, k) / 10.0)
     words[XS] = _count(_disturb(m, 2, xs, k) * 1e9)
+    words[FLAGS], words[FRAME_CYCLE] = flags, k & 0xFFFF
+    words[TPDOS_AT + DATA] = join_halves(words[XJ], words[P12])
+    words[TPDOS_AT + 4 + DATA] = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
     return True
 
 
@@ -413,13 +411,12 @@ def _advance_plant(m: Memory, k: int) -> None:
     load = 0.0
     if k < words[LOAD]:
         load = reals[words[LOAD_AT] + k]
-    noise = reals[NOISE_AT + NOISES * (words[NOISE_USED] % NOISE_RING) + NOISES - 1]
+    noise = reals[NOISE_AT + NOISES * (words[PLANT_CYCLE] % NOISE_RING) + NOISES - 1]
     base = reals.ctypes.data
     _call_advance(words[ADVANCE], base + 8 * _READINGS, base + 8 * _FAILURE,
                   0, 0, words[FLAT], 8, base + 8 * words[FLAT_AT], words[FLAT], 8,
                   reals[_CURRENT], load, noise, words[PLANT_CYCLE] * reals[_PERIOD],
                   0, 0, 1, words[RECORD_SIZE], base + 8 * words[LIVE_AT], 1, words[RECORD_SIZE], STEPS)
-    words[NOISE_USED] += 1
     words[PLANT_CYCLE] += 1
 
 
@@ -450,104 +447,71 @@ def _send(port: Port, m: Memory, cob_id: int, length: int, data: int) -> None:
         m.words[UNSENT] += 1
 
 
-def _send_feedback(port: Port, m: Memory, k: int, t_ns: int) -> bool:
-    """Feedback, where it is due at this SYNC; whether it went out."""
-    words = m.words
-    if not _count_down(words, FEEDBACK_TYPE, FEEDBACK_COUNT, FEEDBACK_ID):
+def _send_due(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
+    """Send a TPDO where it is due, type n of 1..240 at every n-th SYNC; whether it went out now."""
+    words, at = m.words, TPDOS_AT + 4 * (what - _FEEDBACK)
+    words[at + COUNT] -= 1
+    if words[at + COUNT] > 0:
         return False
-    data = join_halves(words[XJ], words[P12])
-    return _send_unless_faulty(port, m, _FEEDBACK, words[FEEDBACK_ID], data, k, t_ns)
+    words[at + COUNT] = words[at + TYPE]
+    return _send_pdo(port, m, what, k, t_ns)
 
 
-def _send_valve_state(port: Port, m: Memory, k: int, t_ns: int) -> bool:
-    """Valve state, where it is due at this SYNC; whether it went out."""
-    words = m.words
-    if not _count_down(words, VALVE_TYPE, VALVE_COUNT, VALVE_ID):
+def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
+    """Send a synchronous TPDO of cycle k as a fault leaves it; whether it went out now."""
+    words, at = m.words, TPDOS_AT + 4 * (what - _FEEDBACK)
+    if words[at + ID] < 0 or not 1 <= words[at + TYPE] <= _LAST_SYNCHRONOUS:
         return False
-    data = join_words(words[XS], words[FLAGS], words[FRAME_CYCLE])
-    return _send_unless_faulty(port, m, _VALVE, words[VALVE_ID], data, k, t_ns)
-
-
-def _count_down(words: Words, kind: int, count: int, cob_id: int) -> bool:
-    """Whether a TPDO is due: type n of 1..240 at every n-th SYNC."""
-    if not 1 <= words[kind] <= _LAST_SYNCHRONOUS:
-        return False
-    words[count] -= 1
-    if words[count] > 0:
-        return False
-    words[count] = words[kind]
-    return bool(words[cob_id] >= 0)
-
-
-def _send_unless_faulty(port: Port, m: Memory, what: int, cob_id: int, data: int, k: int, t_ns: int) -> bool:
-    """Send a frame of cycle k as a fault leaves it; whether it went out now."""
     code, argument = _find_action(m, what, k)
     if code == DELAY:
-        now = t_ns if m.words[PERIOD] else m.words[NOW]
-        _hold_frame(m, now + argument, cob_id, 8, data, what)
+        now = t_ns if words[PERIOD] else words[NOW]
+        _hold_frame(m, what, now + argument, 8, words[at + DATA])
     if code in (DELAY, DROP):
         return False
-    length, data = change_frame(code, argument, 8, data)
-    _send(port, m, cob_id, length, data)
+    length, data = change_frame(code, argument, 8, words[at + DATA])
+    _send(port, m, words[at + ID], length, data)
     if code == DOUBLE:
-        _send(port, m, cob_id, length, data)
+        _send(port, m, words[at + ID], length, data)
     return True
 
 
 # ------------------------------------------------------------------------------------ late frames
 
 
-def _hold_frame(m: Memory, due: int, cob_id: int, length: int, data: int, what: int) -> None:
+def _hold_frame(m: Memory, what: int, due: int, length: int, data: int) -> None:
     """Keep a frame until it is due; one too many is lost and counted."""
     words = m.words
-    if words[HELD] >= _HELD:
+    if words[HELD] >= _HELD_FRAMES:
         words[UNSENT] += 1
         return
-    at = _HELD_AT + 6 * words[HELD]
-    words[at], words[at + 1], words[at + 2] = due, words[ORDER], cob_id
-    words[at + 3], words[at + 4], words[at + 5] = length, data, what
+    at = _HELD_AT + 4 * words[HELD]
+    words[at], words[at + 1], words[at + 2], words[at + 3] = what, due, length, data
     words[HELD] += 1
-    words[ORDER] += 1
 
 
 def _find_next_due(m: Memory) -> int:
     """When the next of the late frames is due, in real time."""
     due = NEVER
     for i in range(m.words[HELD]):
-        due = min(due, _integer(m.words[_HELD_AT + 6 * i]))
+        due = min(due, _integer(m.words[_HELD_AT + 4 * i + 1]))
     return due
 
 
-def _find_next_held(m: Memory, t_ns: int, with_drives: bool) -> int:
-    """Where the late frame stands that is to be delivered next of those due at `t_ns`; -1 for none.
-
-    Drives first, which are for the emulator itself; valve states last, because in lockstep they end the rig's wait.
-    """
+def _find_next_held(m: Memory, t_ns: int, least: int) -> int:
+    """Where the late frame of kind `least` or above stands that is to be delivered next at `t_ns`; -1 for none."""
     best = -1
     for i in range(m.words[HELD]):
-        at = _HELD_AT + 6 * i
-        is_due = m.words[at] <= t_ns and (with_drives or m.words[at + 5] != _DRIVE)
-        if is_due and (best < 0 or _is_before(m.words, at, best)):
+        at = _HELD_AT + 4 * i
+        what, due = m.words[at], m.words[at + 1]
+        if least <= what and due <= t_ns and (best < 0 or (what, due) < (m.words[best], m.words[best + 1])):
             best = at
     return best
 
 
-def _is_before(words: Words, a: int, b: int) -> bool:
-    rank_a, rank_b = (words[a + 5] + 1) % 3, (words[b + 5] + 1) % 3
-    if rank_a != rank_b:
-        return bool(rank_a < rank_b)
-    if words[a] != words[b]:
-        return bool(words[a] < words[b])
-    return bool(words[a + 1] < words[b + 1])
-
-
 def _is_feedback_due(m: Memory, t_ns: int) -> bool:
     """Whether a feedback frame of an earlier cycle is to be sent until `t_ns`."""
-    is_due = False
-    for i in range(m.words[HELD]):
-        at = _HELD_AT + 6 * i
-        is_due |= m.words[at + 5] == _FEEDBACK and m.words[at] <= t_ns
-    return bool(is_due)
+    at = _find_next_held(m, t_ns, _FEEDBACK)
+    return bool(at >= 0 and m.words[at] == _FEEDBACK)
 
 
 @keep_apart
@@ -555,19 +519,19 @@ def _release_until(port: Port, m: Memory, t_ns: int, with_drives: bool) -> bool:
     """Deliver the late frames that are due at `t_ns`; whether feedback was among them."""
     words = m.words
     is_fed = False
-    at = _find_next_held(m, t_ns, with_drives)
+    least = _DRIVE if with_drives else _FEEDBACK
+    at = _find_next_held(m, t_ns, least)
     while at >= 0:
-        cob_id, length, data, what = words[at + 2], words[at + 3], words[at + 4], words[at + 5]
+        what, length, data = words[at], words[at + 2], words[at + 3]
         words[HELD] -= 1
-        last = _HELD_AT + 6 * words[HELD]
-        for i in range(6):
-            words[at + i] = words[last + i]
+        end = _HELD_AT + 4 * words[HELD]
+        words[at:end] = words[at + 4:end + 4]
         if what == _DRIVE:
             _keep_drive(m, length, data)
         else:
-            _send(port, m, cob_id, length, data)
+            _send(port, m, words[TPDOS_AT + 4 * (what - _FEEDBACK) + ID], length, data)
             is_fed |= what == _FEEDBACK
-        at = _find_next_held(m, t_ns, with_drives)
+        at = _find_next_held(m, t_ns, least)
     return bool(is_fed)
 
 
@@ -614,16 +578,10 @@ def _await_drive(port: Port, m: Memory) -> None:
 def _find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
     """What happens to a frame of cycle k: code and argument (frame_faults.py)."""
     words = m.words
-    low, end = _integer(words[HITS_AT + what]), _integer(words[HITS_AT + what + 1])
-    high = end
-    while low < high:  # the first row that is not before cycle k
-        middle = low + (high - low) // 6 * 3
-        if words[middle] < k:
-            low = middle + 3
-        else:
-            high = middle
-    if low < end and words[low] == k:
-        return _integer(words[low + 1]), _integer(words[low + 2])
+    low, end = words[HITS_AT + what], words[HITS_AT + what + 1]
+    at = low + 3 * np.searchsorted(words[low:end:3], k)
+    if at < end and words[at] == k:
+        return _integer(words[at + 1]), _integer(words[at + 2])
     return SENT_NORMALLY, 0
 
 
@@ -631,52 +589,31 @@ def _is_bus_off(m: Memory, k: int) -> bool:
     return _find_action(m, _BUS_OFF, k)[0] != SENT_NORMALLY
 
 
-def _set_parameters(m: Memory, k: int, before: int) -> None:
-    """Set the parameters that differ from what they were in cycle `before`: see `Schedule.parameters_at`."""
-    words = m.words
-    number = -1
+def _set_parameters(m: Memory, k: int) -> None:
+    """Set the parameters that faults change to their values in this cycle: see `Schedule.list_parameters`."""
+    words, reals = m.words, m.reals
     for i in range(words[PARAMETERS]):
         at = words[PARAMETERS_AT] + 4 * i
-        if words[at + 3] != number:  # the first row of a parameter
-            number = words[at + 3]
-            value = _find_parameter(m, i, k)
-            if value != _find_parameter(m, i, before):
-                m.reals[words[LIVE_AT] + words[at]] = value
-
-
-def _find_parameter(m: Memory, first: int, k: int) -> float:
-    """The parameter whose rows begin at `first`, in cycle k."""
-    words, rows = m.words, m.words[PARAMETERS_AT]
-    base = m.reals[words[PARAMETER_VALUES_AT] + 3 * first]
-    i = first
-    while i < words[PARAMETERS] and words[rows + 4 * i + 3] == words[rows + 4 * first + 3]:
-        start = words[rows + 4 * i + 1]
-        if start <= k < words[rows + 4 * i + 2]:
-            at = words[PARAMETER_VALUES_AT] + 3 * i
-            value, ramp, t = m.reals[at + 1], m.reals[at + 2], (k - start) / RATE
-            growth = 1.0 if t >= ramp else t / ramp
-            return float(base + (value - base) * growth)
-        i += 1
-    return float(base)
+        since = min(k - words[at + 1], words[at + 2] - 1)
+        if since >= 0:
+            reals[words[LIVE_AT] + words[at]] = reals[words[VALUES_AT] + words[at + 3] + since]
 
 
 def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
-    """What a sensor says in place of `value`: see `Schedule.signal`."""
+    """What a sensor says in place of `value`: see `Schedule.change_signal`."""
     words, reals = m.words, m.reals
     for i in range(words[SIGNALS]):
-        at, stuck = words[SIGNALS_AT] + 5 * i, words[STUCK_AT] + 2 * i
+        at = words[SIGNALS_AT] + 5 * i
+        kind, first, place = words[at + 1], words[at + 2], words[VALUES_AT] + words[at + 4]
         if words[at] != signal:
             continue
-        is_acting = words[at + 2] <= k < words[at + 3]
-        if words[at + 1] == _ADDED:
-            if is_acting:
-                value += reals[words[ADDED_AT] + words[at + 4] + k - words[at + 2]]
-        elif not is_acting:
-            reals[stuck + 1] = value
-        elif words[at + 1] == _HOLDS_VALUE:
-            value = reals[stuck]
+        if not first <= k < words[at + 3]:
+            if kind == _HOLDS_READING:
+                reals[place] = value
+        elif kind == _ADDED:
+            value += reals[place + k - first]
         else:
-            value = reals[stuck + 1]
+            value = reals[place]
     return value
 
 
@@ -690,35 +627,39 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     readings, `read_flat_sensors`.
     """
     names = {name: i for i, name in enumerate(model.list_names())}
-    parameters = [((names[change.name], change.first, change.last, number), (change.base, change.value, change.ramp))
-                  for number, changes in enumerate(schedule.list_parameter_changes()) for change in changes]
+    parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []
-    stuck: list[tuple[float, float]] = []
-    added: list[float] = []
+    values: list[float] = []
+    for changes in schedule.list_parameter_changes():
+        first, last = min(change.first for change in changes), max(change.last for change in changes)
+        course = np.full(last - first + 1, changes[0].base)
+        for change in reversed(changes):  # of several in a cycle the first counts
+            t = np.arange(change.last - change.first) / RATE
+            growth = np.divide(t, change.ramp, out=np.ones_like(t), where=t < change.ramp)
+            course[change.first - first: change.last - first] = change.base + (change.value - change.base) * growth
+        parameters.append((names[changes[0].name], first, len(course), len(values)))
+        values += course.tolist()
     for number, name in enumerate(_SIGNALS):
-        for change in schedule.list_signal_changes(name):
-            if isinstance(change, AddedSignal):
-                signals.append((number, _ADDED, change.first, change.first + len(change.values), len(added)))
-                added += change.values
+        for fault in schedule.list_signal_changes(name):
+            if isinstance(fault, AddedSignal):
+                signals.append((number, _ADDED, fault.first, fault.first + len(fault.values), len(values)))
+                values += fault.values
             else:
-                kind = _HOLDS_READING if change.value is None else _HOLDS_VALUE
-                signals.append((number, kind, change.cycles.start, change.cycles.stop, 0))
-            stuck.append((getattr(change, "value", None) or 0.0, 0.0))
+                kind = _HOLDS_READING if fault.value is None else _HOLDS_VALUE
+                signals.append((number, kind, fault.cycles.start, fault.cycles.stop, len(values)))
+                values.append(fault.value or 0.0)
     off = schedule.list_bus_off_cycles("plant")
     hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
     record = model.build_record()
     state = list_state_values(model.build_state())
-    words, places = _join_tables(_TABLES_AT, np.int64, [row for row, _ in parameters], signals, *hits)
-    reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, [values for _, values in parameters], stuck, added,
-                                      load, state, record.view(np.float64))
-    words[CHANGED], words[STATE] = -1, INITIALISING
+    words, places = _join_tables(_TABLES_AT, np.int64, parameters, signals, *hits)
+    reals, real_places = _join_tables(_REAL_TABLES_AT, np.float64, values, load, state, record.view(np.float64))
+    words[STATE], words[SYNCED] = INITIALISING, -1
     words[CYCLE_TIME] = round(model["controller.period"] * 1e9)
-    words[PARAMETERS], words[SIGNALS], words[SYNCED] = len(parameters), len(signals), -1
-    words[LOAD], words[FLAT] = len(load), len(state)
+    words[PARAMETERS], words[SIGNALS], words[LOAD], words[FLAT] = len(parameters), len(signals), len(load), len(state)
     words[PARAMETERS_AT], words[SIGNALS_AT] = places[:2]
     words[HITS_AT: HITS_AT + len(hits) + 1] = places[2:]
-    (words[PARAMETER_VALUES_AT], words[STUCK_AT], words[ADDED_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT],
-     _) = real_places
+    words[VALUES_AT], words[LOAD_AT], words[FLAT_AT], words[LIVE_AT], _ = real_places
     words[RECORD_SIZE], words[ADVANCE], words[READ] = record.dtype.itemsize, advance, read
     words[LEVELS_AT: LEVELS_AT + 3] = [names[f"sensors.{q}_noise"] for q in ("position", "pressure", "spool")]
     words[SENSORS_AT: SENSORS_AT + 3] = SENSED, PRESSURE, SPOOL

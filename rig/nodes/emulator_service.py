@@ -40,6 +40,11 @@ from rig.sequences.faults import Plan, Schedule
 LEFT_OUT = (0x000, codec.SYNC, codec.DRIVE, codec.COMMAND, codec.FEEDBACK, codec.VALVE_STATE)
 _HEARTBEAT, _EMCY, _SDO, _REPLY = 0x700 + PLANT, 0x080 + PLANT, 0x600 + PLANT, 0x580 + PLANT
 _COMPILED, _FIFO, _LOCKED, _PINNED = 1, 2, 4, 8  # 0x2211 sub 9
+_RAISED = {  # events of the loop: the errors that they raise
+    ec.TIMEOUT_RAISED: (EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01"),
+    ec.DRIVE_SHORT: (EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION, b"\x01"),
+    ec.DIVERGED: (EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")}
+_CLEARED = {ec.TIMEOUT_CLEARED: (EmcyCode.RPDO_TIMEOUT, b""), ec.DRIVE_WHOLE: (EmcyCode.PDO_TOO_SHORT, b"\x01")}
 _STOP_LIMIT = 5.0  # s: the longest that the loop waits inside a cycle is 1 s, for its turn to send
 
 
@@ -49,6 +54,8 @@ class EmulatorService:
     `send` is for the services; the loop uses `bus`. `enter_thread` gives the loop's thread its priority and its CPU and
     yields the name of the scheduler. `is_locked`: the memory of the process is locked.
     """
+
+    _memory: ec.Memory  # what the loop works on
 
     def __init__(self, send: Send, bus: RawBus, enter_thread: Callable[[], AbstractContextManager[str]],
                  scenario: Scenario | None = None, is_locked: bool = False) -> None:
@@ -72,12 +79,21 @@ class EmulatorService:
         Raises:
             InputError: a scenario that cannot be run; the previous one stays.
         """
+        self._begin(scenario, None if self._scenario else ec.INITIALISING)
+
+    def _begin(self, scenario: Scenario, state: int | None) -> None:
+        """Make new memory for the loop, whose next SYNC is the first; `state`: None for the one it is in."""
         schedule = Schedule(scenario.plan, scenario.model.values)
         memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
         with self._stop_loop():
-            state = self._memory.words[ec.STATE] if self._scenario else ec.INITIALISING
-            self._scenario = scenario
-            self._begin(memory, schedule, int(state))
+            words = memory.words
+            words[ec.STATE] = self._memory.words[ec.STATE] if state is None else state
+            words[ec.BEGUN] = words[ec.FIRST] = words[ec.STATE] == ec.OPERATIONAL
+            self._scenario, self._memory, self._schedule = scenario, memory, schedule
+            self._rng = np.random.default_rng(scenario.seed)
+            self._seen = self._last_sync = 0
+            self._sample_noise()
+            self._share_settings()
 
     def receive(self, frame: Frame) -> None:
         """A frame for the services arrived."""
@@ -109,17 +125,6 @@ class EmulatorService:
         self._halt()
 
     # -- the loop's thread
-
-    def _begin(self, memory: ec.Memory, schedule: Schedule, state: int) -> None:
-        """Take over new memory of the loop, which stands still; its next SYNC is the first."""
-        assert self._scenario is not None
-        self._memory, self._schedule = memory, schedule
-        self._rng = np.random.default_rng(self._scenario.seed)
-        self._seen = self._last_sync = 0
-        self._memory.words[ec.STATE] = state
-        self._memory.words[ec.BEGUN] = self._memory.words[ec.FIRST] = int(state == ec.OPERATIONAL)
-        self._sample_noise()
-        self._share_settings()
 
     @contextmanager
     def _stop_loop(self) -> Iterator[None]:
@@ -190,11 +195,7 @@ class EmulatorService:
     def _on_nmt(self, old: NmtState, new: NmtState) -> None:
         if new is NmtState.INITIALISING:
             assert self._scenario is not None
-            scenario = self._scenario
-            with self._stop_loop():
-                schedule = Schedule(scenario.plan, scenario.model.values)
-                memory = ec.make_memory(scenario.model, scenario.load(), schedule, *compile_plant(scenario.model))
-                self._begin(memory, schedule, ec.PRE_OPERATIONAL)
+            self._begin(self._scenario, ec.PRE_OPERATIONAL)
         elif not self._obeying and old is NmtState.OPERATIONAL:  # an error of the services: 0x1029
             self._memory.words[ec.DEMOTED] = new
             self._bus.wake()
@@ -213,15 +214,15 @@ class EmulatorService:
         others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
         communication = any(code != EmcyCode.SOFTWARE for code in others)
         shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
-        sent = (0x1800, ec.FEEDBACK_TYPE, ec.FEEDBACK_COUNT), (0x1801, ec.VALVE_TYPE, ec.VALVE_COUNT)
-        for index, kind, count in sent:
-            if shared[kind] != od.read_number(index, 2):
-                shared[kind] = shared[count] = od.read_number(index, 2)
+        for row, number in enumerate((1, 2)):
+            at, kind = ec.TPDOS_AT + 4 * row, od.read_number(0x1800 + row, 2)
+            shared[at + ec.ID] = _encode_cob_id(pdo.tpdos[number].cob_id)
+            if shared[at + ec.TYPE] != kind:
+                shared[at + ec.TYPE] = shared[at + ec.COUNT] = kind
         shared[ec.DRIVE_TYPE] = od.read_number(0x1400, 2)
         heard = shared[ec.SYNC_ID], shared[ec.DRIVE_ID]
         shared[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
-        shared[ec.DRIVE_ID], shared[ec.FEEDBACK_ID], shared[ec.VALVE_ID] = (
-            -1 if each.cob_id is None else each.cob_id for each in (pdo.rpdos[1], pdo.tpdos[1], pdo.tpdos[2]))
+        shared[ec.DRIVE_ID] = _encode_cob_id(pdo.rpdos[1].cob_id)
         if heard != (shared[ec.SYNC_ID], shared[ec.DRIVE_ID]):
             wanted = 0, int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
             self._bus.set_filter([cob_id for cob_id in wanted if cob_id >= 0])
@@ -229,7 +230,7 @@ class EmulatorService:
     def _sample_noise(self, least: int = 1024) -> None:
         """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
         filled = int(self._memory.words[ec.NOISE_FILLED])
-        free = int(self._memory.words[ec.NOISE_USED]) + ec.NOISE_RING - filled
+        free = int(self._memory.words[ec.PLANT_CYCLE]) + ec.NOISE_RING - filled
         if free < least:
             return
         rows = self._rng.standard_normal((free, NOISES))
@@ -245,34 +246,26 @@ class EmulatorService:
         while self._seen < self._memory.words[ec.EVENTS]:
             event = self._memory.words[ec.EVENTS_AT + self._seen % ec.EVENT_RING]
             self._seen += 1
+            self._booking = event in (ec.TIMEOUT_RAISED, ec.TIMEOUT_CLEARED)
             if event >= ec.COMMANDED:
                 self._obey(int(event) - ec.COMMANDED)
-            elif event == ec.DRIVE_SHORT:
-                emcy.raise_error(EmcyCode.PDO_TOO_SHORT, ErrorRegister.COMMUNICATION, b"\x01")
-            elif event == ec.DRIVE_WHOLE:
-                emcy.clear(EmcyCode.PDO_TOO_SHORT, b"\x01")
             elif event == ec.SYNC_MALFORMED:
                 self.device.sync.receive(Frame(t_ns, codec.SYNC, b"\0"))
-            elif event == ec.DIVERGED:
-                emcy.raise_error(EmcyCode.SOFTWARE, ErrorRegister.GENERIC, b"\x03")
+            elif event in _RAISED:
+                emcy.raise_error(*_RAISED[event])
+            else:
+                emcy.clear(*_CLEARED[event])
+            if event == ec.DIVERGED:
                 self._obeying = True  # the loop has left OPERATIONAL
                 self.device.nmt.communication_error(0)
                 self._obeying = False
-            else:
-                self._booking = True
-                if event == ec.TIMEOUT_RAISED:
-                    emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, b"\x01")
-                else:
-                    emcy.clear(EmcyCode.RPDO_TIMEOUT)
-                self._booking = False
+            self._booking = False
 
     def _show_values(self, request: bytes) -> None:
         """Put the loop's values into the dictionary, which an SDO request is about to read."""
         shared, od = self._memory.words, self._od
-        for index, word in ((0x2200, ec.XJ), (0x2201, ec.P12), (0x2202, ec.XS), (0x2203, ec.FLAGS),
-                            (0x2204, ec.FRAME_CYCLE), (0x2205, ec.CURRENT), (0x2206, ec.STATUS_WORD),
-                            (0x2207, ec.ANSWERED)):
-            od[index, 0] = int(shared[word])
+        for index in range(0x2200, 0x2208):
+            od[index, 0] = int(shared[ec.XJ + index - 0x2200])
         longest = (shared[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
         counts = (shared[ec.MISSING], shared[ec.LATE], shared[ec.RECORDED], shared[ec.UNSENT], self._bus.overflows,
                   *longest, self._kind)
@@ -287,6 +280,10 @@ class EmulatorService:
         times = self._memory.words[ec.TIMES_AT: ec.TIMES_AT + 6 * RING].reshape(-1, 6)
         rows = times[np.arange(max(0, recorded - RING), recorded) % RING]
         return CycleRecord(*rows.T)
+
+
+def _encode_cob_id(cob_id: int | None) -> int:
+    return -1 if cob_id is None else cob_id
 
 
 def compile_plant(model: Model) -> tuple[int, int]:

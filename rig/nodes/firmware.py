@@ -24,7 +24,7 @@ _RESET, _ACTIVE = int(Control.RESET), int(Control.ACTIVE)
 _LOOP_CLOSED, _READY = int(Status.MODE), int(Status.READY)
 _CURRENT_LIMIT, _PERIOD = 4, 5  # sub-indices of GAINS
 LOST_AFTER = 3  # SYNCs in a row without feedback, or without a command
-_COMMAND_PDO, _FEEDBACK_PDO = b"\x01", b"\x02"  # RPDO numbers, first information byte of EMCY 0x8250
+_COMMAND, _FEEDBACK = 1, 2  # RPDO numbers, first information byte of EMCY 0x8250
 
 
 class Firmware:
@@ -44,8 +44,7 @@ class Firmware:
         self.device.on_write = self._on_write
         self._od = self.device.od.values
         self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
-        self._lost = False  # feedback, announced by EMCY; a restart does not take that back
-        self._is_command_lost = False  # the same for the command
+        self._lost: set[int] = set()  # RPDOs whose loss was announced by EMCY; a restart does not take that back
         self._restart()
         self.receive, self.tick = self.device.receive, self.device.tick
 
@@ -53,8 +52,7 @@ class Firmware:
         self._loop = Loop()
         self._taken.restart()
         self._gains = Gains(*(cast(float, self._od[GAINS, sub]) for sub in range(1, len(Gains._fields) + 1)))
-        self._silent = 0  # SYNCs since the last feedback
-        self._uncommanded = 0  # SYNCs since the last command
+        self._missed = {_COMMAND: 0, _FEEDBACK: 0}  # SYNCs since the last frame
         self._fault = False
         self._acknowledged = True
 
@@ -62,7 +60,7 @@ class Firmware:
         if new is NmtState.OPERATIONAL:
             self._restart()
         elif new is NmtState.INITIALISING:
-            self._lost = self._is_command_lost = False
+            self._lost.clear()
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
         """Reject NaN and infinite gains (they would produce a NaN current), a negative limit and a period of 0."""
@@ -81,26 +79,28 @@ class Firmware:
 
         After LOST_AFTER cycles without feedback, or without a command, trip: the current is zero from the next on.
         """
-        self._watch_command()
-        self._silent += 1
-        if self._silent > LOST_AFTER:
-            self._lost = True
-            self._trip()
-            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, _FEEDBACK_PDO)
+        if self.device.pdo.rpdos[_COMMAND].fresh:
+            self._hear(_COMMAND)
+        else:
+            self._miss(_COMMAND)
+        if self._miss(_FEEDBACK):
             self._drive(0.0, self._status())
 
-    def _watch_command(self) -> None:
-        if self.device.pdo.rpdos[1].fresh:
-            self._uncommanded = 0
-            if self._is_command_lost:
-                self._is_command_lost = False
-                self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT, _COMMAND_PDO)
-            return
-        self._uncommanded += 1
-        if self._uncommanded > LOST_AFTER:
-            self._is_command_lost = True
+    def _miss(self, rpdo: int) -> bool:
+        """A SYNC came without this frame before it; whether it was one too many."""
+        self._missed[rpdo] += 1
+        is_lost = self._missed[rpdo] > LOST_AFTER
+        if is_lost:
+            self._lost.add(rpdo)
             self._trip()
-            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, _COMMAND_PDO)
+            self.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, bytes((rpdo,)))
+        return is_lost
+
+    def _hear(self, rpdo: int) -> None:
+        self._missed[rpdo] = 0
+        if rpdo in self._lost:
+            self._lost.discard(rpdo)
+            self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT, bytes((rpdo,)))
 
     def _on_sync_lost(self) -> None:
         """No SYNC, so no feedback will ask for an answer: say at once that there is no current any more."""
@@ -109,10 +109,7 @@ class Firmware:
 
     def _on_rpdo(self, n: int) -> None:
         """Feedback arrived: close the loop."""
-        if self._lost:
-            self._lost = False
-            self.device.emcy.clear(EmcyCode.RPDO_TIMEOUT, _FEEDBACK_PDO)
-        self._silent = 0
+        self._hear(_FEEDBACK)
         status = self._status()
         if status & _LOOP_CLOSED:
             demand = codec.position(cast(int, self._od[0x2100, 0]))
