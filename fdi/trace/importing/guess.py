@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION
 from fdi.trace.importing.formats import Channel, Measurement, TextTable, split_unit
-from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES, UNITS, convert_to_si, find_unit
+from fdi.trace.importing.import_map import REQUIRED_SIGNALS, SIGNAL_NAMES, UNITS, Unit, find_unit
 from fdi.trace.sensor_dynamics import find_comb
 from fdi.trace.signals import OUTPUTS, SIGNALS
 from plant.errors import InputError
@@ -51,14 +51,19 @@ class Guess:
     """What a column is taken for."""
 
     source: str
-    points: float  # of the name, the unit and the data
-    unit: str = ""
-    sign: int = 1
+    unit: Unit
+    points: float = 0.0  # of the name, the unit and the data
     reasons: list[str] = field(default_factory=list)
+    sign: int = 1
     minus: str = ""  # a column that is subtracted
     scale: float | None = None  # of raw values, in `unit`: value = sign * (scale * raw + offset); None: unknown, or 1
     offset: float = 0.0
     quantum: float = 0.0  # step of the readings, in `unit`
+
+    def note(self, points: float, reason: str) -> None:
+        """Count what speaks for it, or against it."""
+        self.points += points
+        self.reasons.append(reason)
 
     @property
     def confidence(self) -> str:
@@ -66,6 +71,22 @@ class Guess:
         if self.points >= 5.0:
             return "sure"
         return "likely" if self.points >= 3.0 else "unsure"
+
+
+class Columns(NamedTuple):
+    """The columns of a recording."""
+
+    data: Mapping[str, Floats]  # those of numbers: their first values, missing ones held
+    units: Mapping[str, str]  # of all: what the file says, "" for nothing
+
+    def has_raw_unit(self, name: str) -> bool:
+        """Whether the recording names a unit that scale and offset must convert."""
+        return bool(self.units[name]) and find_unit(self.units[name]) is None
+
+    def measures(self, name: str, si: str) -> bool:
+        """Whether the unit of a column is one of the quantity with this SI unit."""
+        unit = find_unit(self.units[name])
+        return unit is not None and unit.si == si
 
 
 class GuessedMap(NamedTuple):
@@ -78,22 +99,23 @@ class GuessedMap(NamedTuple):
 
 def guess_map(measurement: Measurement) -> GuessedMap:
     """The map of a recording whose meaning is not known."""
-    data = _read_numbers(measurement)
-    time_lines, time_source, time_confidence = _guess_time(measurement, data)
-    free = {name: x for name, x in data.items() if name != time_source}
-    found = _assign(measurement, free)
-    _scale_position(found, measurement, free)
-    _find_signs(found, free)
-    _find_steps(found, measurement, free)
+    every = Columns(_read_numbers(measurement),
+                    {name: said or split_unit(name)[1] for name, said in measurement.units.items()})
+    time_lines, time_source, time_confidence = _guess_time(measurement, every)
+    columns = every._replace(data={name: x for name, x in every.data.items() if name != time_source})
+    found = _assign(columns)
+    _scale_position(found, columns)
+    _find_signs(found, columns)
+    _find_steps(found, columns)
     chosen = {"time": (time_source or "its own times", time_confidence)}
     chosen |= {name: (guess.source, guess.confidence) for name, guess in found.items()}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
              f"# Then: rig import {measurement.path.name} --map THIS_FILE", "", *_list_file_lines(measurement),
              *time_lines, ""]
     for name in SIGNAL_NAMES:
-        lines += _list_signal_lines(name, found.get(name), measurement)
+        lines += _list_signal_lines(name, found.get(name), columns)
     used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
-    left = {name: _describe_left(measurement, name, data, found) for name in measurement.units if name not in used}
+    left = {name: _describe_left(name, columns, found) for name in measurement.units if name not in used}
     if left:
         lines += ["# Columns that were left out:", *(f"#   {name} ({why})" for name, why in left.items())]
     return GuessedMap("\n".join(lines) + "\n", chosen, left)
@@ -138,45 +160,47 @@ def _has_word(name: str, words: str) -> str:
     return ""
 
 
-def _guess_time(measurement: Measurement, data: Mapping[str, Floats]) -> tuple[list[str], str | None, str]:
+def _guess_time(measurement: Measurement, columns: Columns) -> tuple[list[str], str | None, str]:
     """The lines of [time], its column and how sure it is."""
     if measurement.has_times:
         return ["# Each channel has times of its own: no [time] needed."], None, "sure"
-    best: tuple[float, str, list[str]] | None = None
-    for name, x in data.items():
-        steps = np.diff(x)
-        unit = find_unit(measurement.units[name])
-        points, why = 0.0, []
-        if (steps > 0).all():
-            points, why = 2.0, ["it grows in every row"]
-            if float(np.median(np.abs(steps - np.median(steps)))) <= 0.01 * float(np.median(steps)):
-                points, why = points + 1.0, [*why, "evenly"]
-        elif _find_bits(x):
-            points, why = 1.5, ["it counts up and starts again"]
-        if points and _has_word(name, TIME_WORDS):
-            points, why = points + 2.0, [*why, "its name says time"]
-        elif points and _has_word(name, COUNTER_WORDS):
-            points, why = points + 0.5, [*why, "its name says counter"]
-        if points and unit is not None and unit.si == "s":
-            points, why = points + 2.0, [*why, f"its unit is {measurement.units[name]}"]
-        if points and (best is None or points > best[0]):
-            best = points, name, why
+    rated = [_rate_time(name, x, columns) for name, x in columns.data.items()]
+    best = max((guess for guess in rated if guess.points), key=lambda guess: guess.points, default=None)
     if best is None:
-        date = next((n for n in measurement.units if n not in data and _has_word(n, TIME_WORDS + "|date|datum")), None)
+        texts = (n for n in columns.units if n not in columns.data)
+        date = next((n for n in texts if _has_word(n, TIME_WORDS + "|date|datum")), None)
         if date is not None:
             return ["[time]  # likely: no column of numbers is a time; this one's name says so",
                     f"source = {_quote(date)}", 'unit = "iso"'], date, "likely"
         return ["[time]  # unsure: no column grows from row to row; put in the true rate",
                 "rate = 1000.0  # rows a second"], None, "unsure"
-    points, name, why = best
-    confidence = Guess(name, points).confidence
-    head = f"[time]  # {confidence}: {', '.join(why)}"
-    bits = _find_bits(data[name])
-    if bits:
-        rate, is_known = _guess_count_rate(measurement.units[name], data[name])
-        return [head, f"source = {_quote(name)}", f"bits = {bits}", rate], name, confidence if is_known else "unsure"
-    unit_name, reason = _guess_time_unit(measurement.units[name], data[name])
-    return [head, f"source = {_quote(name)}", f'unit = "{unit_name}"  # {reason}'], name, confidence
+    name, x = best.source, columns.data[best.source]
+    lines = [f"[time]  # {best.confidence}: {', '.join(best.reasons)}", f"source = {_quote(name)}"]
+    bits, has_unit = _find_bits(x), columns.measures(name, "s")
+    if not bits:
+        return [*lines, _guess_time_unit(columns.units[name], x)], name, best.confidence
+    rate = _guess_count_rate(columns.units[name] if has_unit else "", x)
+    return [*lines, f"bits = {bits}", rate], name, best.confidence if has_unit else "unsure"
+
+
+def _rate_time(name: str, x: Floats, columns: Columns) -> Guess:
+    """How well a column does as the time; no points for one that cannot be."""
+    guess, steps = Guess(name, UNITS["s"]), np.diff(x)
+    if (steps > 0).all():
+        guess.note(2.0, "it grows in every row")
+        if float(np.median(np.abs(steps - np.median(steps)))) <= 0.01 * float(np.median(steps)):
+            guess.note(1.0, "evenly")
+    elif _find_bits(x):
+        guess.note(1.5, "it counts up and starts again")
+    else:
+        return guess
+    if _has_word(name, TIME_WORDS):
+        guess.note(2.0, "its name says time")
+    elif _has_word(name, COUNTER_WORDS):
+        guess.note(0.5, "its name says counter")
+    if columns.measures(name, "s"):
+        guess.note(2.0, f"its unit is {columns.units[name]}")
+    return guess
 
 
 def _find_bits(x: Floats) -> int | None:
@@ -191,97 +215,74 @@ def _find_bits(x: Floats) -> int | None:
     return bits if is_wrap else None
 
 
-def _guess_count_rate(said: str, x: Floats) -> tuple[str, bool]:
-    """The line of a counter's rate, and whether the header gives it."""
+def _guess_count_rate(said: str, x: Floats) -> str:
+    """The line of a counter's rate; `said`: the unit of time that the header gives, "" for none."""
     steps = np.diff(x)
     step = float(np.median(steps[steps > 0]))
     unit = find_unit(said)
-    if unit is not None and unit.si == "s":
-        counts = float(1 / unit.factor)
-        line = f"rate = {counts:.15g}  # counts a second, as the header says ({said}): {counts / step:g} rows a second"
-        return line, True
-    return f"rate = {1000.0 * step:.15g}  # counts a second: put in the true one (rows every 1 ms were assumed)", False
+    if unit is None:
+        return f"rate = {1000.0 * step:.15g}  # counts a second: put in the true one (rows every 1 ms were assumed)"
+    counts = float(1 / unit.factor)
+    return f"rate = {counts:.15g}  # counts a second, as the header says ({said}): {counts / step:g} rows a second"
 
 
-def _guess_time_unit(said: str, x: Floats) -> tuple[str, str]:
+def _guess_time_unit(said: str, x: Floats) -> str:
+    """The line of the time's unit: the header's, or one in which the steps are those of a logger."""
     unit = find_unit(said)
     if unit is not None and unit.si == "s":
-        name = next(name for name, u in UNITS.items() if u == unit)
-        return name, "as the header says"
+        return f'unit = "{unit.name}"  # as the header says'
     step = float(np.median(np.diff(x)))
-    for name, low, high in (("s", 2e-5, 0.05), ("ms", 0.05, 50.0), ("us", 50.0, 5e4), ("ns", 5e4, 5e7)):
-        if low <= step < high:
-            rate = 1.0 / (step * float(UNITS[name].factor))
-            return name, f"unsure: steps of {step:g} would be {rate:g} rows a second"
-    return "s", f"unsure: steps of {step:g}"
+    name = next((name for name in ("s", "ms", "us", "ns") if 2e-5 <= step * UNITS[name].factor < 0.05), "s")
+    rate = 1.0 / (step * float(UNITS[name].factor))
+    return f'unit = "{name}"  # unsure: steps of {step:g} would be {rate:g} rows a second'
 
 
-def _assign(measurement: Measurement, data: Mapping[str, Floats]) -> dict[str, Guess]:
+def _assign(columns: Columns) -> dict[str, Guess]:
     """Each signal's column: the pair of most points first."""
-    rated = []
-    for column, x in data.items():
-        for name in SIGNAL_NAMES if float(np.ptp(x)) > 0.0 else ():
-            guess = _rate_column(measurement, name, column, x)
-            if guess is not None:
-                rated.append((name, guess))
-    rated.sort(key=lambda pair: -pair[1].points)
+    rated = [(name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0 for name in SIGNAL_NAMES
+             if (guess := _rate_column(name, column, columns)) is not None]
     found: dict[str, Guess] = {}
-    for name, guess in rated:
+    for name, guess in sorted(rated, key=lambda pair: -pair[1].points):
         if name not in found and guess.source not in {g.source for g in found.values()}:
             found[name] = guess
-    _guess_by_motion(found, measurement, data)
-    _pair_chambers(found, data)
+    _guess_by_motion(found, columns)
+    _pair_chambers(found, columns.data)
     return {name: found[name] for name in SIGNAL_NAMES if name in found}
 
 
-def _rate_column(measurement: Measurement, name: str, column: str, x: Floats) -> Guess | None:
+def _rate_column(name: str, column: str, columns: Columns) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
-    said = measurement.units[column] or split_unit(column)[1]
+    said, si = columns.units[column], SIGNALS[name].unit
     unit = find_unit(said)
-    if unit is not None and unit.si != SIGNALS[name].unit:
+    if unit is not None and unit.si != si:
         return None
-    points, reasons = 0.0, []
+    guess = Guess(column, unit or UNITS[si])
     for words, worth in WORDS[name]:
         word = _has_word(column, words)
         if word:
-            points += worth
-            reasons.append(f"its name has {word!r}")
-    if not points:
+            guess.note(worth, f"its name has {word!r}")
+    if not guess.points:
         return None
     low, high, units = RANGES[name]
+    x = columns.data[column]
     size = float(np.percentile(np.abs(x - np.median(x)), 99))
+    fitting = [u for u in units if low <= size * float(UNITS[u].factor) <= high]
     if unit is not None:
-        chosen = next(known for known, u in UNITS.items() if u == unit)
-        points += 2.0
-        reasons.append(f"its unit is {said}")
+        guess.note(2.0, f"its unit is {said}")
     elif said:
-        chosen = SIGNALS[name].unit
-        reasons.append(f"its unit {said!r} needs scale and offset")
-        points -= 2.0
+        guess.note(-2.0, f"its unit {said!r} needs scale and offset")
+    elif fitting:
+        guess.unit = UNITS[fitting[0]]
+        guess.note(1.0 if len(fitting) == 1 else 0.0,
+                   f"no unit given, its range of {size:.3g} suits {' or '.join(fitting)}")
     else:
-        fitting = [u for u in units if low <= float(convert_to_si(np.array([size]), UNITS[u])[0]) <= high]
-        chosen = fitting[0] if fitting else SIGNALS[name].unit
-        if fitting:
-            reasons.append(f"no unit given, its range of {size:.3g} suits {' or '.join(fitting)}")
-            points += 1.0 if len(fitting) == 1 else 0.0
-        else:
-            reasons.append(f"no unit given, and its range of {size:.3g} suits none: counts?")
-            points -= 1.0
-    if unit is not None or _is_plausible(name, size, chosen):
-        amplitude = float(convert_to_si(np.array([size]), UNITS[chosen])[0])
-        if low <= amplitude <= high:
-            reasons.append("its range is plausible")
-            points += 0.5
-        else:
-            reasons.append(f"its range, {amplitude:.3g} {SIGNALS[name].unit}, is unusual")
-            points -= 1.0
-    return Guess(column, points, chosen, 1, reasons)
-
-
-def _is_plausible(name: str, size: float, unit: str) -> bool:
-    """Whether an amplitude in a unit is one that the signal of an actuator has."""
-    low, high, _ = RANGES[name]
-    return low <= float(convert_to_si(np.array([size]), UNITS[unit])[0]) <= high
+        guess.note(-1.0, f"no unit given, and its range of {size:.3g} suits none: counts?")
+    amplitude = size * float(guess.unit.factor)
+    if low <= amplitude <= high:
+        guess.note(0.5, "its range is plausible")
+    elif unit is not None:
+        guess.note(-1.0, f"its range, {amplitude:.3g} {si}, is unusual")
+    return guess
 
 
 def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
@@ -289,53 +290,33 @@ def _pair_chambers(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> No
     guess = found.get("p12")
     if guess is None:
         return
-    for first, second in (("a", "b"), ("1", "2")):
-        mine = re.sub(r"[^a-z0-9]", "", _simplify_name(guess.source))
-        for column in data:
-            other = re.sub(r"[^a-z0-9]", "", _simplify_name(column))
-            places = [i for i, (x, y) in enumerate(zip(mine, other, strict=False)) if x != y]
-            if len(mine) == len(other) and len(places) == 1 and {mine[places[0]], other[places[0]]} == {first, second}:
-                source, minus = (guess.source, column) if mine[places[0]] == first else (column, guess.source)
-                guess.source, guess.minus, guess.points = source, minus, min(guess.points, 4.0)
-                guess.reasons.append("two chambers: check that the first one extends the ram")
-                return
+    plain = {column: re.sub(r"[^a-z0-9]", "", _simplify_name(column)) for column in data}
+    mine = guess.source
+    for column, other in plain.items():
+        pairs = [(a, b) for a, b in zip(plain[mine], other, strict=False) if a != b]
+        if len(other) == len(plain[mine]) and len(pairs) == 1 and "".join(sorted(pairs[0])) in ("ab", "12"):
+            guess.source, guess.minus = (mine, column) if pairs[0][0] < pairs[0][1] else (column, mine)
+            guess.note(min(4.0 - guess.points, 0.0), "two chambers: check that the first one extends the ram")
+            return
 
 
-def _guess_by_motion(found: dict[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
+def _guess_by_motion(found: dict[str, Guess], columns: Columns) -> None:
     """Com and XJ where names say nothing: the two free columns that follow each other best; the later one is XJ."""
-    for known, wanted in (("com", "xj"), ("xj", "com")):
-        if known in found and wanted not in found:
-            base = data[found[known].source]
-            _take_partner(found, wanted, base, _list_free(found, measurement, data, wanted), data)
-    if "com" in found or "xj" in found:
+    data, taken = columns.data, {guess.source for guess in found.values()}
+    free = [c for c in data if c not in taken and (columns.measures(c, "m") or find_unit(columns.units[c]) is None)]
+    known = {name: found[name] for name in ("com", "xj") if name in found}
+    firsts, seconds = ([known[name].source] if name in known else free for name in ("com", "xj"))
+    pairs = [(abs(correlate(data[a], data[b])), a, b) for a in firsts for b in seconds
+             if a != b and len(data[a]) == len(data[b])]
+    if len(known) == 2 or not pairs or max(pairs)[0] <= 0.9:
         return
-    free = _list_free(found, measurement, data, "xj")
-    pairs = [(abs(correlate(data[a], data[b])), a, b) for i, a in enumerate(free) for b in free[i + 1:]]
-    if pairs and max(pairs)[0] > 0.9:
-        r, a, b = max(pairs)
-        first, later = (a, b) if measure_lead(data[a], data[b]) >= 0 else (b, a)
-        why = f"no name says so; correlation {r:.3f} of the two, and it comes "
-        found["com"] = Guess(first, 1.5, "mm", 1, [why + "first"])
-        found["xj"] = Guess(later, 1.5, "mm", 1, [why + "later"])
-
-
-def _list_free(found: Mapping[str, Guess], measurement: Measurement, data: Mapping[str, Floats], name: str
-               ) -> list[str]:
-    """Columns that are no signal yet and whose unit does not exclude this one."""
-    taken = {guess.source for guess in found.values()}
-    units = {column: find_unit(measurement.units[column]) for column in data}
-    return [column for column, unit in units.items()
-            if column not in taken and (unit is None or unit.si == SIGNALS[name].unit)]
-
-
-def _take_partner(found: dict[str, Guess], wanted: str, base: Floats, free: Sequence[str], data: Mapping[str, Floats]
-                  ) -> None:
-    rated = [(abs(correlate(base, data[column])), column) for column in free if len(data[column]) == len(base)]
-    if rated and max(rated)[0] > 0.9:
-        r, column = max(rated)
-        other = "com" if wanted == "xj" else "xj"
-        found[wanted] = Guess(column, 2.0, found[other].unit, 1,
-                              [f"no name says so; correlation {r:.3f} with {found[other].source}"])
+    r, a, b = max(pairs)
+    if not known and measure_lead(data[a], data[b]) < 0:
+        a, b = b, a
+    unit = next((guess.unit for guess in known.values()), UNITS["mm"])
+    for name, column, other, order in (("com", a, b, "first"), ("xj", b, a, "later")):
+        more = "" if known else f", and it comes {order}"
+        found.setdefault(name, Guess(column, unit, 1.5, [f"no name says so; correlation {r:.3f} with {other}{more}"]))
 
 
 def correlate(a: Floats, b: Floats) -> float:
@@ -353,29 +334,21 @@ def measure_lead(a: Floats, b: Floats) -> float:
     return abs(correlate(a[:n - shift], b[shift:n])) - abs(correlate(a[shift:n], b[:n - shift]))
 
 
-def _has_raw_unit(measurement: Measurement, guess: Guess) -> bool:
-    """Whether the recording names a unit that scale and offset must convert."""
-    said = measurement.units[guess.source] or split_unit(guess.source)[1]
-    return bool(said) and find_unit(said) is None
-
-
-def _scale_position(found: Mapping[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
+def _scale_position(found: Mapping[str, Guess], columns: Columns) -> None:
     """Scale and offset of a position in counts or volts, roughly, from the other position and Cor."""
     for name, other in (("xj", "com"), ("com", "xj")):
-        if not {name, other} <= found.keys() or not _has_raw_unit(measurement, found[name]):
+        if (not {name, other} <= found.keys() or not columns.has_raw_unit(found[name].source)
+                or columns.has_raw_unit(found[other].source)):
             continue
-        if _has_raw_unit(measurement, found[other]):
-            return
         guess, base = found[name], found[other]
-        raw, x = data[guess.source], data[base.source]
-        r = correlate(raw, x) if len(raw) == len(x) else 0.0
-        if abs(r) < LEAST_SCALING_CORRELATION:
+        raw, x = columns.data[guess.source], columns.data[base.source]
+        if len(raw) != len(x) or abs(correlate(raw, x)) < LEAST_SCALING_CORRELATION:
             continue
-        cor = data[found["cor"].source] if "cor" in found else np.zeros(0)
+        cor = columns.data[found["cor"].source] if "cor" in found else np.zeros(0)
         slope, shift = fit_scale(raw, x, cor if len(cor) == len(x) else np.zeros(len(x)))
         guess.sign, guess.unit, guess.scale = int(np.sign(slope)), base.unit, float(f"{abs(slope):.4g}")
         guess.offset = float(f"{guess.sign * shift:.4g}")
-        guess.reasons.append(f"scale and offset are rough, from {base.source}: put in the true ones")
+        guess.note(0.0, f"scale and offset are rough, from {base.source}: put in the true ones")
 
 
 def fit_scale(raw: Floats, x: Floats, cor: Floats) -> tuple[float, float]:
@@ -397,52 +370,45 @@ def fit_scale(raw: Floats, x: Floats, cor: Floats) -> tuple[float, float]:
     return usual, float(x.mean()) - usual * middle
 
 
-def _find_steps(found: Mapping[str, Guess], measurement: Measurement, data: Mapping[str, Floats]) -> None:
+def _find_steps(found: Mapping[str, Guess], columns: Columns) -> None:
     """The step of readings that are whole multiples of it, where its noise counts beside that of the sensor."""
     nominal = load_nominal_values()
     for name in OUTPUTS:
         guess = found.get(name)
-        if guess is None or guess.minus or (guess.scale is None and _has_raw_unit(measurement, guess)):
+        if guess is None or guess.minus or (guess.scale is None and columns.has_raw_unit(guess.source)):
             continue
-        comb = find_comb(data[guess.source])
-        if comb is None:
-            continue
-        quantum = float(f"{comb.step * (guess.scale or 1.0):.6g}")
-        noise = float(convert_to_si(np.array([quantum]), UNITS[guess.unit])[0]) / math.sqrt(12.0)
-        if noise >= LEAST_QUANTUM_NOISE * nominal[SIGNALS[name].noise]:
-            guess.quantum = quantum
+        comb = find_comb(columns.data[guess.source])
+        if comb is not None:
+            quantum = float(f"{comb.step * (guess.scale or 1.0):.6g}")
+            noise = quantum * float(guess.unit.factor) / math.sqrt(12.0)
+            if noise >= LEAST_QUANTUM_NOISE * nominal[SIGNALS[name].noise]:
+                guess.quantum = quantum
 
 
-def _scale_column(guess: Guess, data: Mapping[str, Floats]) -> Floats:
-    """A column in the unit of its guess; its sign is that of the recording."""
-    return data[guess.source] if guess.scale is None else guess.scale * data[guess.source] + guess.offset
-
-
-def _find_signs(found: Mapping[str, Guess], data: Mapping[str, Floats]) -> None:
+def _find_signs(found: Mapping[str, Guess], columns: Columns) -> None:
     """Signs by what a position loop does: XJ follows Com, and Cor is positive while Com is above XJ."""
     if not {"com", "xj"} <= found.keys():
         return
-    com, xj = found["com"].sign * _scale_column(found["com"], data), _scale_column(found["xj"], data)
-    r = correlate(com, xj)
+    com, xj = ((1.0 if guess.scale is None else guess.scale) * columns.data[guess.source] + guess.offset
+               for guess in (found["com"], found["xj"]))
+    com = found["com"].sign * com
+    r = correlate(com, found["xj"].sign * xj)
     if r < -0.8:
         found["xj"].sign = -1
-        found["xj"].reasons.append(f"it moves against {found['com'].source} (correlation {r:.2f}): one sign is turned")
+        found["xj"].note(0.0, f"it moves against {found['com'].source} (correlation {r:.2f}): one sign is turned")
     elif r > 0.8:
-        found["xj"].points += 0.5
-        found["xj"].reasons.append(f"it follows {found['com'].source} (correlation {r:.3f})")
+        found["xj"].note(0.5, f"it follows {found['com'].source} (correlation {r:.3f})")
     else:
-        found["xj"].points -= 1.0
-        found["xj"].reasons.append(f"it hardly follows {found['com'].source} (correlation {r:.2f}): check it")
+        found["xj"].note(-1.0, f"it hardly follows {found['com'].source} (correlation {r:.2f}): check it")
     if "cor" in found and len(com) == len(xj):
-        scale = [float(UNITS[found[name].unit].factor) for name in ("com", "xj")]
+        scale = [float(found[name].unit.factor) for name in ("com", "xj")]
         error = com * scale[0] - found["xj"].sign * xj * scale[1]
-        r = correlate(data[found["cor"].source], error)
+        r = correlate(columns.data[found["cor"].source], error)
         if r < -0.3:
             found["cor"].sign = -1
-            found["cor"].reasons.append(f"it is negative while Com is above XJ (correlation {r:.2f}): sign turned")
+            found["cor"].note(0.0, f"it is negative while Com is above XJ (correlation {r:.2f}): sign turned")
         elif r > 0.3:
-            found["cor"].points += 0.5
-            found["cor"].reasons.append(f"it has the sign of Com - XJ (correlation {r:.2f})")
+            found["cor"].note(0.5, f"it has the sign of Com - XJ (correlation {r:.2f})")
 
 
 def _quote(text: str) -> str:
@@ -459,41 +425,37 @@ def _list_file_lines(measurement: Measurement) -> list[str]:
     return [*lines, *([f"header = {layout.name_line}"] if layout.name_line else []), ""]
 
 
-def _list_signal_lines(name: str, guess: Guess | None, measurement: Measurement) -> list[str]:
+def _list_signal_lines(name: str, guess: Guess | None, columns: Columns) -> list[str]:
     quantity = f"{SIGNALS[name].symbol}, {SIGNALS[name].quantity}"
     if guess is None:
         if name not in REQUIRED_SIGNALS:
             return []
         return [f"# [signals.{name}]  # {quantity}: no column found; every analysis needs it", '# source = ""',
                 f'# unit = "{SIGNALS[name].unit}"', ""]
+    unit = guess.unit.name
     lines = [f"[signals.{name}]  # {quantity}; {guess.confidence}: {'; '.join(guess.reasons)}",
-             f"source = {_quote(guess.source)}", f'unit = "{guess.unit}"']
+             f"source = {_quote(guess.source)}", f'unit = "{unit}"']
     if guess.minus:
         lines.append(f"minus = {_quote(guess.minus)}")
     if guess.sign < 0:
         lines.append("sign = -1")
-    said = measurement.units[guess.source]
-    if guess.scale is not None:
-        lines.append(f"scale = {guess.scale:g}  # {guess.unit} for each {said}: put in the true one")
-        lines.append(f"offset = {guess.offset:g}  # {guess.unit}")
-    elif said and find_unit(said) is None:
-        lines.append(f"scale = 1.0  # {guess.unit} for each {said}: put in the true one")
-        lines.append(f"offset = 0.0  # {guess.unit}")
+    if columns.has_raw_unit(guess.source):
+        scale, offset = (f"{1.0 if guess.scale is None else guess.scale:g}", f"{guess.offset:g}")
+        lines.append(f"scale = {scale}  # {unit} for each {columns.units[guess.source]}: put in the true one")
+        lines.append(f"offset = {offset}  # {unit}")
     if guess.quantum:
-        step = f"sensor = {{quantum = {guess.quantum:g}}}"
-        lines.append(f"{step}  # {guess.unit}: all readings are multiples of this step")
+        lines.append(f"sensor = {{quantum = {guess.quantum:g}}}  # {unit}: all readings are multiples of this step")
     return [*lines, ""]
 
 
-def _describe_left(measurement: Measurement, column: str, data: Mapping[str, Floats], found: Mapping[str, Guess]
-                   ) -> str:
+def _describe_left(column: str, columns: Columns, found: Mapping[str, Guess]) -> str:
     """The range of a column that is no signal, or why it is none."""
-    if column not in data:
+    if column not in columns.data:
         return "no numbers"
-    x = data[column]
+    x = columns.data[column]
     if float(np.ptp(x)) > 0.0:
         return f"{x.min():.4g} .. {x.max():.4g}"
     rated = [(guess.points, name) for name in SIGNAL_NAMES if name not in found
-             and (guess := _rate_column(measurement, name, column, x)) is not None]
+             and (guess := _rate_column(name, column, columns)) is not None]
     meant = f"; by its name it would be {SIGNALS[max(rated)[1]].symbol}" if rated else ""
     return f"always {x[0]:.4g}{meant}"
