@@ -13,6 +13,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,6 +45,7 @@ Flags = NDArray[np.bool_]
 
 STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
 STEP_JUDGED_UNTIL = 0.1  # s after a step; later there is only stick-slip, which the ramps show better
+LEVELS = {"middle": Level.MAINTENANCE, "most": Level.NON_NOMINAL}  # of a signal that has left this band
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -141,31 +143,18 @@ def _interpolation_weights(friction: float, known: Floats) -> Floats:
 # What is measured on a response
 # ---------------------------------------------------------------------------------------------------------------------
 
-class Stay(NamedTuple):
-    """Rows first..last (inclusive) beyond a limit."""
-
-    first: int
-    last: int
-
-
-def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[Stay]:
-    """Where a flag (n,) is up for `lasting` rows in a row, until it is down for as many.
+def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[int, int]]:
+    """Where a flag (n,) is up for `lasting` rows in a row, until it is down for as many: first and last row of each.
 
     One or two samples are no event; a single sample back inside does not end one.
     """
     edges = np.flatnonzero(np.diff(beyond.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    runs = [Stay(int(a), int(b) - 1) for a, b in edges]
-    joined: list[list[Stay]] = []
-    for run in runs:
-        if joined and run.first - joined[-1][-1].last <= lasting:
-            joined[-1].append(run)
-        else:
-            joined.append([run])
-    found = []
-    for group in joined:
-        lasting_runs = [run for run in group if run.last - run.first + 1 >= lasting]
-        if lasting_runs:
-            found.append(Stay(lasting_runs[0].first, group[-1].last))
+    found: list[tuple[int, int]] = []
+    for first, stop in edges.tolist():
+        if found and first - found[-1][1] <= lasting:
+            found[-1] = (found[-1][0], stop - 1)
+        elif stop - first >= lasting:
+            found.append((first, stop - 1))
     return found
 
 
@@ -211,47 +200,35 @@ def require_same_command(bands: Bands, found: Sequence[Section], period: float, 
     Raises:
         InputError: the first difference.
     """
-    mine, theirs = _outline_command(bands.sections, bands.period), _outline_command(found, period)
+    difference = find_difference(bands, found, period)
+    if difference:
+        kinds = [s.kind for s in bands.sections]
+        name = " ".join([bands.provenance.get("command", ""), f"({kinds.count('step')} steps,"]).strip()
+        raise InputError(where, "com", f"the command of the bands, {name} {kinds.count('ramp')} ramps); {difference} "
+                                       "(rig fdi --learn-bands makes bands of it)")
+
+
+def find_difference(bands: Bands, found: Sequence[Section], period: float) -> str:
+    """The first difference between a command's sections and those of the bands, in words; "" if it is the same command.
+
+    How long a test rests before and after its steps and ramps does not matter.
+    """
+    mine, theirs = ([s for s in parts if s.kind in ("step", "ramp")] for parts in (bands.sections, found))
     if len(mine) != len(theirs):
-        raise InputError(where, "com", f"the command of the bands, {_describe_command(bands)}; this one has "
-                                       f"{len(theirs)} sections (rig fdi --learn-bands makes bands of it)")
+        return f"this one has {len(theirs)} sections"
     for a, b in zip(mine, theirs, strict=True):
-        near = (abs(a.start - b.start) < SAME_COMMAND_TIME and abs(a.first - b.first) < SAME_COMMAND_POSITION
-                and abs(a.last - b.last) < SAME_COMMAND_POSITION
+        start = (b.start - theirs[0].start) * period
+        near = (abs((a.start - mine[0].start) * bands.period - start) < SAME_COMMAND_TIME
+                and abs(a.first - b.first) < SAME_COMMAND_POSITION and abs(a.last - b.last) < SAME_COMMAND_POSITION
                 and abs(a.rate - b.rate) <= SAME_COMMAND_RATE * abs(a.rate) + 1e-6)
         if a.kind != b.kind or not near:
-            raise InputError(where, "com", f"the command of the bands, {_describe_command(bands)}; at {b.start:.3g} s "
-                                           f"it differs (rig fdi --learn-bands makes bands of it)")
+            return f"at {start:.3g} s it differs"
+    return ""
 
 
 def matches_command(bands: Bands, com: Floats, period: float) -> bool:
     """Whether the bands are of this command, (n,) m."""
-    try:
-        require_same_command(bands, find_sections(com, period), period, "")
-    except InputError:
-        return False
-    return True
-
-
-class _Outline(NamedTuple):
-    kind: str
-    start: float  # s from the first change of the command
-    first: float
-    last: float
-    rate: float
-
-
-def _outline_command(parts: Sequence[Section], period: float) -> list[_Outline]:
-    """The steps and ramps: how long a test rests before and after them does not matter."""
-    chosen = [s for s in parts if s.kind in ("step", "ramp")]
-    begin = chosen[0].start if chosen else 0
-    return [_Outline(s.kind, (s.start - begin) * period, s.first, s.last, s.rate) for s in chosen]
-
-
-def _describe_command(bands: Bands) -> str:
-    kinds = [s.kind for s in bands.sections]
-    name = bands.provenance.get("command", "")
-    return f"{name} ({kinds.count('step')} steps, {kinds.count('ramp')} ramps)".strip()
+    return not find_difference(bands, find_sections(com, period), period)
 
 
 def is_loaded(load: Floats) -> bool:
@@ -279,17 +256,11 @@ def format_design(model: Model) -> str:
 
 def describe_other_model(bands: Bands, model: Model) -> str:
     """Which model bands were made for, if it is another than `model`; else ""."""
-    name = bands.provenance.get("model", "eha")
-    known = bands.provenance.get("parameters")
-    if known is None:  # bands of an earlier version say the name alone
-        return f"the model {name}" if name != model.name else ""
+    known = bands.provenance.get("parameters", "")
     if known == format_design(model):
         return ""
-    try:
-        design = ", ".join(f"{parameter} = {value:g}" for parameter, value in json.loads(known).items())
-    except (ValueError, AttributeError, TypeError):
-        design = known
-    return f"the model {name} with {design or 'all parameters nominal'}"
+    design = known.strip("{}").replace('"', "").replace(":", " =") or "all parameters nominal"
+    return f"the model {bands.provenance.get('model', 'eha')} with {design}"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -350,30 +321,22 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
         most = float(np.nanmax(np.abs(load)))
         raise InputError(where, "load", f"none, as these bands are of an unloaded ram, not {most:.3g} N")
     found, friction, notes = find_excursions(com, xj, period, bands, parts)
-    events = sorted((event for e in found for event in _find_events(e, t0, period)), key=lambda event: event.t_in)
-    levels, severity = {}, {}
+    levels, severity, events = {}, {}, {i: _find_events(e, t0, period) for i, e in enumerate(found)}
     for fault in FAULTS:
-        own = [e for e in found if e.fault == fault.name and e.signal == "position" and e.is_judged]
-        if not own:
+        own = [i for i, e in enumerate(found) if e.fault == fault.name and e.signal == "position" and e.is_judged]
+        if own:
+            severity[fault.name] = max(0.0, *(found[i].measure_peak() for i in own))
+            levels[fault.name] = max((LEVELS[event.band] for i in own for event in events[i]), default=Level.ACCEPTABLE)
+        else:
             reason = _explain_no_level(fault.name, found, friction, bands)
             notes.append(f"{fault.name} is not judged by bands: {reason}")
-            continue
-        severity[fault.name] = max(0.0, *(float(find_lasting_peak(e.departure / e.middle)) for e in own))
-        levels[fault.name] = _choose_level({event.band for e in own for event in _find_events(e, t0, period)})
-    if FRICTION.name in levels and max(find_slips(found)) > FAST_SLIP_RATIO * max(1.0, severity[FRICTION.name]):
+    slip = max((e.measure_peak() for e in found if e.signal == "speed"), default=0.0)
+    if FRICTION.name in levels and slip > FAST_SLIP_RATIO * max(1.0, severity[FRICTION.name]):
         notes.append("the spool slips faster than its static friction accounts for: its dynamic friction is low")
     gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
     ruling = max(gone, key=lambda f: gone[f]) if gone else None
-    return BandVerdict(levels, ruling, tuple(events), severity, friction, tuple(notes))
-
-
-def _choose_level(left: set[str]) -> Level:
-    """The level of a fault from the bands that the position has left."""
-    if "most" in left:
-        return Level.NON_NOMINAL
-    if "middle" in left:
-        return Level.MAINTENANCE
-    return Level.ACCEPTABLE
+    every = sorted(chain.from_iterable(events.values()), key=lambda event: event.t_in)
+    return BandVerdict(levels, ruling, tuple(every), severity, friction, tuple(notes))
 
 
 def _explain_no_level(fault: str, found: list[Excursion], friction: float, bands: Bands) -> str:
@@ -405,6 +368,10 @@ class Excursion(NamedTuple):
         limited = np.isfinite(self.departure) & np.isfinite(self.middle)
         return bool(find_lasting_peak(limited.astype(float)) > 0.0)
 
+    def measure_peak(self) -> float:
+        """The furthest lasting departure, in limits of MidBand."""
+        return float(find_lasting_peak(self.departure / self.middle))
+
 
 def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts: list[Section]
                     ) -> tuple[list[Excursion], float, list[str]]:
@@ -427,9 +394,10 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
         scale = ramp.compute_scale(half, fastest)
         amount = float(np.interp(scale * half, ramp.half_range, bands.friction))
         shown.append((amount, amount * ramp.estimate_friction_ratio(half, fastest)))
-        departure = scale * (error - ramp.position.centre)
-        out.append(_make_ramp_excursion("position", s, rows.start, departure, ramp.position))
-        out.append(_make_ramp_excursion("speed", s, rows.start, beyond - ramp.speed.centre, ramp.speed))
+        for signal, x, width in (("position", scale * (error - ramp.position.centre), ramp.position),
+                                 ("speed", beyond - ramp.speed.centre, ramp.speed)):
+            middle, most = (np.full(len(x), limit) for limit in (width.middle, width.most))
+            out.append(Excursion(signal, s, rows.start, np.abs(x), middle, most, FRICTION.name))
     least = float(bands.friction[0])
     friction, sliding = np.mean(shown, axis=0).tolist() if shown else (least, least)
     if bands.ramps and not shown:
@@ -441,11 +409,6 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
     return out, friction, notes
 
 
-def find_slips(found: list[Excursion]) -> list[float]:
-    """Fastest lasting slip on each ramp, in MidBand limits of speed."""
-    return [float(find_lasting_peak(e.departure / e.middle)) for e in found if e.signal == "speed"] or [0.0]
-
-
 def _is_lost(x: Floats, s: Section, notes: list[str]) -> bool:
     """Whether too much of a section is missing to judge it; if so, with a note."""
     lost = float(np.isnan(x).mean()) if len(x) else 1.0
@@ -453,11 +416,6 @@ def _is_lost(x: Floats, s: Section, notes: list[str]) -> bool:
     if too_much:
         notes.append(f"{describe_section(s)} is not judged: {100 * lost:.0f} % of its position is missing")
     return too_much
-
-
-def _make_ramp_excursion(signal: str, s: Section, start: int, departure: Floats, width: Width) -> Excursion:
-    middle, most = (np.full(len(departure), limit) for limit in (width.middle, width.most))
-    return Excursion(signal, s, start, np.abs(departure), middle, most, FRICTION.name)
 
 
 def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section,
@@ -484,11 +442,9 @@ def _find_events(e: Excursion, t0: float, period: float) -> list[Event]:
     for band, limit in (("middle", e.middle), ("most", e.most)):
         with np.errstate(invalid="ignore"):
             beyond = e.departure > limit
-        for stay in find_stays(beyond):
-            rows = slice(stay.first, stay.last + 1)
-            excess = float(np.nanmax(e.departure[rows] - limit[rows]))
-            begin = t0 + (e.start + stay.first) * period
-            end = t0 + (e.start + stay.last + 1) * period
+        for first, last in find_stays(beyond):
+            excess = float(np.nanmax((e.departure - limit)[first:last + 1]))
+            begin, end = (t0 + (e.start + row) * period for row in (first, last + 1))
             out.append(Event(band, e.signal, describe_section(e.section), begin, end, excess))
     return out
 
@@ -497,7 +453,8 @@ DEFAULT = "preflight_bands.toml"
 UM_PER_M, MS_PER_S, MM_PER_M = 1e6, 1e3, 1e3
 KNOT_CYCLES = 2  # between the times at which shifts and spreads of a step are known
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a key that TOML takes without quotes
-LISTS = ("healthy_um", "spread_um", "friction_um", "middle_um", "most_um")
+STEP_LISTS = (("healthy", "healthy_um", 1), ("shift", "friction_um", 1), ("spread", "spread_um", 2),
+              ("middle", "middle_um", 1), ("most", "most_um", 1))  # field of StepBand, key in the file, decimals
 HEADER = """\
 # Bands of a command, as `rig fdi --learn-bands` writes them; `rig fdi TRACE --bands FILE` judges by them.
 # [[step]]: the mean response of healthy units, a number a cycle from {first:g} ms on; every {coarse} cycles what each
@@ -522,10 +479,9 @@ def load_bands(path: str | Path) -> Bands:
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(path, "--bands", f"a readable file of bands ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "--bands", "a file of bands, as text in UTF-8") from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
+        raise InputError(path, "--bands", f"a readable file of bands ({reason})") from error
     return parse_bands(text, path)
 
 
@@ -550,13 +506,13 @@ def format_bands(bands: Bands) -> str:
         lines.append(f"  {json.dumps([s.kind, s.start, s.stop, *numbers])},")
     lines.append("]")
     for step in bands.steps:
-        knots = slice(None, None, KNOT_CYCLES)
-        lines += ["", "[[step]]", f"section = {step.section}",
-                  f"healthy_um = {_format_list(step.healthy * UM_PER_M, 1)}",
-                  "friction_um = [", *(f"  {_format_list(row[knots] * UM_PER_M, 1)}," for row in step.shift), "]",
-                  "spread_um = [", *(f"  {_format_list(row[knots] * UM_PER_M, 2)}," for row in step.spread), "]",
-                  f"middle_um = {_format_list(step.middle[knots] * UM_PER_M, 1)}",
-                  f"most_um = {_format_list(step.most[knots] * UM_PER_M, 1)}"]
+        lines += ["", "[[step]]", f"section = {step.section}"]
+        for field_name, key, places in STEP_LISTS:
+            values = getattr(step, field_name)[..., ::1 if field_name == "healthy" else KNOT_CYCLES] * UM_PER_M
+            if values.ndim == 1:
+                lines.append(f"{key} = {_format_list(values, places)}")
+            else:
+                lines += [f"{key} = [", *(f"  {_format_list(row, places)}," for row in values), "]"]
     for ramp in bands.ramps:
         lines += ["", "[[ramp]]", f"section = {ramp.section}",
                   f"position_um = {_format_width(ramp.position, UM_PER_M)}",
@@ -604,19 +560,16 @@ def _read_bands(table: Mapping[str, Any]) -> Bands:
 
 
 def _read_step(step: Mapping[str, Any], period: float, amounts: int, parts: Container[int]) -> StepBand:
-    healthy, spread, shift, middle, most = (np.array(step[key], float) / UM_PER_M for key in LISTS)
+    lists = {name: np.array(step[key], float) / UM_PER_M for name, key, _ in STEP_LISTS}
+    healthy = lists.pop("healthy")
     rows = np.arange(len(healthy))
     coarse = rows[::KNOT_CYCLES]
-    if spread.shape != (amounts, len(coarse)) or shift.shape != spread.shape or step["section"] not in parts:
+    if not lists["spread"].shape == lists["shift"].shape == (amounts, len(coarse)) or step["section"] not in parts:
         raise ValueError(f"step of section {step['section']}: not a step of the command, or lists of other lengths")
-
-    def interpolate(values: Floats) -> Floats:
-        return np.interp(rows, coarse, values)
-
+    fine = {name: np.apply_along_axis(lambda knots: np.interp(rows, coarse, knots), -1, values)
+            for name, values in lists.items()}
     t = (rows + round(STEP_JUDGED_FROM / period)).astype(float)
-    return StepBand(int(step["section"]), t * period, healthy,
-                    np.array([interpolate(row) for row in shift]),
-                    np.array([interpolate(row) for row in spread]), interpolate(middle), interpolate(most))
+    return StepBand(int(step["section"]), t * period, healthy, **fine)
 
 
 def _read_ramp(ramp: Mapping[str, Any], amounts: int, parts: Container[int]) -> RampBand:
