@@ -5,6 +5,7 @@ present runs. The sensors are those of the present runs; one candidate repeats t
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -33,11 +34,12 @@ STEPS = 20  # solver steps a cycle
 
 
 class Experiment(NamedTuple):
-    """A run that could be made: its name, what to do, and the command, m, and known load, N, (n,) each, of a model."""
+    """A run that could be made: its name, what to do, its command, (n,) m, by the model, and whether under a load."""
 
     name: str
     what: str
-    build: Callable[[Model], tuple[Floats, Floats]]
+    build: Callable[[Model], Floats]
+    is_loaded: bool = False
 
 
 class Advice(NamedTuple):
@@ -49,54 +51,37 @@ class Advice(NamedTuple):
     share: float  # of half the range that the interval would take up with that run beside the present ones
 
 
-def _hold(level: float, seconds: float, period: float) -> Floats:
-    return np.full(max(1, round(seconds / period)), level)
+def _move(model: Model, levels: Sequence[tuple[float, float]], scale: float, speed: float = math.inf) -> Floats:
+    """A command that goes to each of some (level, seconds), times `scale` m, at `speed` m/s, and holds it."""
+    period, at, parts = model["controller.period"], 0.0, []
+    for level, seconds in levels:
+        to = level * scale
+        if to != at and speed < math.inf:
+            parts.append(np.linspace(at, to, max(2, round(abs(to - at) / speed / period)), endpoint=False))
+        parts.append(np.full(max(1, round(seconds / period)), to))
+        at = to
+    return np.concatenate(parts)
 
 
-def _ramp(first: float, last: float, speed: float, period: float) -> Floats:
-    n = max(2, round(abs(last - first) / speed / period))
-    return np.linspace(first, last, n, endpoint=False)
-
-
-def _compute_top_speed(model: Model) -> float:
-    """Speed of the ram, m/s, with the spool a fifth open."""
-    return 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]
-
-
-def _build_steps(model: Model) -> tuple[Floats, Floats]:
-    h, x = model["controller.period"], model["jack.travel"]
+def _build_steps(model: Model) -> Floats:
     levels = (0.0, 0.1, 0.0, 0.6, -0.6, 0.0, -0.1, 0.0)
-    com = np.concatenate([_hold(level * x, 0.8 if abs(level) < 0.5 else 1.5, h) for level in levels])
-    return com, np.zeros_like(com)
+    return _move(model, [(level, 0.8 if abs(level) < 0.5 else 1.5) for level in levels], model["jack.travel"])
 
 
-def _build_ramps(model: Model) -> tuple[Floats, Floats]:
-    h, x = model["controller.period"], 0.03 * model["jack.travel"]
-    com = np.concatenate([_hold(0.0, 0.3, h), _ramp(0.0, x, x / 2.0, h), _hold(x, 0.5, h), _ramp(x, -x, x / 2.0, h),
-                          _hold(-x, 0.5, h), _ramp(-x, 0.0, x / 2.0, h), _hold(0.0, 0.3, h)])
-    return com, np.zeros_like(com)
+def _build_ramps(model: Model) -> Floats:
+    x = 0.03 * model["jack.travel"]
+    return _move(model, ((0.0, 0.3), (1.0, 0.5), (-1.0, 0.5), (0.0, 0.3)), x, x / 2.0)
 
 
-def _build_sweep(model: Model) -> tuple[Floats, Floats]:
-    h, t = model["controller.period"], np.arange(0.0, 5.0, model["controller.period"])
+def _build_sweep(model: Model) -> Floats:
+    t = np.arange(0.0, 5.0, model["controller.period"])
     com = 0.03 * model["jack.travel"] * np.sin(2.0 * np.pi * (0.5 * t + 1.9 * t**2))  # 0.5 to 19.5 Hz
-    com = np.concatenate([_hold(0.0, 0.3, h), com])
-    return com, np.zeros_like(com)
+    return np.concatenate([_move(model, ((0.0, 0.3),), 0.0), com])
 
 
-def _build_stops(model: Model) -> tuple[Floats, Floats]:
-    h, x, speed = model["controller.period"], 1.1 * model["jack.travel"], _compute_top_speed(model)
-    com = np.concatenate([_hold(0.0, 0.3, h), _ramp(0.0, x, speed, h), _hold(x, 0.8, h), _ramp(x, -x, speed, h),
-                          _hold(-x, 0.8, h), _ramp(-x, 0.0, speed, h), _hold(0.0, 0.3, h)])
-    return com, np.zeros_like(com)
-
-
-def _build_loaded(model: Model) -> tuple[Floats, Floats]:
-    com, _ = _build_steps(model)
-    part = np.arange(len(com)) / len(com)
-    force = 0.3 * model["jack.area"] * model["supply.pressure"]
-    load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
-    return com, load
+def _build_stops(model: Model) -> Floats:
+    speed = 0.2 * model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"]  # with the spool a fifth open
+    return _move(model, ((0.0, 0.3), (1.0, 0.8), (-1.0, 0.8), (0.0, 0.3)), 1.1 * model["jack.travel"], speed)
 
 
 EXPERIMENTS = (
@@ -105,7 +90,7 @@ EXPERIMENTS = (
     Experiment("sweep", "a sine sweep from 0.5 to 20 Hz of 3 % of the stroke", _build_sweep),
     Experiment("stops", "a command 10 % beyond both end stops, held there for 0.8 s", _build_stops),
     Experiment("load", "steps under a known force, a third of the largest, pushing and pulling (column load)",
-               _build_loaded),
+               _build_steps, is_loaded=True),
 )
 
 
@@ -127,7 +112,11 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
         known = known + _measure_information(present, free, x)
     found = {}
     for experiment in EXPERIMENTS:
-        trace = _simulate(model, *experiment.build(model), problem.trace.outputs)
+        com = experiment.build(model)
+        part = np.arange(len(com)) / len(com)
+        force = 0.3 * model["jack.area"] * model["supply.pressure"] * experiment.is_loaded
+        load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
+        trace = _simulate(model, com, load, problem.trace.outputs)
         run = replace(present, trace=trace, also=(), _lanes={})
         found[experiment.name] = known + _measure_information(run, free, x)
     what = {e.name: e.what for e in EXPERIMENTS}
@@ -141,12 +130,9 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: LogProblem, 
     shares = {name: _compute_shares(free, information) for name, information in found.items()}
     advice = []
     for name in unseen:
-        best = min(shares, key=lambda experiment: shares[experiment][name])
-        share = shares[best][name]
-        if share <= IDENTIFIABLE_SHARE:
-            advice.append(Advice(name, best, what[best], share))
-        else:
-            advice.append(Advice(name, None, "", share))
+        share, best = min((shares[experiment][name], experiment) for experiment in shares)
+        is_enough = share <= IDENTIFIABLE_SHARE
+        advice.append(Advice(name, best if is_enough else None, what[best] if is_enough else "", share))
     return advice
 
 

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -225,7 +226,6 @@ def _find_answer_file(file: Path, model: Model) -> Path:
 TABLE = "dates.csv"
 AXES = {"date": "days", "hours": "h", "flights": "flights"}  # axis: its unit
 _DATE = re.compile(r"(?<!\d)(\d{4})-?([01]\d)-?([0-3]\d)(?:[T_ ]([0-2]\d)[-:]?([0-5]\d)(?:[-:]?([0-5]\d))?)?(?!\d)")
-_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)$")
 
 
 class Row(NamedTuple):
@@ -242,18 +242,11 @@ def parse_date(text: str) -> float:
     >>> parse_date("1970-01-02"), parse_date("1970-01-01T12:00:00-12:00"), parse_date("soon")
     (1.0, 1.0, nan)
     """
-    text = text.strip().removesuffix("Z")
-    offset = _OFFSET.search(text) if "T" in text or " " in text else None
-    late = 0.0
-    if offset:
-        sign, hours, minutes = offset.groups()
-        late = float(f"{sign}1") * (int(hours) * 60 + int(minutes)) / 1440
-        text = text[:offset.start()]
     try:
-        found = np.datetime64(text.strip(), "s") if re.match(r"\d{4}-\d\d-\d\d", text) else np.datetime64("NaT")
+        found = datetime.fromisoformat(text.strip()).replace(microsecond=0)
     except ValueError:
         return math.nan
-    return math.nan if np.isnat(found) else float(found.astype(float)) / 86400 - late
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() / 86400
 
 
 def format_day(day: float) -> str:
@@ -271,13 +264,9 @@ def find_date_in_name(path: Path) -> float:
     >>> find_date_in_name(Path("unit7/2026-01-02/trace.mcap")) - parse_date("2026-01-01")
     1.0
     """
-    for part in reversed(path.parts):
-        for y, m, d, *clock in _DATE.findall(part):
-            hour = "T" + ":".join(word or "00" for word in clock) if clock[0] else ""
-            found = parse_date(f"{y}-{m}-{d}{hour}")
-            if not math.isnan(found):
-                return found
-    return math.nan
+    found = (parse_date(f"{y}-{m}-{d}" + ("T" + ":".join(word or "00" for word in clock) if clock[0] else ""))
+             for part in reversed(path.parts) for y, m, d, *clock in _DATE.findall(part))
+    return next((day for day in found if not math.isnan(day)), math.nan)
 
 
 def read_dates_table(path: Path) -> dict[str, Row]:

@@ -1,6 +1,7 @@
 """Bands: what leaves them and what does not, limits from Table 2's faults, files, other commands, a fleet's own."""
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -8,15 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from noisy_traces import SHORT as RAMP_AND_SINE
+from noisy_traces import record_plant
 
 from fdi.diagnosis import learn_bands
 from fdi.diagnosis.bands import (
     Bands,
     BandVerdict,
+    describe_other_model,
     find_stays,
     format_bands,
     judge_position,
     judge_trace,
+    list_design,
     load_bands,
     load_default_bands,
     matches_command,
@@ -24,14 +29,22 @@ from fdi.diagnosis.bands import (
     require_same_command,
     save_bands,
 )
+from fdi.diagnosis.diagnosis import diagnose
 from fdi.diagnosis.faults import Level
-from fdi.diagnosis.learn_bands import UnitKind, choose_bands, make_bands_by_simulation, simulate_units
+from fdi.diagnosis.learn_bands import (
+    UnitKind,
+    choose_bands,
+    make_bands_by_simulation,
+    sample_sensor_noise,
+    simulate_units,
+)
 from fdi.thresholds import BAND_EVENT_SAMPLES
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
-from plant import InputError, load_model, simulate
+from plant import InputError, Model, load_model, simulate
 from plant.profile import build_profile as profile
 from plant.segments import Hold, Ramp, Step
+from rig.cli.main import main
 from rig.sequences import load_sequence
 
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"
@@ -173,6 +186,8 @@ def test_bands_of_another_command_are_refused() -> None:
         judge_position(other, other, 1e-3, load_default_bands())
     with pytest.raises(InputError, match="has 2 sections"):
         judge_position(command()[:2000], command()[:2000], 1e-3, load_default_bands())
+    with pytest.raises(InputError, match="steps or slow ramps"):
+        make_bands_by_simulation(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
     with pytest.raises(InputError, match="unloaded ram"):
         judge_position(command(), units()[0], 1e-3, load_default_bands(), load=np.full(len(other), 5e3))
     assert matches_command(load_default_bands(), command(), 1e-3)
@@ -211,56 +226,124 @@ def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "5000 N" in bands.provenance["load"]
 
 
-def test_a_command_that_shows_nothing() -> None:
-    """A hold has no band."""
-    with pytest.raises(InputError, match="steps or slow ramps"):
-        make_bands_by_simulation(load_model(), np.zeros(1000), np.zeros(1000), 1e-3)
-
-
 def test_the_file(tmp_path: Path) -> None:
-    """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed."""
+    """What is written is read again, to the digit; it is small, says where it is from, and can be reviewed.
+
+    A step of no whole number of mm is read again, too.
+    """
     save_bands(load_default_bands(), tmp_path / "b.toml")
     again = load_bands(tmp_path / "b.toml")
-    assert format_bands(again) == format_bands(load_default_bands())
     assert judged(units(0.3)[0], again) == judged(units(0.3)[0])
-    facts = load_default_bands().provenance.keys()
-    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= facts
+    assert {"made", "command", "command_hash", "model", "runs", "seed", "software"} <= again.provenance.keys()
     assert (tmp_path / "b.toml").stat().st_size < 40_000
     some = short_bands()
-    assert format_bands(parse_bands(format_bands(some), "")) == format_bands(some)
-
-
-def test_a_file_of_any_command_is_read_again(tmp_path: Path) -> None:
-    """A step of no whole number of mm, too."""
-    some = short_bands()
     odd = replace(some, precursors={"overshoot_0.341mm": next(iter(some.precursors.values()))})
-    save_bands(odd, tmp_path / "b.toml")
-    assert load_bands(tmp_path / "b.toml").precursors.keys() == odd.precursors.keys()
+    for bands in (load_default_bands(), some, odd):
+        text = format_bands(bands)
+        assert format_bands(parse_bands(text, "")) == text
 
 
 @pytest.mark.parametrize(("old", "new", "word"), [
     ("period_ms = 1\n", "period_ms = 0\n", "a file of bands"),
     ("friction_N = [5.0, ", "friction_N = [500.0, ", "rising"),
-    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "not a ramp of the command")])
-def test_a_file_edited_wrongly_is_refused(old: str, new: str, word: str) -> None:
+    ("friction_N = [5.0, ", "friction_N = [", "of other lengths"),
+    ("[[ramp]]\nsection = ", "[[ramp]]\nsection = 9", "not a ramp of the command"),
+    ("", "[bands", "TOML"), ("", "x = 1\n", "bands"), ("", "[bands]\nperiod_ms = 1\n", "key")])
+def test_a_wrong_file_is_refused(old: str, new: str, word: str, tmp_path: Path) -> None:
+    """In one line."""
     content = format_bands(load_default_bands())
     assert old in content
-    with pytest.raises(InputError, match=word):
-        parse_bands(content.replace(old, new), "b.toml")
-
-
-@pytest.mark.parametrize(("wrong", "word"), [("[bands", "TOML"), ("x = 1\n", "bands"), (None, "of other lengths"),
-                                             ("[bands]\nperiod_ms = 1\n", "key")])
-def test_a_wrong_file_is_refused(wrong: str | None, word: str, tmp_path: Path) -> None:
-    """In one line."""
-    if wrong is None:
-        wrong = format_bands(load_default_bands()).replace("friction_N = [5.0, ", "friction_N = [")
-    (tmp_path / "b.toml").write_text(wrong)
+    (tmp_path / "b.toml").write_text(content.replace(old, new) if old else new)
     with pytest.raises(InputError, match=word) as refused:
         load_bands(tmp_path / "b.toml")
     assert "\n" not in str(refused.value)
     with pytest.raises(InputError, match="a readable file"):
         load_bands(tmp_path / "none.toml")
+
+
+OTHER = {"jack.mass": 150.0}
+
+
+def test_bands_remember_their_model_through_a_file() -> None:
+    """Its faults and its noise do not count; bands of another model are refused."""
+    com = RAMP_AND_SINE[:1400]
+    model = Model().replace(OTHER)
+    made = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
+    same = {"filter.clogging": 0.2, "spool.static_friction": 20.0, "spool.dynamic_friction": 10.0,
+            "sensors.position_noise": 5e-6}
+    assert list_design(Model().replace(same)) == {} and list_design(model.replace(same)) == OTHER
+    assert describe_other_model(made, model) == describe_other_model(made, model.replace(same)) == ""
+    for other in (Model(), model.replace({"jack.mass": 151.0})):
+        assert describe_other_model(made, other) == "the model eha with jack.mass = 150.0"
+    with pytest.raises(InputError, match=r"--bands: made for the model eha with all parameters nominal.*mass = 150"):
+        diagnose(record_plant(com=RAMP_AND_SINE, seed=1), model, load_default_bands())
+
+
+def trace(x: np.ndarray, com: np.ndarray | None = None) -> Trace:
+    com = command() if com is None else com
+    return Trace.from_columns({"com": com, "xj": x, "cor": np.full(len(x), 1e-3)}, 1e-3, {})
+
+
+def test_a_fleet_of_its_own() -> None:
+    """Another design's response, learned from healthy traces, is healthy then; its faults are still found."""
+    model = load_model().replace({"pilot.flow_gain": 0.069 * 0.88})
+    com = command()
+
+    def fleet(kind: UnitKind, count: int, seed: int) -> list[Trace]:
+        return [trace(x) for x in simulate_units(model, com, np.zeros_like(com), kind, count, seed)]
+
+    sound = fleet(UnitKind(""), 32, 7)
+    strange = [judge_trace(t, load_default_bands()) for t in sound]
+    assert np.mean([j.severity[CLOGGING] for j in strange]) > 0.3
+    own = learn_bands.learn_bands(sound)
+    assert own.provenance["made"].startswith("from 32 healthy traces")
+    fresh = [judge_trace(t, own) for t in fleet(UnitKind(""), 16, 8)]
+    assert [j.events for j in fresh] == [()] * 16
+    assert np.mean([j.severity[CLOGGING] for j in fresh]) < 0.2
+    assert {judge_trace(t, own).ruling for t in fleet(UnitKind("", 0.4), 8, 9)} == {CLOGGING}
+    assert own.precursors["overshoot_5mm"]["healthy"] != load_default_bands().precursors["overshoot_5mm"]["healthy"]
+
+
+def test_a_fleet_that_cannot_be_learned_from() -> None:
+    """Too few, another command in one of them, holes."""
+    own = [trace(x) for x in units()[:6]]
+    other, holed = command().copy(), units()[7].copy()
+    other[500:1500], holed[3000:4000] = 4e-3, np.nan
+    for traces, reason in ((own[:3], "at least 5"), ([*own, trace(units()[7], other)], r"odd\.csv: com"),
+                           ([*own, trace(holed)], "missing")):
+        with pytest.raises(InputError, match=reason):
+            learn_bands.learn_bands(traces, names=[*"abcdef", "odd.csv"][:len(traces)])
+    doubtful = learn_bands.learn_bands([*own, trace(units(0.5)[0])], names=[*"abcdef", "clogged.csv"])
+    assert doubtful.provenance["doubtful"].endswith(": clogged.csv")
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`rig fdi --learn-bands` writes a file, from a command or from traces; without a place for it, one line."""
+    com = profile((Hold(time=0.1), Step(to=2e-3, time=0.15), Ramp(to=2.5e-3, time=0.9))).command
+    rows = "\n".join(f"{k / 1000:.3f},{value:.9g}" for k, value in enumerate(com))
+    (tmp_path / "c.csv").write_text("t,com\n" + rows + "\n")
+    out = str(tmp_path / "b.toml")
+    assert main(["fdi", "--learn-bands", "--command", str(tmp_path / "c.csv"), "--out", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["judges"] == [CLOGGING, FRICTION]
+    assert load_bands(out).provenance["command"].endswith("c.csv")
+    assert main(["fdi", "--learn-bands"]) == main(["fdi"]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+def test_noise_of_the_healthy() -> None:
+    """As large as the sensor's, of different colours, with hum: what false alarms are counted with."""
+    drawn = [sample_sensor_noise(np.random.default_rng(k), load_model(), 4000) for k in range(40)]
+    sizes = np.array([x.std() for x in drawn])
+    colours = np.array([np.corrcoef(x[:-1], x[1:])[0, 1] for x in drawn])
+    assert sizes.min() > 1.6e-6 and sizes.max() < 3e-6
+    assert colours.min() < 0.2 and colours.max() > 0.7
+
+
+@pytest.mark.slow
+def test_the_shipped_bands_are_what_the_command_makes(tmp_path: Path) -> None:
+    """Byte for byte, on this kind of machine."""
+    assert main(["fdi", "--learn-bands", "--out", str(tmp_path / "b.toml"), "--quiet"]) == 0
+    assert (tmp_path / "b.toml").read_text() == format_bands(load_default_bands())
 
 
 @pytest.mark.slow

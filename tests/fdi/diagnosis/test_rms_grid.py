@@ -1,15 +1,17 @@
 """The RMS grid: its maps are what they say, its minima are where the faults are, and its rules are the paper's."""
 from __future__ import annotations
 
-import time
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from rig_command import rig
 
 from fdi import Trace
+from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate
 from fdi.diagnosis.rms_grid import (
     FSS_AXIS,
     KINTAS_AXIS,
@@ -20,6 +22,7 @@ from fdi.diagnosis.rms_grid import (
     search_grid,
 )
 from fdi.estimation.replay import read_cycles
+from fdi.report.diagnosis_report import explain_grid
 from plant import InputError, Model, simulate
 from plant.monitor import Monitor
 from plant.profile import build_profile
@@ -174,9 +177,24 @@ def test_centre_of_gravity() -> None:
     assert merge_minima(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
 
 
-def test_fast_enough() -> None:
-    """21x21 cells, everything included, under 2 s of both cores; processor time, as others may be at work here."""
-    search_grid(trace(0.25, 30.0))  # compiled and loaded
-    begin = time.process_time()
-    search_grid(trace(0.25, 30.0))
-    assert time.process_time() - begin < 4.0
+def diagnosis(kintas: float, explained: bool = True, others: dict[str, Estimate] | None = None) -> Any:
+    def point(value: float) -> Any:
+        return SimpleNamespace(minimum=SimpleNamespace(kintas=value, fss=5.0, rms=54e-6))
+
+    grid = SimpleNamespace(kintas=np.linspace(0.0, 0.5, 21), fss=np.linspace(0.0, 90.0, 21), step=point(2 * kintas),
+                           ramp=point(0.0), joint=point(kintas), merged=SimpleNamespace(kintas=kintas, fss=5.0))
+    sizes = {CLOGGING.name: Estimate(0.001, 0.0, 0.02), FRICTION.name: Estimate(5.0, 4.0, 6.0)}
+    refinement = SimpleNamespace(errors={"xj": 2e-6}, is_explained=explained)
+    return cast(Any, SimpleNamespace(grid=grid, sizes=sizes, others=others or {}, refinement=refinement))
+
+
+def test_a_grid_that_contradicts_the_fit_says_why() -> None:
+    (text,) = explain_grid(diagnosis(0.175, others={"null_bias.current": Estimate(2.4e-4, 2.3e-4, 2.5e-4)}))
+    assert text.startswith("The grid gives Kintas 0.175 (minima: steps 0.350, ramps 0), the fit 0.001 (0 .. 0.020)")
+    assert "null bias 0.24 mA" in text and "leaves 54 um of the position, the fit 2 um. Trust the fit." in text
+    (text,) = explain_grid(diagnosis(0.175, explained=False))
+    assert text.endswith("The fit does not explain the trace either.")
+
+
+def test_a_grid_that_agrees_says_nothing() -> None:
+    assert explain_grid(diagnosis(0.05)) == []

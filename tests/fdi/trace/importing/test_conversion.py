@@ -1,4 +1,4 @@
-"""Time bases, rates, gaps, delays and scales: what an import makes of them."""
+"""Text tables, time bases, rates, gaps, delays and scales: what an import makes of them, and what a guess says."""
 from __future__ import annotations
 
 import math
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fdi.trace.importing.conversion import Imported, Samples, import_measurement, place_samples
-from fdi.trace.importing.formats import Channel, ChannelReader, open_measurement
-from fdi.trace.importing.guess import guess_map
+from fdi.trace.importing.formats import Channel, ChannelReader, open_measurement, open_text_table
+from fdi.trace.importing.guess import GuessedMap, guess_map
 from fdi.trace.importing.import_map import parse_map
 from plant.errors import InputError
 
@@ -117,13 +117,17 @@ def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
     assert trace.period == pytest.approx(1.0003e-3) and len(trace) == n and np.array_equal(trace.xj, x)
 
 
+def guess(tmp_path: Path, lines: list[str]) -> GuessedMap:
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    return guess_map(open_measurement(tmp_path / "x.csv"))
+
+
 def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
     """Only motion tells: the growing column is the time, the two that follow each other are Com and XJ."""
     com = np.where(np.arange(1000) % 400 > 200, 3.0, -3.0)
     xj = np.convolve(com, np.exp(-np.arange(200) / 20.0) / 20.5, "full")[:1000]
     lines = [f"{k},{x:.4f},{c:.1f},{k % 7}" for k, (x, c) in enumerate(zip(xj, com, strict=True))]
-    (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
-    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    guessed = guess(tmp_path, lines)
     assert guessed.chosen["com"] == ("column 3", "unsure") and guessed.chosen["xj"][0] == "column 2"
     assert guessed.chosen["time"][0] == "column 1" and 'unit = "ms"' in guessed.text
     assert "# [signals.cor]" in guessed.text and "every analysis needs it" in guessed.text
@@ -132,8 +136,7 @@ def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
 def test_guess_finds_a_counter(tmp_path: Path) -> None:
     lines = ["cnt;Sollwert_mm;Istwert_mm;i_mA"]
     lines += [f"{(250 + k) % 256};{math.sin(k / 90):.5f};{-math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(2000)]
-    (tmp_path / "x.csv").write_text("\n".join(lines))
-    text = guess_map(open_measurement(tmp_path / "x.csv")).text
+    text = guess(tmp_path, lines).text
     assert 'source = "cnt"\nbits = 8' in text and "sign = -1" in text
 
 
@@ -141,8 +144,7 @@ def test_guess_takes_the_rate_of_a_counter_from_its_unit(tmp_path: Path) -> None
     """A counter of microseconds that wraps counts 1e6 a second: 500 counts a row are 2000 rows a second."""
     lines = ["cnt [us];Soll [mm];Ist [mm];i [mA]"]
     lines += [f"{500 * k % 65536};{math.sin(k / 90):.5f};{math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(500)]
-    (tmp_path / "x.csv").write_text("\n".join(lines))
-    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    guessed = guess(tmp_path, lines)
     assert "bits = 16\nrate = 1000000  # counts a second, as the header says (us): 2000 rows" in guessed.text
     assert guessed.chosen["time"][1] != "unsure"
 
@@ -160,8 +162,7 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
     rows = zip(com, np.rint(xj / 0.005) + 1000, cor, strict=True)
     lines = ["t [s];Soll [mm];Ist [counts];i [mA];Kraft [kN]"]
     lines += [f"{k / 1000};{c:g};{x:.0f};{i:.5f};0" for k, (c, x, i) in enumerate(rows)]
-    (tmp_path / "x.csv").write_text("\n".join(lines))
-    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    guessed = guess(tmp_path, lines)
     signals = parse_map(guessed.text, tmp_path / "x.map.toml").signals
     scaling = signals["xj"].term
     assert scaling.scale == pytest.approx(0.005, rel=0.01) and scaling.offset == pytest.approx(-5.0, rel=0.02)
@@ -173,8 +174,7 @@ def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
 def test_guess_pairs_two_chambers(tmp_path: Path) -> None:
     lines = ["time [s];target [mm];stroke [mm];p B [bar];p A [bar]"]
     lines += [f"{k / 1000};{math.sin(k / 90)};{math.sin(k / 90 - 0.1)};{50 + k % 7};{60 + k % 5}" for k in range(500)]
-    (tmp_path / "x.csv").write_text("\n".join(lines))
-    guessed = guess_map(open_measurement(tmp_path / "x.csv"))
+    guessed = guess(tmp_path, lines)
     assert 'source = "p A [bar]"\nunit = "bar"\nminus = "p B [bar]"' in guessed.text
     assert guessed.chosen["p12"] == ("p A [bar]", "likely")
 
@@ -214,3 +214,62 @@ def test_the_map_in_the_manual_is_valid() -> None:
     found = parse_map("\n".join(line[4:] for line in block.splitlines()), Path("import.md"))
     assert found.signals["p12"].delay == 0.0035 and found.signals["p12"].sensor.moving_mean == 20.0
     assert found.signals["xj"].sensor.quantum == pytest.approx(2.5e-5)
+
+
+LAYOUTS = {
+    "comma": ("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
+    "semicolon and decimal comma": ("t;x\n0;1,5\n1;2,5\n2;-3e-2\n", "utf-8"),
+    "tabulator": ("t\tx\n0\t1.5\n1\t2.5\n2\t-3e-2\n", "utf-8"),
+    "white space": ("   t     x\n 0   1.5\n 1   2.5\n  2  -3e-2\n", "utf-8"),
+    "mark of UTF-8, CRLF": ("t,x\r\n0,1.5\r\n1,2.5\r\n2,-3e-2\r\n", "utf-8-sig"),
+    "UTF-16": ("t,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-16"),
+    "comments and an empty line": ("# a logger\n% 3 rows\n\nt,x\n0,1.5\n# pause\n1,2.5\n2,-3e-2\n", "utf-8"),
+    "quoted": ('"t","x"\n"0","1.5"\n"1","2.5"\n"2","-3e-2"\n', "utf-8"),
+    "names in a comment": ("# t, x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
+    "words above": ("Logger,7\nserial number 12\nt,x\n0,1.5\n1,2.5\n2,-3e-2\n", "utf-8"),
+    "last separator": ("t;x\n0;1.5;\n1;2.5;\n2;-3e-2;\n", "utf-8"),
+}
+
+
+@pytest.mark.parametrize("case", LAYOUTS)
+def test_layouts(case: str, tmp_path: Path) -> None:
+    text, encoding = LAYOUTS[case]
+    (tmp_path / "x.csv").write_bytes(text.encode(encoding))
+    table = open_text_table(tmp_path / "x.csv")
+    assert list(table.units)[:2] == ["t", "x"]
+    assert [c.values.tolist() for c in table.read(["t", "x"]).values()] == [[0.0, 1.0, 2.0], [1.5, 2.5, -0.03]]
+
+
+@pytest.mark.parametrize(("content", "units"), [
+    ("Zeit;Weg [mm];p;Weg [mm]\ns;;bar;\n0;1;2;3\n1;2;3;4\n",
+     {"Zeit": "s", "Weg [mm]": "mm", "p": "bar", "Weg [mm] #2": "mm"}),
+    ("Ram Position\tp\n m\tMPa\n0\t1\n1\t2\n", {"Ram Position": "m", "p": "MPa"})])
+def test_units_from_a_line_and_from_brackets(content: str, units: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_bytes(content.encode("latin-1"))
+    assert open_text_table(tmp_path / "x.csv").units == units
+
+
+def test_missing_fields_and_dates(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("when,x,y\n2024-05-01T12:00:00.000,1,2\n2024-05-01T12:00:00.001,NaN,2\n"
+                                    "2024-05-01T12:00:00.003,,n/a\n")
+    columns = open_text_table(tmp_path / "x.csv").read(["when", "x"], ["when"])
+    assert np.diff(columns["when"].values).round(7).tolist() == [0.001, 0.002]
+    assert np.isnan(columns["x"].values).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(("row", "place", "reason"), [
+    ("2,abc", "line 4: x", "'abc'"), ("2,inf", "line 4: x", "'inf'"), ("2,1_0", "line 4: x", "'1_0'"),
+    ("2", "line 4", "2 fields, not 1"), ("2,3,4", "line 4", "2 fields, not 3"),
+])
+def test_bad_rows(row: str, place: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text(f"t,x\n0,1\n1,2\n{row}\n3,4\n")
+    with pytest.raises(InputError) as error:
+        open_text_table(tmp_path / "x.csv").read(["t", "x"])
+    assert place in str(error.value) and reason in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no table\n", b"\0\1\2", b"a,b\nc,d\n"])
+def test_what_is_no_table(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.csv"):
+        open_text_table(tmp_path / "x.csv")
