@@ -48,12 +48,25 @@ class CycleRecords(NamedTuple):
     response: Array  # the controller's drive frame
     flags: NDArray[np.int64]  # of the valve state
     injected: Injected
-    plant_delay: Array | None = None  # the plant's own record: feedback sent after SYNC came
+    plant_delay: Array  # the plant's own record: feedback sent after SYNC came; 0 where it has none
 
     @property
     def cycles(self) -> int:
         """Number of cycles."""
         return len(self.lateness)
+
+    def find_missing(self, node: int) -> Mask:
+        """The cycles without a cyclic frame of a node, (cycles,)."""
+        return np.isnan(self.response) if node == CONTROLLER else np.isnan(self.feedback) & np.isnan(self.valve)
+
+    def find_stop(self, node: int) -> int:
+        """The first cycle from which a node sent none of its cyclic frames any more; `cycles` if it sent the last."""
+        present = np.flatnonzero(~self.find_missing(node))
+        return int(present[-1]) + 1 if len(present) else 0
+
+    def find_cycle(self, t_ns: int) -> int:
+        """The cycle under way at a log time; 0 before the first."""
+        return max(int(np.searchsorted(self.due_ns, t_ns, "right")) - 1, 0)
 
 
 class Trouble(NamedTuple):
@@ -73,7 +86,6 @@ class Disturbance(NamedTuple):
     last: int
     reach: int
     source: int  # node 1 rig or node 3 plant
-    overruns: int
     text: str
 
 
@@ -165,34 +177,27 @@ def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterabl
     sync = (records.lateness > policy.sync) & ~records.injected.sync
     is_in_time = (records.feedback <= policy.feedback) & ~np.isnan(records.valve)
     feedback = ~is_in_time & ~records.injected.plant & ~records.injected.sync
-    missing = np.isnan(records.feedback) & np.isnan(records.valve)
+    missing = records.find_missing(PLANT)
     for cycle in stops:
         known_after = 150  # cycles: a change of the NMT state is known with the next heartbeat
         first = _find_run_start(missing, min(cycle, records.cycles - 1), near=known_after)
         present = np.flatnonzero(~missing[first:])
         feedback[first:first + int(present[0]) if len(present) else None] = False
-    delay = records.plant_delay
-    stalled = np.zeros(records.cycles, dtype=bool) if delay is None else delay > policy.feedback
-    return LateCycles(sync, feedback, stalled)
+    return LateCycles(sync, feedback, records.plant_delay > policy.feedback)
 
 
 def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: Container[int]) -> list[int]:
     """Cycles in which the plant was found to have stopped: it is gone, has an error of its own, or left OPERATIONAL."""
-    stops = [find_cycle(records, trouble.t_ns) for trouble in troubles
+    stops = [records.find_cycle(trouble.t_ns) for trouble in troubles
              if trouble.node == PLANT and not _is_communication(trouble)]
     return [*stops, records.cycles - 1] if PLANT in gone else stops
 
 
-class StartProblem(NamedTuple):
-    """Why bring-up failed. `kind` as in `Trouble`: "late" if the bench was late, "bring_up" if the node is too slow."""
-
-    node: int  # 0: the bench as a whole
-    kind: str
-    text: str
-
-
-def find_start_problem(times: Mapping[int, StartTime], limit: float) -> StartProblem | None:
+def find_start_problem(times: Mapping[int, StartTime], limit: float) -> tuple[str, str, int] | None:
     """Who is to blame when a node was not OPERATIONAL within `limit` s of NMT start; None if all were.
+
+    Returns kind, text and node (0: the bench as a whole) as in `Trouble`. The kind is "late" if the bench was late,
+    "bring_up" if the node is too slow.
 
     The controller is blamed only if the plant was in time and the rig was there to take its heartbeat in. If both nodes
     are too slow, the machine or the bus stood still.
@@ -207,26 +212,15 @@ def find_start_problem(times: Mapping[int, StartTime], limit: float) -> StartPro
     rule = f"must be OPERATIONAL within {limit:g} s of NMT start"
     if len(slow) == 2:
         which = ", ".join(f"node {node} {NAMES[node]} {said[node]}" for node in slow)
-        return StartProblem(0, "late", f"the bench was late in bring-up: both nodes {rule}: {which}")
+        return "late", f"the bench was late in bring-up: both nodes {rule}: {which}", 0
     for node in slow:
-        is_late = node == PLANT and node in times  # the plant is a part of the bench
-        kind = "late" if is_late else "bring_up"
-        return StartProblem(node, kind, f"node {node} {NAMES[node]} {rule} and {said[node]}")
+        kind = "late" if node == PLANT and node in times else "bring_up"  # the plant is a part of the bench
+        return kind, f"node {node} {NAMES[node]} {rule} and {said[node]}", node
     for node, time in times.items():
         if time.seconds > limit:
-            return StartProblem(RIG, "late", f"the rig stood still for {time.waited:.2f} s and cannot know "
-                                              f"whether node {node} {NAMES[node]} was OPERATIONAL within {limit:g} s")
+            return "late", (f"the rig stood still for {time.waited:.2f} s and cannot know whether node {node} "
+                            f"{NAMES[node]} was OPERATIONAL within {limit:g} s"), RIG
     return None
-
-
-def find_last_stop(missing: Mask) -> int:
-    """First of the cycles at the end that are all missing; the number of cycles if the last one is not.
-
-    >>> find_last_stop(np.array([False, True, False, True, True]))
-    3
-    """
-    present = np.flatnonzero(~missing)
-    return int(present[-1]) + 1 if len(present) else 0
 
 
 def find_disturbances(records: CycleRecords, late: LateCycles, joined: int = 2) -> tuple[Disturbance, ...]:
@@ -243,23 +237,21 @@ def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, l
     """A disturbance with its reach: three cycles, and as long again as it lasted."""
     span = slice(first, last + 1)
     skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / PERIOD).sum())
-    overruns = count_overruns(records, late)[span].sum()
-    reach = last + 3 + (last - first + 1) + skipped
+    source, text = PLANT, _describe_plant(records, late, span)
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
     if late.sync[first] or (late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2):
-        worst = float(np.nanmax(records.lateness[span])) if span.stop > span.start else 0.0
-        return Disturbance(first, last, reach, RIG, int(overruns), f"the rig sent SYNC {1e3 * worst:.1f} ms late")
-    return Disturbance(first, last, reach, PLANT, int(overruns), _describe_plant(records, late, span))
+        source, text = RIG, f"the rig sent SYNC {1e3 * float(np.nanmax(records.lateness[span])):.1f} ms late"
+    return Disturbance(first, last, last + 3 + (last - first + 1) + skipped, source, text)
 
 
 def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
-    delay = records.plant_delay
-    if delay is not None and late.stalled[span].any():
-        return f"by its own record the plant sent feedback {1e3 * float(np.nanmax(delay[span])):.1f} ms after SYNC"
+    if late.stalled[span].any():
+        delay = float(records.plant_delay[span].max())
+        return f"by its own record the plant sent feedback {1e3 * delay:.1f} ms after SYNC"
     missing = int(np.isnan(records.feedback[span]).sum() or np.isnan(records.valve[span]).sum())
     if missing:
         return f"the plant sent no feedback for {missing} {'cycle' if missing == 1 else 'cycles'}"
-    return f"the plant's feedback came {1e3 * float(np.nanmax(records.feedback[span])):.1f} ms after SYNC"
+    return f"the plant's feedback came {1e3 * float(np.nanmax(records.feedback[span], initial=0.0)):.1f} ms after SYNC"
 
 
 def count_overruns(records: CycleRecords, late: LateCycles) -> NDArray[np.int64]:
@@ -322,14 +314,14 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
     that no longer come; a fault of the sequence explains what follows from it; lateness of the bench explains what
     falls into its reach; a node that sent no frames explains that others miss them.
     """
-    cycle = find_cycle(records, trouble.t_ns)
+    cycle = records.find_cycle(trouble.t_ns)
     itself = Cause(trouble.node, trouble.kind, cycle, trouble.text)
     if not _is_communication(trouble):
         return itself
     silent, origin = _find_silent_node(trouble, records, cycle)
     for node in (silent, trouble.node):
-        if node in gone and _find_stop(node, records) <= cycle + 1:  # later it still answered
-            return _describe_stop(node, records, min(origin, _find_stop(node, records)), cycle, gone[node])
+        if node in gone and records.find_stop(node) <= cycle + 1:  # later it still answered
+            return _describe_stop(node, records, min(origin, records.find_stop(node)), cycle, gone[node])
     window = records.injected.any[max(origin - 1, 0):cycle + 1]
     if window.any() and trouble.kind != "guard":
         return itself._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
@@ -354,32 +346,24 @@ def _is_communication(trouble: Trouble) -> bool:
     return trouble.kind in ("heartbeat", "process", "guard")
 
 
-def find_cycle(records: CycleRecords, t_ns: int) -> int:
-    """The cycle under way at a log time; 0 before the first."""
-    return max(int(np.searchsorted(records.due_ns, t_ns, "right")) - 1, 0)
-
-
 def _find_silent_node(trouble: Trouble, records: CycleRecords, cycle: int) -> tuple[int, int]:
     """The node whose missing frames a trouble is about, and the first cycle without them; 0 and `cycle` for none."""
     if trouble.kind in ("heartbeat", "process"):
-        stop = _find_stop(trouble.node, records)
+        stop = records.find_stop(trouble.node)
         is_answering = trouble.kind == "heartbeat" and stop > cycle  # only the heartbeat is missing
         return (0, cycle) if is_answering else (trouble.node, min(cycle, stop))
     if trouble.kind != "emcy" or trouble.code != _RPDO_TIMEOUT:
         return 0, cycle
-    no_feedback = np.isnan(records.feedback) & np.isnan(records.valve)
-    no_drive = np.isnan(records.response) | _shift_back(records.flags & _NO_DRIVE != 0)
-    origin = _find_run_start(no_drive if trouble.node == PLANT else no_feedback, cycle)
-    if trouble.node == PLANT:
-        # Without feedback the controller has nothing to answer: then the plant was first.
-        first = max(origin - 1, 0)
-        return (PLANT, first) if no_feedback[first:origin + 1].any() else (CONTROLLER, origin)
-    return (PLANT, origin) if no_feedback[min(origin, len(no_feedback) - 1):][:1].any() else (0, cycle)
-
-
-def _shift_back(mask: Mask) -> Mask:
-    """The plant's flags of cycle k + 1 speak of the drive frame of cycle k."""
-    return np.append(mask[1:], False) if len(mask) else mask
+    no_feedback = records.find_missing(PLANT)
+    if trouble.node != PLANT:
+        origin = _find_run_start(no_feedback, cycle)
+        return (PLANT, origin) if no_feedback[min(origin, len(no_feedback) - 1):][:1].any() else (0, cycle)
+    # The plant's flags of cycle k + 1 speak of the drive frame of cycle k.
+    flagged = np.append(records.flags[1:] & _NO_DRIVE != 0, False)[:records.cycles]
+    origin = _find_run_start(records.find_missing(CONTROLLER) | flagged, cycle)
+    first = max(origin - 1, 0)
+    # Without feedback the controller has nothing to answer: then the plant was first.
+    return (PLANT, first) if no_feedback[first:origin + 1].any() else (CONTROLLER, origin)
 
 
 def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
@@ -392,24 +376,16 @@ def _find_run_start(missing: Mask, cycle: int, near: int = 4) -> int:
     return int(present[-1]) + 1 if len(present) else 0
 
 
-def _find_stop(node: int, records: CycleRecords) -> int:
-    """The first cycle from which a node sent none of its cyclic frames any more."""
-    if node == CONTROLLER:
-        return find_last_stop(np.isnan(records.response))
-    return find_last_stop(np.isnan(records.feedback) & np.isnan(records.valve))
-
-
 def _describe_stop(node: int, records: CycleRecords, first: int, cycle: int, how: str) -> Cause:
     """A node that stopped answering in cycle `first`, with the evidence that the bench did its part."""
     missing = np.isnan(records.response if node == CONTROLLER else records.feedback)
     frames = "drive" if node == CONTROLLER else "feedback"
     count = int(np.argmin(missing[first:])) if not missing[first:].all() else 0  # 0: until the end
-    if how:
-        text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}; {how}"
-    elif count or first >= records.cycles:
+    if not how and (count or first >= records.cycles):
         text = f"node {node} {NAMES[node]} did not answer in time: no {frames} frame for {count} cycles from {first}"
     else:
         text = f"node {node} {NAMES[node]} stopped answering: no {frames} frame since cycle {first}"
+        text += f"; {how}" if how else ""
     evidence = _show_punctuality(records, first, cycle) if node == CONTROLLER else ()
     return Cause(node, "stopped", first, text, evidence, is_gone=bool(how))
 
@@ -437,26 +413,18 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
     """
     sync, plant, anything = (np.zeros(cycles, dtype=bool) for _ in range(3))
     for fault in plan.faults:
-        if isinstance(fault, Parameter | Offset | Stuck):
-            continue
         first, last = plan.find_cycles(fault)
         frame = getattr(fault, "frame", "")
-        if not frame:
+        if not frame and not isinstance(fault, Parameter | Offset | Stuck):
             anything[first:last + heartbeat_limit] = True
-            if not isinstance(fault, Silent):
-                sync[first:last + watchdog_limit] = True
-            if isinstance(fault, BusOff):
-                plant[first:last + 1] = True
-            continue
-        for k in range(first, min(last, cycles)):
+            sync[first:last + watchdog_limit] |= not isinstance(fault, Silent)
+            plant[first:last + 1] |= isinstance(fault, BusOff)
+        for k in range(first, min(last, cycles) if frame else first):
             action = schedule.find_action(frame, k)
             if action is not None:
-                delay = -(-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else 0
-                span = slice(k, k + delay + watchdog_limit)
-                anything[span] = True
-                if frame in ("feedback", "valve_state", "sync"):
-                    plant[k:k + delay + 1] = True
-                if frame == "sync":
-                    sync[k:k + delay + 1] = True
-                    anything[k:k + heartbeat_limit] = True
+                last_hit = k - (-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else k
+                anything[k:last_hit + watchdog_limit] = True
+                plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
+                sync[k:last_hit + 1] |= frame == "sync"
+                anything[k:k + heartbeat_limit] |= frame == "sync"
     return Injected(sync, plant, anything)

@@ -148,7 +148,7 @@ class BringUp:
             self._journal.log("INFO", "nmt",
                               f"node {node} {NAMES[node]} is OPERATIONAL {1e3 * seconds:.0f} ms after NMT start")
         if problem := find_start_problem(times, limit):
-            self._safety.handle(problem.kind, problem.text, problem.node)
+            self._safety.handle(*problem)
 
     def find_on_time_of(self, history: History, faults: Schedule | None = None) -> Mask:
         """The cycles of a play in which the bench was on time."""

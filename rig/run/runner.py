@@ -190,13 +190,12 @@ def collect_records(job: Job, session: Session) -> CycleRecords:
                         injected, select_plant_delays(session.plant_record, len(history)))
 
 
-def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array | None:
-    """From SYNC to feedback by the plant's own record, s, (cycles,); 0 where it has no entry, None without a record."""
-    if record is None:
-        return None
+def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array:
+    """From SYNC to feedback by the plant's own record, s, (cycles,); 0 where it has no entry."""
     delays = np.zeros(cycles)
-    known = (record.cycle >= 0) & (record.cycle < cycles)
-    delays[record.cycle[known]] = (record.sent - record.sync)[known] * 1e-9
+    if record is not None:
+        known = (record.cycle >= 0) & (record.cycle < cycles)
+        delays[record.cycle[known]] = (record.sent - record.sync)[known] * 1e-9
     return delays
 
 

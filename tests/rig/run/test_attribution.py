@@ -18,7 +18,6 @@ from rig.run.attribution import (
     attribute,
     count_most_in_a_row,
     find_injected,
-    find_last_stop,
     find_start_problem,
 )
 from rig.run.runner import select_plant_delays
@@ -39,7 +38,7 @@ class Script:
         self.feedback, self.valve, self.response = np.full(N, 1e-4), np.full(N, 1.1e-4), np.full(N, 2e-4)
         self.flags = np.zeros(N, dtype=np.int64)
         self.injected = np.zeros((3, N), dtype=bool)
-        self.delay: np.ndarray | None = None
+        self.delay = np.full(N, 1e-5)
         self.troubles: list[Trouble] = []
 
     def lose_feedback(self, first: int, last: int = N) -> None:
@@ -77,12 +76,12 @@ def test_who_is_to_blame_for_a_slow_start(controller: StartTime | None, plant: S
                                           blamed: tuple[int, str] | None) -> None:
     times = {node: time for node, time in ((CONTROLLER, controller), (PLANT, plant)) if time is not None}
     found = find_start_problem(times, 1.0)
-    assert (None if found is None else (found.node, found.kind)) == blamed
-    if found is not None and found.kind == "late":
+    assert (None if found is None else (found[2], found[0])) == blamed
+    if found is not None and found[0] == "late":
         script = Script()
-        script.report(0, found.node, 0, found.kind, found.text)
+        script.report(0, found[2], 0, *found[:2])
         cause = script.attribute().cause
-        assert cause is not None and cause.is_lateness and cause.text == found.text
+        assert cause is not None and cause.is_lateness and cause.text == found[1]
 
 
 def test_a_run_without_trouble() -> None:
@@ -143,7 +142,6 @@ def test_late_feedback_is_not_held_against_the_controller(late: float) -> None:
 
 def test_the_plants_own_record_shows_a_stall() -> None:
     script = Script()
-    script.delay = np.full(N, 1e-5)
     script.delay[500] = 3e-3
     script.lose_drive(499, 503)
     script.report(503.0, PLANT, 0x8250)
@@ -155,9 +153,8 @@ def test_the_plants_own_record_shows_a_stall() -> None:
 def test_the_plants_record_is_matched_by_cycle() -> None:
     cycle, sync = np.array([2, 3, 900]), np.array([1000, 2000, 3000])
     record = CycleRecord(cycle, sync, sync + 10, sync + 500, sync + 900, np.zeros(3, dtype=np.int64))
-    delays = select_plant_delays(record, 5)
-    assert delays is not None and delays == pytest.approx([0, 0, 5e-7, 5e-7, 0])
-    assert select_plant_delays(None, 5) is None
+    assert select_plant_delays(record, 5) == pytest.approx([0, 0, 5e-7, 5e-7, 0])
+    assert select_plant_delays(None, 5).tolist() == [0.0] * 5
 
 
 def test_a_dead_controller_is_named_and_not_the_plant_that_misses_it() -> None:
@@ -274,7 +271,7 @@ def test_the_limits_are_those_of_the_sequence() -> None:
 def test_a_run_without_cycles() -> None:
     empty, mask = np.zeros(0), np.zeros(0, dtype=bool)
     records = CycleRecords(np.zeros(0, dtype=np.int64), empty, empty, empty, empty, np.zeros(0, dtype=np.int64),
-                           Injected(mask, mask, mask))
+                           Injected(mask, mask, mask), empty)
     found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, {PLANT: "gone"})
     assert source_and_kind(found) == (CONTROLLER, "bring_up") and len(found.judged) == 0
 
@@ -292,11 +289,6 @@ def test_the_first_of_several_causes() -> None:
 @pytest.mark.parametrize(("values", "most"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([0, 7, 0], 7), ([2, 1], 3)])
 def test_overruns_in_a_row(values: list[int], most: int) -> None:
     assert count_most_in_a_row(np.array(values, dtype=np.int64)) == most
-
-
-def test_last_stop() -> None:
-    assert find_last_stop(np.array([True, False, True])) == 2 and find_last_stop(np.zeros(3, dtype=bool)) == 3
-    assert find_last_stop(np.ones(3, dtype=bool)) == 0
 
 
 @pytest.mark.parametrize(("fault", "expected"), [
