@@ -178,12 +178,15 @@ Done = Callable[[], bool]
 class Wire(Protocol):
     """What the master and the loop need of a bus."""
 
-    clock: Clock
     send: Send
     receive: Callable[[Frame], None]  # where incoming frames go; set by the master
     is_node_gone: Done  # whether a node will not answer any more; set by the session
     blind_ns: int  # how long at most the frames that come in now have waited to be taken in
     stalled_ns: int  # how long in all frames were not taken in, pauses of the cycle left out
+
+    @property
+    def clock(self) -> Clock:
+        """The time of the bus."""
 
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
