@@ -7,7 +7,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,13 +38,15 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str]) -> Cs
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
-        plant = _find_recorder(header)
-        table = _find_table(header, plant) if plant else None
-        rows = csv.reader(chain([header], stream), delimiter=table.separator if table else ",")
-        if table is None:
-            return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
-        sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
-        return CsvColumns(_combine_columns(sources, table), notes, plant)
+        for plant in map(find_plant, list_plants()):
+            for table in plant.tables:
+                names = {name.strip() for name in next(csv.reader([header], delimiter=table.separator), [])}
+                if table.sources <= names:
+                    rows = csv.reader(chain([header], stream), delimiter=table.separator)
+                    sources, notes = _parse_rows(path, rows, tuple(sorted(table.sources)), ())
+                    return CsvColumns(_combine_columns(sources, table), notes, plant)
+        rows = csv.reader(chain([header], stream))
+        return CsvColumns(*_parse_rows(path, rows, tuple(required), tuple(optional)), None)
 
 
 @contextlib.contextmanager
@@ -118,75 +120,50 @@ def _parse_rows(path: Path, rows: Iterator[list[str]], required: tuple[str, ...]
     if len(set(header)) < len(header):
         raise InputError(f"{path}: line 1", "header", "each column once")
     known = [(i, name) for i, name in enumerate(header) if name in required or name in optional]
-    values: list[list[float]] = [[] for _ in known]
-    words = dict.fromkeys((name for _, name in known), 0)  # fields that say "nan"
+    values: dict[str, list[float]] = {name: [] for _, name in known}
+    words = dict.fromkeys(values, 0)  # fields that say "nan"
     last = -math.inf
     for line, row in enumerate(rows, 2):
         if not row:
             continue
         if len(row) != len(header):
             raise InputError(f"{path}: line {line}", "", f"{len(header)} fields as in the header, not {len(row)}")
-        for out, (i, name) in zip(values, known, strict=True):
-            out.append(_parse_number(path, line, name, row[i]))
-            words[name] += math.isnan(out[-1]) and bool(row[i].strip())
-            if name == "t":
-                if not out[-1] > last:
-                    raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, not {row[i]!r}")
-                last = out[-1]
-    if not values[0]:
+        for i, name in known:
+            try:
+                value = float(row[i]) if row[i].strip() else math.nan
+            except ValueError:
+                value = math.inf
+            if math.isinf(value):
+                raise InputError(f"{path}: line {line}", name, f"a finite number or an empty field, not {row[i]!r}")
+            values[name].append(value)
+            words[name] += math.isnan(value) and bool(row[i].strip())
+        if "t" in values:
+            t = values["t"][-1]
+            if not t > last:
+                raise InputError(f"{path}: line {line}", "t", f"a time after {last:g} s, "
+                                                              f"not {row[header.index('t')]!r}")
+            last = t
+    if not values[known[0][1]]:
         raise InputError(path, "", "at least one row after the header")
-    unknown = [name for name in header if name not in required and name not in optional]
-    notes = (*_describe_unknown(unknown),
-             *(f"column {name}: {count} fields say nan and count as missing" for name, count in words.items() if count))
-    return {name: np.array(column) for column, (_, name) in zip(values, known, strict=True)}, notes
-
-
-def _parse_number(path: Path, line: int, name: str, text: str) -> float:
-    try:
-        value = float(text) if text.strip() else math.nan
-    except ValueError:
-        value = math.inf
-    if math.isinf(value):
-        raise InputError(f"{path}: line {line}", name, f"a finite number or an empty field, not {text!r}")
-    return value
-
-
-def _find_recorder(header: str) -> Plant | None:
-    """The plant whose rig writes a CSV with this first line; None for a trace of this software or any other."""
-    for plant in map(find_plant, list_plants()):
-        if _find_table(header, plant):
-            return plant
-    return None
-
-
-def _find_table(header: str, plant: Plant) -> Table | None:
-    """Which of the plant's own files has this first line."""
-    return next((table for table in plant.tables if table.sources <= set(_split_header(header, table))), None)
-
-
-def _split_header(line: str, table: Table) -> list[str]:
-    return [name.strip() for name in next(csv.reader([line], delimiter=table.separator), [])]
-
-
-def _describe_unknown(names: Sequence[str], most: int = 3) -> list[str]:
-    """At most one note: the columns that were left out, the first ones by name."""
-    if len(names) < 2:
-        return [f"column {name} is not known and was left out" for name in names]
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return [f"{len(names)} columns are not known and were left out: {', '.join(names[:most])}{more}"]
+    unknown = [name for name in header if name not in values]
+    notes = [f"column {name} is not known and was left out" for name in unknown]
+    if len(unknown) > 1:
+        more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
+        notes = [f"{len(unknown)} columns are not known and were left out: {', '.join(unknown[:3])}{more}"]
+    notes += [f"column {name}: {count} fields say nan and count as missing" for name, count in words.items() if count]
+    return {name: np.array(column) for name, column in values.items()}, tuple(notes)
 
 
 def _combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Floats]:
     """The columns of a trace from those of a plant's own rig; NaN where a part of one is missing."""
-    columns = {name: sum((_shift_term(sources, term) for term in terms), start=np.zeros(1))[table.skip:]
+    def shift_term(term: Term) -> Floats:
+        values = term.factor * sources[term.source]
+        return np.concatenate([values[term.later:], np.full(term.later, np.nan)])
+
+    columns = {name: sum(map(shift_term, terms), start=np.zeros(1))[table.skip:]
                for name, terms in table.columns.items()}
     if table.derive:
         columns |= {name: values[table.skip:] for name, values in table.derive(sources).items()}
     if table.load:
         columns["load"] = table.load(columns)
     return columns
-
-
-def _shift_term(sources: Mapping[str, Floats], term: Term) -> Floats:
-    values = term.factor * sources[term.source]
-    return np.concatenate([values[term.later:], np.full(term.later, np.nan)])

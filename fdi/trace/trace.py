@@ -176,7 +176,7 @@ class Trace:
     def from_columns(cls, columns: Mapping[str, Floats], period: float, provenance: Mapping[str, str]) -> Trace:
         """A trace from columns com, xj, cor and, where known, t, p12, xs, load, shape (n,) each."""
         grid = {"t": np.round(np.arange(len(columns["com"])) * period, 9), **columns}
-        return _make_trace(grid, period, [], provenance=dict(provenance))
+        return _make_trace(grid, period, np.arange(len(grid["com"])), provenance=dict(provenance))
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -276,39 +276,39 @@ def _from_csv(path: Path) -> Trace:
         line = int(np.argmin(np.diff(rows))) + 3
         raise InputError(f"{path}: line {line}", "t", f"one row per cycle of {typical:g} s")
     period = round(float(t[-1] - t[0]) / float(rows[-1]), 9)
-    grid, gaps = _on_grid(path, rows, {**columns, "t": t})
-    lost = np.isnan(grid["t"])
-    grid["t"][lost] = np.round(t[0] + period * np.arange(len(lost)), 9)[lost]
-    return _make_trace(grid, period, gaps, provenance={"source": path.name} | ({"plant": plant.name} if plant else {}),
-                       units=UNITS | ({"cor": plant.unit} if plant else {}), notes=notes)
+    grid = _spread_rows(path, rows, {**columns, "t": t})
+    grid["t"] = np.where(np.isnan(grid["t"]), np.round(t[0] + period * np.arange(len(grid["t"])), 9), grid["t"])
+    return _make_trace(grid, period, rows, notes=notes, units=UNITS | ({"cor": plant.unit} if plant else {}),
+                       provenance={"source": path.name} | ({"plant": plant.name} if plant else {}))
 
 
-def _on_grid(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Gap]]:
-    """Spread columns, shape (m,), over all cycles 0..rows[-1]: NaN where there is none; and the gaps, in rows."""
+def _spread_rows(path: Path, rows: NDArray[np.int64], columns: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Columns, shape (m,), spread over all cycles 0..rows[-1]: NaN where there is none."""
     n = int(rows[-1]) + 1
     if n > 10 * len(rows) + 1_000_000:  # the columns are as long as the numbers say, not as the file
         raise InputError(path, "t", f"gaps that leave more than {len(rows)} of {n} cycles")
-    out = {}
+    out = {name: np.full(n, math.nan) for name in columns}
     for name, values in columns.items():
-        out[name] = np.full(n, math.nan)
         out[name][rows] = values
-    return out, [Gap(float(a), float(b), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1]
+    return out
 
 
-def _make_trace(grid: Mapping[str, Floats], period: float, gaps: list[Gap], **more: object) -> Trace:
+def _make_trace(grid: Mapping[str, Floats], period: float, rows: NDArray[np.int64], **more: object) -> Trace:
+    """The trace of columns in which cycles without one of the `rows` are NaN."""
     t = grid["t"]
-    nothing = np.full(len(t), math.nan)
-    columns = {name: grid.get(name, nothing) for name in (*REQUIRED, *OPTIONAL)}
+    columns = {name: grid.get(name, np.full(len(t), math.nan)) for name in (*REQUIRED, *OPTIONAL)}
     if "pa" in grid and "pb" in grid:
         more["chambers"] = np.column_stack([grid["pa"], grid["pb"]])
     more.setdefault("phase", np.full(len(t), MAIN))
     more.update(usable=np.ones(len(t), bool), filled=np.zeros(len(t), bool), incomplete=np.zeros(len(t), bool))
-    in_seconds = tuple(Gap(float(t[int(g.t0)]), float(t[int(g.t1)]), g.cycles) for g in gaps)
-    return Trace(**columns, period=period, gaps=in_seconds, **more)  # type: ignore[arg-type]
+    gaps = tuple(Gap(float(t[a]), float(t[b]), int(b - a - 1)) for a, b in pairwise(rows) if b - a > 1)
+    return Trace(**columns, period=period, gaps=gaps, **more)  # type: ignore[arg-type]
 
 
 def _from_log(log: Log, everything: bool) -> Trace:
-    signals, timing, rest = log.read_columns("/signals"), log.read_columns("/timing"), _read_messages(log)
+    signals, timing = log.read_columns("/signals"), log.read_columns("/timing")
+    rest = {name: [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
+            for name in ("/events", "/nmt", "/checks")}
     _require_numbers(log, "/signals", signals, ("cycle", "phase", *REQUIRED[1:], *OPTIONAL))
     _require_numbers(log, "/timing", timing, ("cycle", "lateness", "response", "work", "overrun"))
     notes = [f"only the first {MOST_MESSAGES} messages of {name} were read"
@@ -330,12 +330,11 @@ def _from_log(log: Log, everything: bool) -> Trace:
     kept = slice(None) if everything else slice(main[0], main[-1] + 1)
     seconds = _make_clock(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
     rows = cycle[kept] - cycle[kept][0]
-    grid, gaps = _on_grid(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
-                          | {"phase": phase[kept].astype(float)})
+    grid = _spread_rows(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
+                        | {"phase": phase[kept].astype(float)})
     grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
-    numbers = grid.pop("phase")
-    filled = numbers[np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(len(numbers))))]
-    return _make_trace(grid, period, gaps, phase=filled.astype(int), provenance=_collect_provenance(log, run),
+    filled = hold_last(grid.pop("phase"))
+    return _make_trace(grid, period, rows, phase=filled.astype(int), provenance=_collect_provenance(log, run),
                        units=dict(UNITS) | log.read_units("/signals"), attachments=log.attachments, notes=tuple(notes),
                        sensors=read_sensors(log.path, run),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
@@ -376,25 +375,16 @@ def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], 
             raise InputError(log.path, f"{topic}.{name}", "a field of this name with a number")
 
 
-def _read_messages(log: Log) -> dict[str, Messages]:
-    """Events, NMT states and checks: the topics with few messages; of each the first MOST_MESSAGES."""
-    found: dict[str, Messages] = {}
-    for name in ("/events", "/nmt", "/checks"):
-        found[name] = [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
-    return found
-
-
 def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
     """The run's own figure, else the median over the cycles, to the microsecond."""
+    usual = round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
+    said = run.get("period", usual)
     try:
-        period = float(run["period"])
-    except KeyError:
-        period = round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3
+        period = float(said)
     except ValueError:
         period = math.nan
     if not 1e-6 <= period <= 3600.0:  # nor NaN
-        said = run.get("period", str(period))
-        raise InputError(log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {said!r}")
+        raise InputError(log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {str(said)!r}")
     return period
 
 
@@ -424,9 +414,7 @@ def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float],
 
 def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
     """Of the cycles that have a row; t = 0 at cycle `zero`."""
-    if not len(columns["time_ns"]):
-        return NO_TIMING
-    kept = np.isin(columns["cycle"], cycles)
+    kept = np.isin(columns.get("cycle", []), cycles)
     if not kept.any():
         return NO_TIMING
     t = (columns["cycle"][kept].astype(int) - zero) * period
@@ -473,11 +461,9 @@ def bridge_gaps(x: Floats, longest: int) -> tuple[Floats, Flags]:
     rows = np.arange(len(x))
     there = rows[~missing]
     filled = np.interp(rows, there, x[there])
-    edges = np.flatnonzero(np.diff(missing, prepend=False, append=False)).reshape(-1, 2)
     flagged = np.zeros(len(x), bool)
-    for first, stop in edges:
-        if stop - first > longest or first == 0:
-            flagged[first:stop] = True
+    for first, stop in np.flatnonzero(np.diff(missing, prepend=False, append=False)).reshape(-1, 2):
+        flagged[first:stop] = stop - first > longest or first == 0
     gaps = rows[missing & ~flagged]
     after = np.searchsorted(there, gaps)
     inner = (after >= 2) & (after < len(there) - 1)

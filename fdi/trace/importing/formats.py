@@ -4,7 +4,6 @@ from __future__ import annotations
 import codecs
 import csv
 import importlib
-import io
 import itertools
 import math
 import re
@@ -13,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
@@ -214,7 +214,10 @@ class TextTable:
                    for i, name in places]
         width = len(self.layout.names)
         with report_unreadable(self.path, ENCODINGS), open_text(self.path, self.layout.encoding) as stream:
-            for line, fields in _split_rows(stream, self.layout):
+            for line, text in enumerate(stream, 1):
+                if line < self.layout.first_line or _is_comment(text):
+                    continue
+                fields = _split_line(text.rstrip("\r\n"), self.layout.separator)
                 if len(fields) != width and not _is_padded(fields, width):
                     raise InputError(f"{self.path}: line {line}", "", f"{width} fields, not {len(fields)}")
                 for i, name, append, parse in appends:
@@ -240,15 +243,17 @@ def open_text_table(path: Path, separator: str | None = None, decimal: str | Non
         with open_text(path, encoding) as stream:
             lines = [line.rstrip("\r\n") for line in itertools.islice(stream, SAMPLE_LINES)]
     separator, decimal = _find_separators(path, lines, separator, decimal)
-    rows = [_split_line(line, separator) for line in lines]
     parse = _make_number_parser(decimal)
-    width = _find_width(rows, lines, parse)
-    first = next((i for i, row in enumerate(rows) if not _is_comment(lines[i]) and _is_data(row, width, parse)
-                  and i != (name_line or 0) - 1), None)
+    rows = [[] if _is_comment(line) else _split_line(line, separator) for line in lines]
+    width = _find_width(rows, parse)
+    rows = [row[:width] if _is_padded(row, width) else row for row in rows]
+    first = next((i for i, row in enumerate(rows) if i + 1 != name_line and _is_data(row, width, parse)), None)
     if first is None:
         raise InputError(path, "", "a table with rows of numbers in its first 200 lines")
     names, units, line = _find_names(path, rows, lines, first, width, name_line)
-    return TextTable(path, Layout(encoding, separator, decimal, names, units, line, first + 1))
+    unique = tuple(name + (f" #{names[:i].count(name) + 1}" if name in names[:i] else "")
+                   for i, name in enumerate(names))
+    return TextTable(path, Layout(encoding, separator, decimal, unique, tuple(units), line, first + 1))
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -297,13 +302,6 @@ def _split_line(line: str, separator: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def _split_rows(stream: io.TextIOBase, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of each row of numbers."""
-    for line, text in enumerate(stream, 1):
-        if line >= layout.first_line and not _is_comment(text):
-            yield line, _split_line(text.rstrip("\r\n"), layout.separator)
-
-
 def _is_padded(fields: list[str], width: int) -> bool:
     """Whether a row has only empty fields more, as behind a last separator."""
     return len(fields) > width and not any(fields[width:])
@@ -349,96 +347,70 @@ def _is_number(text: str, parse: Callable[[str], float]) -> bool:
 
 def _find_separators(path: Path, lines: list[str], separator: str | None, decimal: str | None) -> tuple[str, str]:
     """The pair under which most fields are numbers."""
-    best, found = 0.0, (separator or ",", decimal or ".")
+    best, found = 0.0, ("", "")
     body = [line for line in lines if not _is_comment(line)]
-    for sep in (separator,) if separator else SEPARATORS:
-        rows = [_split_line(line, sep) for line in body]
-        widths = Counter(map(len, rows))
-        width = widths.most_common(1)[0][0] if widths else 0
-        for dec in (decimal,) if decimal else (".", ","):
-            if dec == sep or width < 2:
-                continue
-            parse = _make_number_parser(dec)
-            cells = [cell for row in rows if len(row) == width and any(_is_number(cell, parse) for cell in row)
-                     for cell in row]
-            share = sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)
-            score = len(cells) * share**3
-            if score > best:
-                best, found = score, (sep, dec)
+    for sep, dec in product([separator] if separator else SEPARATORS, [decimal] if decimal else (".", ",")):
+        rows, parse = [_split_line(line, sep) for line in body], _make_number_parser(dec)
+        width = max(Counter(map(len, rows)).items(), key=lambda pair: pair[1], default=(0, 0))[0]
+        if dec == sep or width < 2:
+            continue
+        cells = [cell for row in rows if len(row) == width and any(_is_number(cell, parse) for cell in row)
+                 for cell in row]
+        score = len(cells) * (sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)) ** 3
+        if score > best:
+            best, found = score, (sep, dec)
     if not best:
         raise InputError(path, "", "a table with at least two columns of numbers")
     return found
 
 
-def _find_width(rows: list[list[str]], lines: list[str], parse: Callable[[str], float]) -> int:
+def _find_width(rows: list[list[str]], parse: Callable[[str], float]) -> int:
     """Columns of the rows of numbers, without those behind a last separator."""
-    numbers = [row for row, line in zip(rows, lines, strict=True)
-               if not _is_comment(line) and any(_is_number(cell, parse) for cell in row)]
-    width = Counter(map(len, numbers)).most_common(1)[0][0] if numbers else 0
+    widths = Counter(len(row) for row in rows if any(_is_number(cell, parse) for cell in row))
+    width = widths.most_common(1)[0][0] if widths else 0
     alike = [row for row in rows if len(row) == width]
-    while width and not any(row[width - 1] for row in alike):
-        width -= 1
-    return width
+    return max((i + 1 for row in alike for i, cell in enumerate(row) if cell), default=0)
 
 
 def _is_data(row: list[str], width: int, parse: Callable[[str], float]) -> bool:
     numbers = sum(_is_number(cell, parse) for cell in row)
     words = sum(not _is_number(cell, parse) and cell.lower() not in MISSING for cell in row)
-    return len(_trim(row, width)) == width and numbers > words
+    return len(row) == width and numbers > words
 
 
 def _find_names(path: Path, rows: list[list[str]], lines: list[str], first: int, width: int,
-                name_line: int | None) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+                name_line: int | None) -> tuple[list[str], list[str], int]:
     """Names, units, and the line of the names: the text lines just above the numbers."""
-    above = [i for i in range(first) if len(_trim(rows[i], width)) == width
-             and not (_is_comment(lines[i]) and i + 1 != name_line)]
+    above = [i for i in range(first) if len(rows[i]) == width]
     if name_line is not None:
         if name_line - 1 not in above:
             raise InputError(f"{path}: line {name_line}", "names", f"{width} names above the first row of numbers, "
                                                                    f"line {first + 1}")
         above = [i for i in above if i >= name_line - 1]
-    elif len(above) > 2 or (len(above) == 2 and not _is_unit_line(rows[above[-1]])):
+    elif above:
         above = above[-2:] if _is_unit_line(rows[above[-1]]) else above[-1:]
-    if not above:
-        comment = _find_names_in_comment(lines, first, width)
-        names = comment or [f"column {i + 1}" for i in range(width)]
-        return _make_unique(names), tuple(split_unit(name)[1] for name in names), 0
-    names = [name or f"column {i + 1}" for i, name in enumerate(_trim(rows[above[0]], width))]
+    names = rows[above[0]] if above else _find_names_in_comment(lines, first, width)
+    names = [name or f"column {i + 1}" for i, name in enumerate(names)]
     units = [split_unit(name)[1] for name in names]
     if len(above) > 1 and _is_unit_line(rows[above[1]]):
-        units = [own.strip("[]() ") or unit for own, unit in zip(_trim(rows[above[1]], width), units, strict=True)]
-    return _make_unique(names), tuple(units), above[0] + 1
+        units = [own.strip("[]() ") or unit for own, unit in zip(rows[above[1]], units, strict=True)]
+    return names, units, above[0] + 1 if above else 0
 
 
 def _find_names_in_comment(lines: list[str], first: int, width: int) -> list[str]:
-    """Names in the last comment line above the numbers, as `# t, x, p`."""
+    """Names in the last comment line above the numbers, as `# t, x, p`; empty ones if there are none."""
     for line in reversed(lines[:first]):
-        text = line.strip().lstrip("#%!/ ")
         for separator in SEPARATORS:
-            names = _split_line(text, separator)
+            names = _split_line(line.strip().lstrip("#%!/ "), separator)
             if len(names) == width and all(names):
                 return names
-    return []
-
-
-def _trim(row: list[str], width: int) -> list[str]:
-    return row[:width] if _is_padded(row, width) else row
+    return [""] * width
 
 
 def _is_unit_line(row: list[str]) -> bool:
     cells = [cell.strip("[]() ") for cell in row]
     known = sum(_is_unit(cell) for cell in cells if cell and cell != "-")
     return known > 0 and known >= 0.5 * sum(bool(cell) and cell != "-" for cell in cells)
-
-
-def _make_unique(names: list[str]) -> tuple[str, ...]:
-    """The names, a second one of the same name with " #2" behind it."""
-    seen: Counter[str] = Counter()
-    out = []
-    for name in names:
-        seen[name] += 1
-        out.append(name if seen[name] == 1 else f"{name} #{seen[name]}")
-    return tuple(out)
 
 
 class Channel(NamedTuple):
