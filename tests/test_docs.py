@@ -24,9 +24,9 @@ from plant.state import Input, Ports, State
 from rig.cli import main
 from rig.cli.command_list import HELP_OF_COMMAND
 from rig.sequences import faults
-from rig.sequences.checks import Guard
+from rig.sequences.checks import KEYS, Guard
 from rig.sequences.python_parts import Step
-from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, Sequence, parse_sequence
+from rig.sequences.sequence import SEGMENT_KINDS, Sequence, parse_sequence
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -41,7 +41,7 @@ def indented_blocks(text: str) -> list[str]:
 
 
 def documented_keys() -> Iterator[tuple[str, str]]:
-    for kinds in (SEGMENT_KINDS, faults.KINDS, CHECK_KINDS):
+    for kinds in (SEGMENT_KINDS, faults.KINDS, KEYS):
         for kind, cls in kinds.items():
             yield kind, kind
             yield from ((kind, f.name) for f in fields(cls) if f.metadata.get("key", True))

@@ -19,7 +19,8 @@ from plant.plants import list_plants
 from rig.cli.command_list import HELP_OF_COMMAND
 from rig.conformance.run_cases import CASES
 from rig.sequences import faults
-from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS
+from rig.sequences.checks import KINDS
+from rig.sequences.sequence import SEGMENT_KINDS
 
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 PAGES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").glob("*.md")}
@@ -64,7 +65,7 @@ def test_the_reference_has_every_effect_key_and_kind(reference: Path) -> None:
     sections = re.findall(r"^##+ (.*)", (reference / "effects.md").read_text(), re.MULTILINE)
     assert {effect.name for plant in list_plants() for effect in list_offered_effects(plant)} == set(sections)
     sections = re.findall(r"^##+ (.*)", (reference / "sequences.md").read_text(), re.MULTILINE)
-    for word, kinds in (("Segment", SEGMENT_KINDS), ("Fault", faults.KINDS), ("Check", CHECK_KINDS)):
+    for word, kinds in (("Segment", SEGMENT_KINDS), ("Fault", faults.KINDS), ("Check", KINDS)):
         assert {f"{word} {name}" for name in kinds} <= set(sections)
     assert "| `filter.clogging` |" in (reference / "parameters.md").read_text()
     page = (reference / "conformance.md").read_text()

@@ -14,11 +14,10 @@ from plant import Model
 from plant.segments import Segment
 from rig.cli.commands import list as list_command
 from rig.sequences import faults, tables
-from rig.sequences.check import Check
-from rig.sequences.checks import Guard
+from rig.sequences.checks import KEYS, KINDS, Check, Guard
 from rig.sequences.protocol import ProtocolLimits
 from rig.sequences.python_parts import Step
-from rig.sequences.sequence import CHECK_KINDS, SEGMENT_KINDS, RequiredFirmware, Sequence
+from rig.sequences.sequence import SEGMENT_KINDS, RequiredFirmware, Sequence
 from rig.sequences.timing import TimingPolicy
 
 
@@ -30,13 +29,14 @@ def write_sequence_page() -> list[str]:
     lines += ["", "## Shipped sequences", *make_plain_table(list_command.list_sequences(Model()))]
     lines += ["## Tables of the file", *describe_keys(Sequence)]
     for title, kinds, base in (("Segments", SEGMENT_KINDS, Segment), ("Faults", faults.KINDS, faults.Fault),
-                               ("Checks", CHECK_KINDS, Check)):
+                               ("Checks", KEYS, Check)):
         lines += [f"## {title}", "", describe_class(base), "", f"Keys of all {title.lower()}:", *describe_keys(base)]
         common = {f.name for f in fields(base)}
         for name, kind in kinds.items():
-            unit = getattr(kind, "si", None)
-            lines += [f"### {title[:-1]} {name}", "", describe_class(kind)]
-            lines += ["", f"Unit: {unit or 'of the signal'}."] if unit is not None and name != "python" else []
+            measured = KINDS[name] if base is Check else None
+            text = describe_class(kind) if measured is None else escape_markup(measured.text)
+            lines += [f"### {title[:-1]} {name}", "", text]
+            lines += ["", f"Unit: {measured.unit or 'of the signal'}."] if measured and name != "python" else []
             lines += describe_keys(kind, without=common)
     for title, cls in (("Guards", Guard), ("Steps in Python", Step), ("Limits of the protocol checks", ProtocolLimits),
                        ("Timing", TimingPolicy), ("Firmware", RequiredFirmware)):

@@ -20,7 +20,7 @@ from rig.network.codec import Flags
 from rig.network.frame import Frame, Send
 from rig.network.node_objects import COUNTERS, PLANT, SCENARIO
 from rig.nodes.scenario import Scenario
-from rig.sequences.faults import Delay, Double, Plan, Schedule, apply_action
+from rig.sequences.faults import DELAY, DOUBLE, Plan, Schedule, apply_action
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 _NAMES = {codec.FEEDBACK: "feedback", codec.VALVE_STATE: "valve_state"}
@@ -86,8 +86,8 @@ class Emulator:
         """A frame of another node arrived: a fault may delay or drop it."""
         if frame.cob_id == codec.DRIVE:
             action = self._faults.find_action("drive", self._cycle - 1)
-            if isinstance(action, Delay):
-                heapq.heappush(self._late, (frame.t_ns + action.ns, len(self._late), frame))
+            if action.code == DELAY:
+                heapq.heappush(self._late, (frame.t_ns + action.argument, len(self._late), frame))
                 return
             for data in apply_action(action, frame.data):
                 self.device.receive(frame._replace(data=data))
@@ -100,8 +100,8 @@ class Emulator:
         if is_cycle:
             for _ in range(self._faults.count_lost_syncs(self._cycle)):  # time went on for the plant
                 self._pass_cycle()
-            is_second = self._synced == self._cycle - 1 and isinstance(
-                self._faults.find_action("sync", self._synced), Double)
+            is_second = (self._synced == self._cycle - 1
+                         and self._faults.find_action("sync", self._synced).code == DOUBLE)
             self._synced = -1 if is_second else self._cycle
             if is_second:
                 self._answer_again()
@@ -143,8 +143,8 @@ class Emulator:
         name = _NAMES.get(cob_id)
         if name is not None:
             action = self._faults.find_action(name, self._cycle)
-            if isinstance(action, Delay):
-                heapq.heappush(self._held, (self.device.t_ns + action.ns, self._cycle, cob_id, data))
+            if action.code == DELAY:
+                heapq.heappush(self._held, (self.device.t_ns + action.argument, self._cycle, cob_id, data))
                 return
             for what in apply_action(action, data):
                 self._send(cob_id, what)

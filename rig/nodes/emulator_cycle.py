@@ -40,7 +40,7 @@ from rig.network.raw_bus import (
     sleep_until,
     split_words,
 )
-from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, AddedSignal, Schedule, change_frame
+from rig.sequences.faults import DELAY, DOUBLE, DROP, SENT_NORMALLY, Schedule, change_frame
 
 MISSED_LIMIT = 3  # drive frames missing in a row until the current is zeroed
 NOISE_RING = 1 << 16  # cycles of noise drawn ahead
@@ -576,7 +576,7 @@ def _await_drive(port: Port, m: Memory) -> None:
 
 @keep_apart
 def _find_action(m: Memory, what: int, k: int) -> tuple[int, int]:
-    """What happens to a frame of cycle k: code and argument (frame_faults.py)."""
+    """What happens to a frame of cycle k: see `faults.Action`."""
     words = m.words
     low, end = words[HITS_AT + what], words[HITS_AT + what + 1]
     at = low + 3 * np.searchsorted(words[low:end:3], k)
@@ -630,7 +630,7 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []
     values: list[float] = []
-    for changes in schedule.list_parameter_changes():
+    for changes in schedule.parameters.values():
         first, last = min(change.first for change in changes), max(change.last for change in changes)
         course = np.full(last - first + 1, changes[0].base)
         for change in reversed(changes):  # of several in a cycle the first counts
@@ -640,14 +640,10 @@ def make_memory(model: Model, load: list[float], schedule: Schedule, advance: in
         parameters.append((names[changes[0].name], first, len(course), len(values)))
         values += course.tolist()
     for number, name in enumerate(_SIGNALS):
-        for fault in schedule.list_signal_changes(name):
-            if isinstance(fault, AddedSignal):
-                signals.append((number, _ADDED, fault.first, fault.first + len(fault.values), len(values)))
-                values += fault.values
-            else:
-                kind = _HOLDS_READING if fault.value is None else _HOLDS_VALUE
-                signals.append((number, kind, fault.cycles.start, fault.cycles.stop, len(values)))
-                values.append(fault.value or 0.0)
+        for fault in schedule.signals.get(name, ()):
+            kind = _HOLDS_READING if fault.value is None else _HOLDS_VALUE
+            signals.append((number, kind if fault.added is None else _ADDED, fault.first, fault.last, len(values)))
+            values += [fault.value or 0.0] if fault.added is None else fault.added
     off = schedule.list_bus_off_cycles("plant")
     hits = [*map(schedule.list_frame_hits, _FRAMES), np.column_stack((off, np.ones_like(off), np.zeros_like(off)))]
     record = model.build_record()

@@ -20,7 +20,7 @@ from plant.segments import Array
 from rig.network.codec import Flags
 from rig.network.master import StartTime
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
-from rig.sequences.faults import BusOff, Delay, Offset, Parameter, Plan, Schedule, Silent, Stuck
+from rig.sequences.faults import DELAY, BusOff, Offset, Parameter, Plan, Schedule, Silent, Stuck
 from rig.sequences.timing import PERIOD, TimingPolicy
 
 Mask = NDArray[np.bool_]
@@ -421,8 +421,8 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
             plant[first:last + 1] |= isinstance(fault, BusOff)
         for k in range(first, min(last, cycles) if frame else first):
             action = schedule.find_action(frame, k)
-            if action is not None:
-                last_hit = k - (-action.ns // round(PERIOD * 1e9)) if isinstance(action, Delay) else k
+            if action.code:
+                last_hit = k - (-action.argument // round(PERIOD * 1e9)) if action.code == DELAY else k
                 anything[k:last_hit + watchdog_limit] = True
                 plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
                 sync[k:last_hit + 1] |= frame == "sync"

@@ -30,7 +30,7 @@ from rig.recorder import Signals, Timing
 from rig.run import hard_cycle as hc
 from rig.run.loop import CycleInput, CycleLoop, CycleObserver, Loop
 from rig.run.priority import enter_loop_thread, list_cpus
-from rig.sequences.faults import Cut, Delay, Double, Drop, Schedule, encode_action
+from rig.sequences.faults import CUT, DELAY, DOUBLE, DROP, NORMAL, Schedule
 
 RECEIVED = (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE, codec.SYNC, codec.COMMAND)  # the last two: of a second rig
 _PLANT_EMCY = 0x080 + PLANT
@@ -197,13 +197,13 @@ class HardLoop(Loop):
     def _push(self, step: CycleInput) -> None:
         k = self.queued
         command, sync = self._faults.find_action("command", k), self._faults.find_action("sync", k)
-        if not self._realtime and isinstance(sync, Delay):
-            sync = None  # a cycle has no fixed length
+        if not self._realtime and sync.code == DELAY:
+            sync = NORMAL  # a cycle has no fixed length
         position = int(self._words[hc.TAIL])
         self._inputs[position % len(self._inputs)] = step
         queue = self._buffers.inputs
         queue[position % len(queue)] = (
-            codec.raw_position(step.demand), step.control, *encode_action(command), *encode_action(sync),
+            codec.raw_position(step.demand), step.control, *command, *sync,
             self._faults.is_bus_off("rig", k), *self._count_repeated_frames(k))
         self._words[hc.TAIL] = position + 1
 
@@ -213,15 +213,15 @@ class HardLoop(Loop):
         Zeros where none is doubled. Lockstep waits for all of them, for feedback of the cycle before would count as
         that of the next one.
         """
-        is_second = isinstance(self._faults.find_action("sync", k), Double)
+        is_second = self._faults.find_action("sync", k).code == DOUBLE
         cycles = (k, k + 1) if is_second else (k,)  # the second answer is under the faults of the cycle to come
         feedback, valve = ([self._faults.find_action(name, each) for each in cycles]
                            for name in ("feedback", "valve_state"))
-        if self._realtime or not (is_second or any(isinstance(each[0], Double) for each in (feedback, valve))):
+        if self._realtime or not (is_second or any(each[0].code == DOUBLE for each in (feedback, valve))):
             return 0, 0
-        copies = {Drop: 0, Delay: 0, Double: 2}
-        answered = sum(copies.get(type(action), 1) for action in feedback if not isinstance(action, Cut))
-        return sum(copies.get(type(action), 1) for action in feedback + valve), answered
+        copies = {DROP: 0, DELAY: 0, DOUBLE: 2}
+        answered = sum(copies.get(action.code, 1) for action in feedback if action.code != CUT)
+        return sum(copies.get(action.code, 1) for action in feedback + valve), answered
 
     def _run_one(self) -> None:
         """Lockstep: one cycle, with the services meanwhile, so that Ctrl-C and EMCYs are not kept waiting."""
@@ -232,7 +232,7 @@ class HardLoop(Loop):
             self._serve_lockstep()
         self._serve_lockstep()
         self._require_bus()
-        is_cut = [isinstance(self._faults.find_action("drive", k), Cut) for k in (self._k - 1, self._k)]
+        is_cut = [self._faults.find_action("drive", k).code == CUT for k in (self._k - 1, self._k)]
         if is_cut == [False, True]:  # the first drive frame that a fault cuts: the plant reports it, beside its cycle
             self._wire.wait(lambda: self._reported or self._wire.is_node_gone(), self._wire.grace_ns * 1e-9)
         self._drain()

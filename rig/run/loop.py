@@ -23,7 +23,7 @@ from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.master import Master
 from rig.recorder import Signals, Timing
-from rig.sequences.faults import Delay, Drop, Schedule, apply_action
+from rig.sequences.faults import DELAY, DROP, Schedule, apply_action
 
 
 class _Answer(NamedTuple):
@@ -186,13 +186,13 @@ class CycleLoop(Loop):
     def _send_sync(self) -> int | None:
         """Send SYNC; returns how late a fault makes it, ns, or None where it is lost."""
         action = self._faults.find_action("sync", self.k)
-        delay = action.ns if isinstance(action, Delay) else 0
+        delay = action.argument if action.code == DELAY else 0
         if delay and self._realtime:
             self._wire.run_until(self._t_ns + delay)
         self._sync = self._wire.clock.now() if self._realtime else self._wall.now()
         for _ in apply_action(action, b""):
             self._master.send(codec.SYNC, b"")
-        return None if isinstance(action, Drop) else delay
+        return None if action.code == DROP else delay
 
     def _wait_for_answers(self, delay: int | None) -> None:
         """Lockstep: let the answers come in; without a SYNC there are none, and a cycle's time passes."""
@@ -203,8 +203,8 @@ class CycleLoop(Loop):
 
     def _command(self, data: bytes) -> None:
         action = self._faults.find_action("command", self.k)
-        if isinstance(action, Delay):
-            heapq.heappush(self._held, (self._t_ns + action.ns, self.k, data))
+        if action.code == DELAY:
+            heapq.heappush(self._held, (self._t_ns + action.argument, self.k, data))
             return
         for what in apply_action(action, data):
             self._master.send(codec.COMMAND, what)

@@ -1,198 +1,167 @@
-"""The kinds of check, and how a run is judged by them.
+"""Checks: a window of a run, a number measured there, limits, and a verdict. And guards, watched in every cycle.
 
-Every kind measures one number (measures.py says how) that is held against `low` and `high`, all three in `unit`.
-What no run could answer (0 Hz, an empty band) is refused when the check is read. On a run a check never raises: what
-cannot be measured has failed, and `detail` says why.
+Every kind of check is a row of `KINDS`: the number that it measures (measures.py says how), its unit, and the class
+that has its keys. The number is held against `low` and `high`, all three in `unit`. What no run could answer (0 Hz, an
+empty band) is refused when the check is read. On a run a check never raises: what cannot be measured has failed, and
+`detail` says why.
 """
 from __future__ import annotations
 
 from cmath import phase
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from math import degrees, inf, nan
-from typing import Annotated, Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import degrees, inf, isfinite, nan
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from plant.errors import InputError
-from plant.segments import RATE, Hertz, Second, require_frequency
+from plant.run import Columns
+from plant.segments import LONGEST, RATE, Array
 from rig.network.codec import Status
 from rig.sequences import measures
-from rig.sequences.check import LATEST_TIME, Check, CheckResult, InUnit, Reference, require_check
-from rig.sequences.measures import (
-    NO_DRIVES,
-    UNIT_OF_SIGNAL,
-    DriveFrames,
-    EventLike,
-    NotMeasurable,
-    RunData,
-    TraceLike,
-    find_scale,
-)
-
-__all__ = ["KINDS", "Check", "CheckResult", "ResponseWithin", "ShutOff", "evaluate_checks"]
+from rig.sequences.faults import Time
+from rig.sequences.measures import MAIN, NO_DRIVES, UNIT_OF_SIGNAL, DriveFrames, NotMeasurable, RunData, find_scale
+from rig.sequences.python_parts import Argument, UserFunction, describe_value, require_function_name
+from rig.sequences.tables import Range
 
 LEFT_OPERATIONAL = "node 2 left OPERATIONAL:"  # words of the event
 Signal = Literal["com", "xj", "error", "speed", "cor", "p12", "xs", "load"]
 InSI = Annotated[float, "SI units"]
-Percent = Annotated[float, "%"]
+InUnit = Annotated[float, "the check's unit"]
+
+
+class CheckResult(NamedTuple):
+    """One line of the table. `value`, `low` and `high` are in `unit`; NaN: not measurable, no such limit."""
+
+    name: str
+    kind: str
+    signal: str
+    value: float
+    unit: str
+    low: float
+    high: float
+    passed: bool
+    t0: float  # s, the window
+    t1: float
+    detail: str
+    requirement: tuple[str, ...] = ()  # ids of the requirements that the check verifies
+    after: float = nan  # s of main, from which a time is measured; NaN: the check measures none
+    above: float = nan  # level that a signal has to pass, SI
+    below: float = nan
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfPosition(Check):
+class Check:
+    """A measured number and its limits. `window`: a section's name, [t0, t1] in s of main, or "main" for all of it."""
+
+    kind: str = field(metadata={"key": False})
+    name: str
+    window: str | tuple[Time, Time] = MAIN
+    skip: Annotated[float, Range("s", low=0.0, high=LONGEST)] = 0.0  # left out at the window's beginning
+    low: InUnit | None = None
+    high: InUnit | None = None
+    unit: str = ""
+    requirement: str | tuple[str, ...] = ()  # id of the requirement that it verifies, or several
+
+    def __post_init__(self) -> None:
+        require_check(self.low is not None or self.high is not None, "", "a low, a high, or both")
+        if self.low is not None and self.high is not None:
+            require_check(self.low <= self.high, "high", f"a number from low = {self.low:g} up, not {self.high:g}")
+        if isinstance(self.window, tuple):
+            require_check(self.window[0] < self.window[1], "window", f"[t0, t1] with t0 < t1, not {[*self.window]}")
+        for word in self.requirements:
+            require_check(bool(word.strip()) and word.isprintable(), "requirement",
+                          f"the id of a requirement, such as REQ-12, not {word!r}")
+        _ = self.scale  # raises InputError for a unit of something else
+
+    @property
+    def about(self) -> str:
+        """The signal, or the event, that is judged."""
+        return str(getattr(self, "signal", None) or getattr(self, "event", ""))
+
+    @property
+    def requirements(self) -> tuple[str, ...]:
+        """The ids of the requirements that the check verifies."""
+        return (self.requirement,) if isinstance(self.requirement, str) else self.requirement
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of the limits; by default that of the kind, or of the signal."""
+        return self.unit or KINDS[self.kind].unit or UNIT_OF_SIGNAL[self.about]
+
+    @property
+    def scale(self) -> float:
+        """How many SI units the unit of the limits is."""
+        return find_scale(self.shown_unit, KINDS[self.kind].unit or UNIT_OF_SIGNAL[self.about])
+
+    def judge(self, run: RunData) -> CheckResult:
+        """Measure the number and compare it with the limits."""
+        value, t0, t1, detail = nan, nan, nan, ""
+        try:
+            span = run.find_rows(self.window, self.skip)
+            t0, t1 = span.start / RATE, span.stop / RATE
+            missing = run.count_missing(self.about, span)
+            measured = KINDS[self.kind].measure(self, run, span) / self.scale
+            if not isfinite(measured):
+                raise NotMeasurable(f"the measure came to {measured:g}")
+            value, detail = measured, f"{missing} missing samples bridged" if missing else ""
+        except NotMeasurable as reason:
+            detail = str(reason)
+        except (ArithmeticError, ValueError) as error:  # one bad check must not cost a run its verdict
+            detail = f"the measure failed ({type(error).__name__}: {error})"
+        low, high = (nan if limit is None else limit for limit in (self.low, self.high))
+        passed = not (value != value or value < low or value > high)  # NaN limits compare false
+        return CheckResult(self.name, self.kind, self.about, value, self.shown_unit, low, high, passed, t0, t1, detail,
+                           self.requirements, *self._find_reference(run))
+
+    def _find_reference(self, run: RunData) -> tuple[float, float, float]:
+        """What a reaction is measured against: the time from which it counts, s of main, and levels; NaN for none."""
+        after = len(run.trace.t) / RATE if self.kind == "recovers" else getattr(self, "after", nan)
+        after = after if isinstance(after, float) else run.starts.get(after, nan)
+        above, below = (getattr(self, key, None) for key in ("above", "below"))
+        return after, nan if above is None else above, nan if below is None else below
+
+
+def require_check(holds: bool, key: str, expected: str) -> None:
+    """Raise InputError unless `holds`; the caller adds file and line."""
+    if not holds:
+        raise InputError("check", key, expected)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfPosition(Check):
     """A number of the position against the demand."""
 
-    si = "m"
     signal: Literal["xj"] = "xj"
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfSignal(Check):
-    si = ""
+class Settling(OfPosition):
+    """With the band around the target of a step."""
+
+    band: Annotated[float, Range("%", above=0.0, high=100.0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtFrequency(OfPosition):
+    """At one frequency."""
+
+    frequency: Annotated[float, Range("Hz", above=0.0, below=RATE / 2)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfSignal(Check):
+    """A number of any signal."""
+
     signal: Signal
 
 
 @dataclass(frozen=True, kw_only=True)
-class Overshoot(_OfPosition):
-    """How far a step goes beyond its target, % of the step."""
+class Response(Check):
+    """With the instant from which time counts (a fault's name or s of main), and an event or a level of a signal."""
 
-    kind, si = "overshoot", "%"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_overshoot(*run.read_step(span))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SettlingTime(_OfPosition):
-    """Time until a step stays within +-`band` of its target, s."""
-
-    kind, si = "settling_time", "s"
-    band: Percent
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_check(0 < self.band <= 100, "band", f"above 0 and at most 100 % of the step, not {self.band:g}")
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_settling_time(*run.read_step(span), self.band)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RiseTime(_OfPosition):
-    """Time from 10 % to 90 % of a step, s."""
-
-    kind, si = "rise_time", "s"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_rise_time(*run.read_step(span))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SteadyError(_OfPosition):
-    """Size of the mean position error, m."""
-
-    kind = "steady_error"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return abs(float(run.read_signal("error", span).mean()))
-
-
-@dataclass(frozen=True, kw_only=True)
-class RampError(_OfPosition):
-    """Mean lag behind a ramp, m."""
-
-    kind = "ramp_error"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_ramp_error(run.read_signal("error", span), run.read_signal("com", span))
-
-
-@dataclass(frozen=True, kw_only=True)
-class BreakAway(_OfPosition):
-    """Position error before the spool lets go on a slow ramp, m."""
-
-    kind = "break_away"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return measures.measure_break_away(run.read_signal("error", span))
-
-
-@dataclass(frozen=True, kw_only=True)
-class MaxError(_OfPosition):
-    """Largest position error in either direction, m."""
-
-    kind = "max_error"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return float(np.abs(measures.filter_median(run.read_signal("error", span))).max())
-
-
-@dataclass(frozen=True, kw_only=True)
-class RmsError(_OfPosition):
-    """Root mean square of the position error, m."""
-
-    kind = "rms_error"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return float(np.sqrt(np.mean(run.read_signal("error", span) ** 2)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeverExceeds(_OfSignal):
-    """Largest size of a signal, every sample counting."""
-
-    kind = "never_exceeds"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return float(np.abs(run.read_signal(self.signal, span)).max())
-
-
-@dataclass(frozen=True, kw_only=True)
-class AmplitudeRatio(_OfPosition):
-    """Amplitude of the position over that of the demand at one frequency."""
-
-    kind, si = "amplitude_ratio", "1"
-    frequency: Hertz
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_frequency("frequency", self.frequency)
-
-    def measure(self, run: RunData, span: slice) -> float:
-        return abs(measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), self.frequency))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhaseLag(AmplitudeRatio):
-    """By how much the position is behind the demand at one frequency, deg."""
-
-    kind, si = "phase_lag", "deg"
-
-    def measure(self, run: RunData, span: slice) -> float:
-        response = measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), self.frequency)
-        return -degrees(phase(response))
-
-
-def _require_time(after: str | float) -> None:
-    if isinstance(after, float):
-        require_check(0 <= after <= LATEST_TIME, "after",
-                      f"0 to {LATEST_TIME:g} s of main, or a fault's name, not {after:g}")
-
-
-def _find_start(run: RunData, after: str | float) -> float:
-    """When a reaction is due to begin, s of main; NaN without the fault that it names."""
-    try:
-        return run.find_start(after)
-    except NotMeasurable:
-        return nan
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResponseWithin(Check):
-    """Time from `after` (a fault's name or s of main) to an event, or to a signal passing a level for 3 samples, s."""
-
-    kind, si = "response_within", "s"
-    after: str | Second
+    after: str | Time
     event: str = ""
     signal: Signal | None = None
     above: InSI | None = None
@@ -204,84 +173,20 @@ class ResponseWithin(Check):
         levelled = self.above is not None or self.below is not None
         require_check(levelled == (self.signal is not None), "signal",
                       "a signal with a level above or below which it counts")
-        _require_time(self.after)
-
-    def find_reference(self, run: RunData) -> Reference:
-        above, below = (nan if level is None else level for level in (self.above, self.below))
-        return Reference(_find_start(run, self.after), above, below)
-
-    def measure(self, run: RunData, span: slice) -> float:
-        after = run.find_start(self.after)
-        if self.signal:
-            rest = run.find_rows((after, span.stop / RATE))
-            return measures.find_crossing(run.read_signal(self.signal, rest), self.above, self.below)
-        events = run.find_events(self.event, after)
-        if not events:
-            raise NotMeasurable(f"no event {self.event!r} after {after:g} s")
-        return events[0].t - after
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShutOff(Check):
-    """Time from `after` to the drive frame from which on the controller says zero current and no closed loop, s.
+    """With the instant from which time counts. `status`: four lower bits of the status word; default: without MODE."""
 
-    Any drive frame counts, also one of another cycle. A controller that leaves OPERATIONAL sends none any more, which
-    counts as well. `status`: the four lower bits of the status word that it must say then; by default any without MODE.
-    """
-
-    kind, si = "shut_off", "s"
-    after: str | Second
-    status: int | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_time(self.after)
-        require_check(self.status is None or 0 <= self.status <= 0xF, "status",
-                      f"the four lower bits of a status word, 0 to 15, not {self.status}")
-
-    def find_reference(self, run: RunData) -> Reference:
-        return Reference(_find_start(run, self.after))
-
-    def measure(self, run: RunData, span: slice) -> float:
-        after = run.find_start(self.after)
-        drives = run.drives.select_between(after, span.stop / RATE)
-        is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
-        if self.status is not None:
-            is_off &= drives.status & 0xF == self.status
-        on = np.flatnonzero(~is_off)
-        off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
-        left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / RATE)
-                if not len(on) or event.t >= drives.t[on[-1]]]
-        times = [*off[:1].tolist(), *left[:1]]
-        if not times:
-            raise NotMeasurable("the controller did not say zero current, nor did it leave OPERATIONAL")
-        return float(min(times)) - after
+    after: str | Time
+    status: Annotated[int, Range("1", low=0, high=0xF)] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recovers(Check):
-    """Time from the start of clean-up until the status word says ACTIVE, and does so to the end, s."""
+class OfEvent(Check):
+    """With the words of an event: at least once unless limits say otherwise."""
 
-    kind, si = "recovers", "s"
-
-    def find_reference(self, run: RunData) -> Reference:
-        return Reference(len(run.trace.t) / RATE)
-
-    def measure(self, run: RunData, span: slice) -> float:
-        start = len(run.trace.t) / RATE
-        drives = run.drives.select_between(start, np.inf)
-        idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
-        first = int(idle[-1]) + 1 if len(idle) else 0
-        if first >= len(drives.t):
-            raise NotMeasurable("the controller was not ACTIVE at the end of clean-up")
-        return float(drives.t[first]) - start
-
-
-@dataclass(frozen=True, kw_only=True)
-class EventOccurs(Check):
-    """How often an event happens: at least once unless limits say otherwise."""
-
-    kind, si = "event_occurs", "1"
     event: str
     low: InUnit | None = 1.0
 
@@ -289,34 +194,159 @@ class EventOccurs(Check):
         super().__post_init__()
         require_check(bool(self.event.split()), "event", "at least one word")
 
-    def measure(self, run: RunData, span: slice) -> float:
-        return float(len(run.find_events(self.event, span.start / RATE, span.stop / RATE)))
-
 
 @dataclass(frozen=True, kw_only=True)
-class EventNever(EventOccurs):
-    """How often an event happens that should not."""
+class NoEvent(OfEvent):
+    """With the words of an event that should not happen."""
 
-    kind = "event_never"
     low: InUnit | None = None
     high: InUnit | None = 0.0
 
 
-KINDS: dict[str, type[Check]] = {kind.kind: kind for kind in (
-    Overshoot, SettlingTime, RiseTime, SteadyError, RampError, BreakAway, MaxError, RmsError, NeverExceeds,
-    AmplitudeRatio, PhaseLag, ResponseWithin, ShutOff, Recovers, EventOccurs, EventNever)}
+@dataclass(frozen=True, kw_only=True)
+class PythonCheck(Check):
+    """With the function that measures the number."""
+
+    python: str
+    arguments: Mapping[str, Argument] = field(default_factory=dict)
+    function: UserFunction | None = field(default=None, repr=False, compare=False, metadata={"key": False})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_function_name(self.python)
+        require_check(self.unit.isprintable() and len(self.unit) <= 20, "unit", "a unit of at most 20 characters")
+
+    @property
+    def scale(self) -> float:
+        return 1.0
 
 
-def evaluate_checks(checks: Iterable[Check], trace: TraceLike, sections: Mapping[str, slice],
-             events: Sequence[EventLike] = (), starts: Mapping[str, float] | None = None,
-             drives: DriveFrames = NO_DRIVES) -> list[CheckResult]:
+class Window(Columns):
+    """What a user's check gets: the cycles of its window as columns, SI units, NaN where a sample is missing."""
+
+    @property
+    def error(self) -> Array:
+        """Demand minus position, m."""
+        return self.com - self.xj
+
+
+def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:
+    assert check.function is not None
+    columns = [np.array(getattr(run.trace, name)[span], dtype=np.float64) for name in Window._fields[1:]]
+    value = check.function.call(Window(np.arange(span.start, span.stop) / RATE, *columns), **check.arguments)
+    if value is None:
+        raise NotMeasurable(f"{check.python} returned no value")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise NotMeasurable(f"{check.python} returned {describe_value(value)}, not a number") from None
+    if not isfinite(number):
+        raise NotMeasurable(f"{check.python} returned {number:g}")
+    return number
+
+
+def _measure_response(check: Response, run: RunData, span: slice) -> float:
+    after = run.find_start(check.after)
+    if check.signal:
+        rest = run.find_rows((after, span.stop / RATE))
+        return measures.find_crossing(run.read_signal(check.signal, rest), check.above, check.below)
+    events = run.find_events(check.event, after)
+    if not events:
+        raise NotMeasurable(f"no event {check.event!r} after {after:g} s")
+    return float(events[0].t) - after
+
+
+def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
+    """Any drive frame counts, also one of another cycle. A controller that leaves OPERATIONAL sends none any more."""
+    after = run.find_start(check.after)
+    drives = run.drives.select_between(after, span.stop / RATE)
+    is_off = (drives.current == 0.0) & (drives.status & int(Status.MODE) == 0)
+    if check.status is not None:
+        is_off &= drives.status & 0xF == check.status
+    on = np.flatnonzero(~is_off)
+    off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
+    left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / RATE)
+            if not len(on) or event.t >= drives.t[on[-1]]]
+    times = [*off[:1].tolist(), *left[:1]]
+    if not times:
+        raise NotMeasurable("the controller did not say zero current, nor did it leave OPERATIONAL")
+    return float(min(times)) - after
+
+
+def _measure_recovery(check: Check, run: RunData, span: slice) -> float:
+    start = len(run.trace.t) / RATE
+    drives = run.drives.select_between(start, np.inf)
+    idle = np.flatnonzero(drives.status & int(Status.ACTIVE) != int(Status.ACTIVE))
+    first = int(idle[-1]) + 1 if len(idle) else 0
+    if first >= len(drives.t):
+        raise NotMeasurable("the controller was not ACTIVE at the end of clean-up")
+    return float(drives.t[first]) - start
+
+
+def _read_response(check: AtFrequency, run: RunData, span: slice) -> complex:
+    return measures.measure_response(run.read_signal("xj", span), run.read_signal("com", span), check.frequency)
+
+
+def _count_events(check: OfEvent, run: RunData, span: slice) -> float:
+    return float(len(run.find_events(check.event, span.start / RATE, span.stop / RATE)))
+
+
+class Kind(NamedTuple):
+    """A kind of check."""
+
+    text: str  # what it measures
+    unit: str  # SI; "" for that of the check's signal
+    measure: Callable[[Any, RunData, slice], float]  # in the rows of a window, SI; raises NotMeasurable with the reason
+    keys: type[Check] = OfPosition
+
+
+KINDS: dict[str, Kind] = {
+    "overshoot": Kind("How far a step goes beyond its target, % of the step.", "%",
+                      lambda check, run, span: measures.measure_overshoot(*run.read_step(span))),
+    "settling_time": Kind("Time until a step stays within +-`band` of its target, s.", "s", lambda check, run, span:
+                          measures.measure_settling_time(*run.read_step(span), check.band), Settling),
+    "rise_time": Kind("Time from 10 % to 90 % of a step, s.", "s",
+                      lambda check, run, span: measures.measure_rise_time(*run.read_step(span))),
+    "steady_error": Kind("Size of the mean position error, m.", "m",
+                         lambda check, run, span: abs(float(run.read_signal("error", span).mean()))),
+    "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measures.measure_ramp_error(
+        run.read_signal("error", span), run.read_signal("com", span))),
+    "break_away": Kind("Position error before the spool lets go on a slow ramp, m.", "m",
+                       lambda check, run, span: measures.measure_break_away(run.read_signal("error", span))),
+    "max_error": Kind("Largest position error in either direction, m.", "m", lambda check, run, span: float(
+        np.abs(measures.filter_median(run.read_signal("error", span))).max())),
+    "rms_error": Kind("Root mean square of the position error, m.", "m",
+                      lambda check, run, span: float(np.sqrt(np.mean(run.read_signal("error", span) ** 2)))),
+    "never_exceeds": Kind("Largest size of a signal, every sample counting.", "", lambda check, run, span: float(
+        np.abs(run.read_signal(check.signal, span)).max()), OfSignal),
+    "amplitude_ratio": Kind("Amplitude of the position over that of the demand at one frequency.", "1",
+                            lambda *given: abs(_read_response(*given)), AtFrequency),
+    "phase_lag": Kind("By how much the position is behind the demand at one frequency, deg.", "deg",
+                      lambda *given: -degrees(phase(_read_response(*given))), AtFrequency),
+    "response_within": Kind("Time from `after` (a fault's name or s of main) to an event, or to a signal passing a "
+                            "level for 3 samples, s.", "s", _measure_response, Response),
+    "shut_off": Kind("Time from `after` to the drive frame from which on the controller says zero current and no "
+                     "closed loop, s.", "s", _measure_shut_off, ShutOff),
+    "recovers": Kind("Time from the start of clean-up until the status word says ACTIVE, and does so to the end, s.",
+                     "s", _measure_recovery, Check),
+    "event_occurs": Kind("How often an event happens: at least once unless limits say otherwise.", "1", _count_events,
+                         OfEvent),
+    "event_never": Kind("How often an event happens that should not.", "1", _count_events, NoEvent),
+    "python": Kind("A number that a function of yours measures: f(window, **arguments), in the check's unit, which may "
+                   "be any text.", "1", _measure_python, PythonCheck),
+}
+KEYS: dict[str, type[Check]] = {name: kind.keys for name, kind in KINDS.items()}
+
+
+def evaluate_checks(checks: Iterable[Check], trace: Columns, sections: Mapping[str, slice], events: Sequence[Any] = (),
+                    starts: Mapping[str, float] | None = None, drives: DriveFrames = NO_DRIVES) -> list[CheckResult]:
     """Judge a run.
 
     Args:
         checks: what to judge, in the order of the table.
         trace: the main phase.
         sections: rows of each section of the command.
-        events: what happened, times in s of main.
+        events: what happened; each has `t` (s of main), `kind` and `text`.
         starts: when each fault began, s of main, by its label.
         drives: all drive frames, for the checks of a reaction.
     """
@@ -333,14 +363,12 @@ class Guard:
     low: float | None = None
     high: float | None = None
     unit: str = ""
-    cycles: int = 3  # one noisy sample is no excursion
+    cycles: Annotated[int, Range("1", low=1)] = 3  # one noisy sample is no excursion
 
     def __post_init__(self) -> None:
         low, high = self.compute_limits()
         if low >= high or (low, high) == (-inf, inf):
             raise InputError("guard", "", "a low, a high, or both with low below high")
-        if self.cycles < 1:
-            raise InputError("guard", "cycles", f"1 or more cycles, not {self.cycles}")
 
     def compute_limits(self) -> tuple[float, float]:
         """Low and high in SI; infinite where there is none."""
@@ -366,10 +394,9 @@ class GuardWatch:
         """
         passed = None
         for i, (guard, low, high) in enumerate(self._watched):
-            value = values.get(guard.signal)
-            if value is None or value != value:
-                continue
-            self._outside[i] = 0 if low <= value <= high else self._outside[i] + 1
-            if passed is None and self._outside[i] >= guard.cycles:
-                passed = guard
+            value = values.get(guard.signal, nan)
+            if value == value:
+                self._outside[i] = 0 if low <= value <= high else self._outside[i] + 1
+                if passed is None and self._outside[i] >= guard.cycles:
+                    passed = guard
         return passed

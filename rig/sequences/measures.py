@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from math import inf
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.errors import InputError
+from plant.run import Columns
 from plant.segments import RATE, Array
 from rig.sequences import tables
 
@@ -134,11 +136,7 @@ def measure_response(signal: Array, com: Array, frequency: float) -> complex:
 
 def find_crossing(signal: Array, above: float | None, below: float | None) -> float:
     """Time of the first of three samples in a row above or below a level, s from the signal's start."""
-    beyond = np.zeros(len(signal), bool)
-    if above is not None:
-        beyond |= signal > above
-    if below is not None:
-        beyond |= signal < below
+    beyond = (signal > (inf if above is None else above)) | (signal < (-inf if below is None else below))
     in_a_row = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
     if not len(in_a_row):
         raise NotMeasurable("the level was never passed")
@@ -159,35 +157,13 @@ UNIT_OF_SIGNAL = {"com": "m", "xj": "m", "error": "m", "speed": "m/s", "cor": "A
 
 def find_scale(unit: str, si: str) -> float:
     """How many of the SI unit `si` one `unit` is; InputError at the key `unit` if it measures something else."""
-    fitting = [name for name, (base, _) in SI_OF_UNIT.items() if base == si]
+    fitting = {name: scale for name, (base, scale) in SI_OF_UNIT.items() if base == si}
     if unit not in fitting:
         raise InputError("unit", "unit", tables.list_choices(unit, fitting))
-    return SI_OF_UNIT[unit][1]
+    return fitting[unit]
 
 
 MAIN = "main"  # the window that is all of the main phase
-
-
-class TraceLike(Protocol):
-    """The columns of a run, each (n,) and SI; row k is cycle k of main. Also cor, p12, xs, load. NaN, None: absent."""
-
-    @property
-    def t(self) -> Array: ...
-    @property
-    def com(self) -> Array: ...
-    @property
-    def xj(self) -> Array: ...
-
-
-class EventLike(Protocol):
-    """An event at `t` seconds of the main phase."""
-
-    @property
-    def t(self) -> float: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def text(self) -> str: ...
 
 
 class DriveFrames(NamedTuple):
@@ -210,34 +186,24 @@ NO_DRIVES = DriveFrames(np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
 class RunData:
     """The data of a run that checks use: trace, sections, events, and when each fault started (s of main, by label)."""
 
-    trace: TraceLike
+    trace: Columns
     sections: Mapping[str, slice] = field(default_factory=dict)
-    events: Sequence[EventLike] = ()
+    events: Sequence[Any] = ()  # each has `t` (s of main), `kind` and `text`
     starts: Mapping[str, float] = field(default_factory=dict)
     drives: DriveFrames = NO_DRIVES
 
     def find_start(self, after: str | float) -> float:
-        """A time, s of main, given as such or as the label of the fault that begins then.
-
-        Raises:
-            NotMeasurable: there is no such fault.
-        """
-        t = after if isinstance(after, float) else self.starts.get(after)
-        if t is None:
-            raise NotMeasurable(f"there was no fault {after!r}")
-        return t
+        """A time, s of main, given as such or as the label of the fault that begins then."""
+        return after if isinstance(after, float) else self.starts[after]
 
     def find_rows(self, window: str | tuple[float, float], skip: float = 0.0) -> slice:
         """Rows of a window without its first `skip` seconds; NotMeasurable if the run ended before the window did."""
         rows = len(self.trace.t)
         if isinstance(window, tuple):
             first, last = round(window[0] * RATE), round(window[1] * RATE)
-        elif window == MAIN:
-            first, last = 0, rows
-        elif window in self.sections:
-            first, last = self.sections[window].start, self.sections[window].stop
         else:
-            raise NotMeasurable(f"there is no section {window!r}")
+            section = slice(0, rows) if window == MAIN else self.sections[window]
+            first, last = section.start, section.stop
         if last > rows:
             raise NotMeasurable(f"the run ended at {rows / RATE:g} s, the window at {last / RATE:g} s")
         first += round(skip * RATE)
@@ -251,15 +217,12 @@ class RunData:
             return self.read_signal("com", span) - self.read_signal("xj", span)
         if name == "speed":
             return compute_speed(self.read_signal("xj", span))
-        column = getattr(self.trace, name, None)
-        if column is None:
-            raise NotMeasurable(f"{name} was not measured")
-        return bridge_gaps(np.asarray(column, float)[span], name, largest_missing_share)
+        return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
-        column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), None)
-        return 0 if column is None else int(np.isnan(np.asarray(column, float)[span]).sum())
+        column = getattr(self.trace, {"error": "xj", "speed": "xj"}.get(name, name), np.zeros(0))  # or of an event
+        return int(np.isnan(np.asarray(column, float)[span]).sum())
 
     def read_step(self, span: slice) -> tuple[Array, Array, float]:
         """Position and demand in a span, and the demand before it (at the very start: where the ram is)."""
@@ -267,7 +230,7 @@ class RunData:
         before = float(self.trace.com[span.start - 1] if span.start else position[0])
         return position, self.read_signal("com", span), before
 
-    def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[EventLike]:
+    def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[Any]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
         words = set(event.lower().split())
         found = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))

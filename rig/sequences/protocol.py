@@ -5,7 +5,7 @@ bus, no clock. docs/sequences.md lists the checks and their default limits.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import Annotated, NamedTuple
@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant.controller import Loop, compute_current
-from plant.errors import InputError
 from plant.segments import RATE, Array, Second
 from rig.device.emcy import EmcyCode
 from rig.network.codec import Control, Flags, Status
-from rig.sequences.check import CheckResult
+from rig.sequences.checks import CheckResult
+from rig.sequences.tables import Range
 
 Mask = NDArray[np.bool_]
 Whole = NDArray[np.int64]
 KIND = "protocol"  # of the check results
+NO_FRAME = "no drive frame came"
 HEARTBEAT = "heartbeat"  # the signal of those about heartbeats
 CONTROLLER = 2
 DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lists them
@@ -33,6 +34,7 @@ DOCUMENTED_EMCY: Mapping[int, frozenset[int]] = {  # by node, as docs/bus.md lis
 }
 _LEVELS, _READY = int(Control.ACTIVE), int(Status.READY)
 LONGEST_STEP_DELAY = 0.1  # s: the probe's step lasts as long
+UpToOneSecond = Annotated[float, Range("s", above=0.0, high=1.0)]
 _BEFORE_EMCY = 20  # cycles: a fault may show in the status word before its EMCY has been read
 
 
@@ -48,31 +50,16 @@ class ProtocolLimits:
     probes.
     """
 
-    status: Second = 2e-3
-    missing: Annotated[float | None, "share of the cycles"] = None
-    response_p50: Second = 0.5e-3
-    response_p99: Second = 0.9e-3
-    response_max: Second = 1e-3
-    heartbeat: Second = 0.01
-    gain: Annotated[float, "share"] = 0.1
-    step_delay: Second = 0.0
-    emcy: tuple[int, ...] = ()
+    status: UpToOneSecond = 2e-3
+    missing: Annotated[float, Range("1", low=0.0, high=1.0)] | None = None
+    response_p50: UpToOneSecond = 0.5e-3
+    response_p99: UpToOneSecond = 0.9e-3
+    response_max: UpToOneSecond = 1e-3
+    heartbeat: UpToOneSecond = 0.01
+    gain: Annotated[float, Range("1", above=0.0, below=1.0)] = 0.1
+    step_delay: Annotated[float, Range("s", low=0.0, high=LONGEST_STEP_DELAY)] = 0.0
+    emcy: tuple[Annotated[int, Range("1", low=1, high=0xFFFF)], ...] = ()
     probe: bool = True
-
-    def __post_init__(self) -> None:
-        for key in ("status", "response_p50", "response_p99", "response_max", "heartbeat"):
-            value = getattr(self, key)
-            _require(0 < value <= 1, key, f"above 0 and at most 1 s, not {value:g}")
-        _require(self.missing is None or 0 <= self.missing <= 1, "missing", "a share of the cycles from 0 to 1")
-        _require(0 <= self.step_delay <= LONGEST_STEP_DELAY, "step_delay",
-                 f"0 s or more, at most {LONGEST_STEP_DELAY:g}, not {self.step_delay:g}")
-        _require(0 < self.gain < 1, "gain", f"a share above 0 and below 1, not {self.gain:g}")
-        _require(all(0 < code <= 0xFFFF for code in self.emcy), "emcy", "EMCY codes from 1 to 0xFFFF")
-
-
-def _require(holds: bool, key: str, expected: str) -> None:
-    if not holds:
-        raise InputError("protocol", key, expected)
 
 
 class Rows(NamedTuple):
@@ -139,15 +126,9 @@ class ProtocolRecord:
 
 def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> list[CheckResult]:
     """The protocol checks of a run, in the order of the table."""
-    results = [_judge_idle_current(record, limits), _judge_largest_current(record), _judge_status(record, limits),
-               *_judge_drive_frames(record, limits), _judge_frozen(record)]
-    if len(record.probes) > 0:
-        results += _judge_probes(record, limits)
-    if record.is_response_judged:
-        results += _judge_response(record, limits)
-    results += _judge_heartbeats(record, limits)
-    results.append(_judge_emergencies(record, limits))
-    return results
+    return [check for judge in (_judge_current, _judge_status, _judge_drive_frames, _judge_frozen, _judge_probes,
+                                _judge_response, _judge_heartbeats, _judge_emergencies)
+            for check in judge(record, limits)]
 
 
 def _make_result(name: str, signal: str, value: float, unit: str, low: float = nan, high: float = nan,
@@ -157,44 +138,40 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
     return CheckResult(name, KIND, signal, value, unit, low, high, passed, nan, nan, detail)
 
 
-def _judge_idle_current(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
-    """Largest current in cycles whose control word, and those of the grace time before it, are not ACTIVE."""
+def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
+    """Largest current in cycles whose control word, and those of the grace time before it, are not ACTIVE; and in all.
+    """
     grace = round(limits.status * RATE)
-    values = [np.abs(rows.cor[find_idle(rows.control, grace)]) for rows in record.stretches]
-    largest, detail = _find_largest(np.concatenate(values))
-    return _make_result("no current unless ACTIVE", "current", largest * 1e3, "mA", high=0.0, detail=detail)
+    idle = _drop_missing([rows.cor[find_idle(rows.control, grace)] for rows in record.stretches])
+    current = _drop_missing([rows.cor for rows in record.stretches])
+    for name, values, limit, detail in (
+            ("no current unless ACTIVE", idle, 0.0, f"{len(idle)} cycles"),
+            ("current within its limit", current, record.current_limit, "")):
+        largest, detail = (float(np.abs(values).max()), detail) if len(values) else (nan, NO_FRAME)
+        yield _make_result(name, "current", largest * 1e3, "mA", high=limit * 1e3, detail=detail)
+
+
+def _drop_missing(parts: Sequence[Array]) -> Array:
+    values = np.concatenate(parts)
+    return values[~np.isnan(values)]
 
 
 def find_idle(control: Array, grace: int) -> Mask:
     """Cycles whose control word is not ACTIVE and was not in the `grace` cycles before; none is before the first."""
     active = control.astype(int) & _LEVELS == _LEVELS
-    recent = active.copy()
-    for back in range(1, min(grace, len(active) - 1) + 1):
-        recent[back:] |= active[:-back]
-    idle: Mask = ~recent
+    count, k = np.concatenate(([0], np.cumsum(active))), np.arange(len(active))
+    idle: Mask = count[k + 1] == count[np.maximum(k - grace, 0)]
     return idle
 
 
-def _find_largest(values: Array) -> tuple[float, str]:
-    known = values[~np.isnan(values)]
-    return (float(known.max()), f"{len(known)} cycles") if len(known) else (nan, "no drive frame came")
-
-
-def _judge_largest_current(record: ProtocolRecord) -> CheckResult:
-    largest, detail = _find_largest(np.concatenate([np.abs(rows.cor) for rows in record.stretches]))
-    limit = record.current_limit * 1e3
-    detail = "" if isfinite(largest) else detail
-    return _make_result("current within its limit", "current", largest * 1e3, "mA", high=limit, detail=detail)
-
-
-def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
+def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
     """How old the control word is that the status word confirms, at worst."""
     faulty = _find_faulty(record)
-    ages = [measure_status_ages(rows, faulty if rows is record.run else None) for rows in record.stretches]
-    oldest = max((int(age.max()) for age in ages if len(age)), default=-1)
-    value = nan if oldest < 0 else oldest * 1e3 / RATE
-    return _make_result("status word follows the control word", "status word", value, "ms", high=limits.status * 1e3,
-                        detail="no drive frame came" if oldest < 0 else "")
+    ages = np.concatenate([measure_status_ages(rows, faulty if rows is record.run else None)
+                           for rows in record.stretches])
+    value, detail = (int(ages.max()) * 1e3 / RATE, "") if len(ages) else (nan, NO_FRAME)
+    yield _make_result("status word follows the control word", "status word", value, "ms", high=limits.status * 1e3,
+                       detail=detail)
 
 
 def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
@@ -260,11 +237,11 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
 
 
-def _judge_frozen(record: ProtocolRecord) -> CheckResult:
+def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
     """How far the position error moved while the current of the closed loop stood still."""
     change = measure_frozen(record.run, record.current_limit if record.gains is not None else None)
-    largest = 100e-6  # m: fifty times the noise of the position sensor
-    return _make_result("current follows the error", "current", change * 1e6, "um", high=largest * 1e6)
+    largest = 100.0  # um: fifty times the noise of the position sensor
+    yield _make_result("current follows the error", "current", change * 1e6, "um", high=largest)
 
 
 def measure_frozen(rows: Rows, limit: float | None) -> float:
@@ -285,6 +262,8 @@ def measure_frozen(rows: Rows, limit: float | None) -> float:
 
 def _judge_probes(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
     """Answer to the demand step of the probe, and whether a reset makes the controller forget."""
+    if not record.probes:
+        return
     first = record.probes[0]
     delay, detail = measure_step_delay(first)
     yield _make_result("delay of the answer to a step", "current", delay, "ms", high=limits.step_delay * 1e3,
@@ -350,14 +329,12 @@ def measure_difference(probes: Sequence[Rows]) -> tuple[float, str]:
 
 def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
     """From SYNC to the drive frame, in cycles that the bench delivered on time."""
-    values = np.concatenate([rows.response[rows.on_time] for rows in record.stretches])
-    known = values[~np.isnan(values)] * 1e6
-    measures: dict[str, tuple[Callable[[Array], float], float]] = {
-        "p50": (lambda x: float(np.percentile(x, 50)), limits.response_p50),
-        "p99": (lambda x: float(np.percentile(x, 99)), limits.response_p99),
-        "max": (lambda x: float(x.max()), limits.response_max)}
-    for name, (measure, limit) in measures.items():
-        value, detail = (measure(known), f"{len(known)} cycles") if len(known) else (nan, "no drive frame came")
+    if not record.is_response_judged:
+        return
+    known = _drop_missing([rows.response[rows.on_time] for rows in record.stretches]) * 1e6
+    for name, share, limit in (("p50", 50, limits.response_p50), ("p99", 99, limits.response_p99),
+                               ("max", 100, limits.response_max)):
+        value, detail = (float(np.percentile(known, share)), f"{len(known)} cycles") if len(known) else (nan, NO_FRAME)
         yield _make_result(f"response time, {name}", "drive", value, "us", high=limit * 1e6, detail=detail)
 
 
@@ -384,10 +361,10 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
         yield _make_result(f"heartbeat period, {node}", HEARTBEAT, round(value, 6), "ms", low, high, detail)
 
 
-def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> CheckResult:
+def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult]:
     """How many EMCY frames carry a code that is not documented for their node."""
     allowed = {node: codes | (frozenset(limits.emcy) if node == CONTROLLER else frozenset())
                for node, codes in DOCUMENTED_EMCY.items()}
     strange = [e for e in record.emergencies if e.code not in allowed.get(e.node, frozenset())]
     said = ", ".join(dict.fromkeys(f"node {e.node} 0x{e.code:04X}" for e in strange[:5]))
-    return _make_result("undocumented EMCY codes", "EMCY", float(len(strange)), "1", high=0.0, detail=said)
+    yield _make_result("undocumented EMCY codes", "EMCY", float(len(strange)), "1", high=0.0, detail=said)

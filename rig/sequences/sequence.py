@@ -10,50 +10,43 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from types import ModuleType
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from plant import segments
 from plant.errors import InputError
 from plant.model import Model, find_quantity
+from plant.parameters import parse_value
 from plant.profile import Profile, build_profile, list_section_names, parse_columns
+from plant.quantity import Quantity
 from plant.segments import FARTHEST, RATE, STRONGEST, Array, Csv, Segment
 from rig.sequences import checks, faults, tables
-from rig.sequences.checks import Check, Guard, ResponseWithin, ShutOff
-from rig.sequences.faults import Fault, Known, Parameter, Plan, check_faults, check_overrides, check_together
+from rig.sequences.checks import Check, Guard, PythonCheck
+from rig.sequences.faults import Fault, Parameter, Plan, find_contradiction
 from rig.sequences.measures import MAIN
 from rig.sequences.protocol import ProtocolLimits
-from rig.sequences.python_parts import (
-    VALUES_OF_PART,
-    PythonCheck,
-    PythonPart,
-    PythonSegment,
-    Step,
-    UserModules,
-    require_function_name,
-)
-from rig.sequences.tables import Place
+from rig.sequences.python_parts import PythonSegment, Step, load_function, require_function_name, run_file
+from rig.sequences.tables import Place, Range
 from rig.sequences.timing import TimingPolicy
+
+PHASES = ("setup", "main", "cleanup", "load")
+Unsigned32 = Annotated[int, Range("1", low=0, high=0xFFFFFFFF)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RequiredFirmware:
     """What the controller must say about itself; a key that is left out is not compared."""
 
-    device_type: int | None = None  # 0x1000
+    device_type: Unsigned32 | None = None  # 0x1000
     name: str | None = None  # 0x1008
     hardware: str | None = None  # 0x1009
     software: str | None = None  # 0x100A
-    vendor: int | None = None  # 0x1018 sub 1
-    product: int | None = None  # 0x1018 sub 2
-    revision: int | None = None  # 0x1018 sub 3
-    serial: int | None = None  # 0x1018 sub 4
-
-    def __post_init__(self) -> None:
-        for key, value in asdict(self).items():
-            if isinstance(value, int) and not 0 <= value <= 0xFFFFFFFF:
-                raise InputError("firmware", key, f"a number from 0 to 0xFFFFFFFF, not {value}")
+    vendor: Unsigned32 | None = None  # 0x1018 sub 1
+    product: Unsigned32 | None = None  # 0x1018 sub 2
+    revision: Unsigned32 | None = None  # 0x1018 sub 3
+    serial: Unsigned32 | None = None  # 0x1018 sub 4
 
     def find_difference(self, identity: Mapping[str, object]) -> tuple[str, str]:
         """The first key in which a controller's identity differs and how, in words; two empty texts if none does."""
@@ -73,8 +66,7 @@ def _format(value: object) -> str:
 ReadFile = Callable[[str], bytes]
 
 SEGMENT_KINDS: dict[str, type[Segment]] = {**segments.KINDS, PythonSegment.kind: PythonSegment}
-CHECK_KINDS: dict[str, type[Check]] = {**checks.KINDS, PythonCheck.kind: PythonCheck}
-_KINDS: tables.Kinds = {Segment: SEGMENT_KINDS, Fault: faults.KINDS, Check: CHECK_KINDS}
+_KINDS: tables.Kinds = {Segment: SEGMENT_KINDS, Fault: faults.KINDS, Check: checks.KEYS}
 _OWN = {"key": False}  # a field that the program fills in
 
 
@@ -165,7 +157,7 @@ class Sequence:
         return {self.name: self.source.encode(), **self.files}
 
     @classmethod
-    def from_bundle(cls, bundle: Mapping[str, bytes], known: Known = find_quantity) -> Sequence:
+    def from_bundle(cls, bundle: Mapping[str, bytes]) -> Sequence:
         """The sequence of a bundle; Python files in it run.
 
         Raises:
@@ -180,37 +172,35 @@ class Sequence:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        try:
-            text = bundle[sources[0]].decode()
-        except UnicodeDecodeError as error:
-            raise InputError(sources[0], "", "text in UTF-8") from error
-        return parse_sequence(text, sources[0], read_file, known)
+        return parse_sequence(_decode(bundle[sources[0]], sources[0]), sources[0], read_file)
 
 
-def load_sequence(name_or_path: str | Path, known: Known = find_quantity) -> Sequence:
+def _decode(data: bytes, name: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(name, "", "text in UTF-8") from error
+
+
+def load_sequence(name_or_path: str | Path) -> Sequence:
     """Read a sequence: a TOML file, or the name of one that comes with the rig.
 
     Args:
         name_or_path: e.g. "preflight" or "tests/mine.toml"; CSV and Python files in it are sought beside it.
-        known: raises InputError for the name of a parameter that does not exist.
 
     Raises:
         InputError: no such sequence, or the file, line and key that cannot be used and what was expected there.
     """
-    entries = {entry.name: entry for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml")}
-    shipped = {Path(name).stem: name for name in entries}
+    found = files("rig.sequences").iterdir()
+    shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
     if str(name_or_path) in shipped:
-        name = shipped[str(name_or_path)]
-        return parse_sequence(entries[name].read_text(encoding="utf-8"), name, _read_beside(Path()), known)
+        entry = shipped[str(name_or_path)]
+        return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, _read_beside(Path()))
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
     read_file = _read_beside(path.parent)
-    try:
-        text = read_file(path.name).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(path, "", "text in UTF-8") from error
-    return parse_sequence(text, str(path), read_file, known)
+    return parse_sequence(_decode(read_file(path.name), str(path)), str(path), read_file)
 
 
 def _read_beside(folder: Path) -> ReadFile:
@@ -223,7 +213,7 @@ def _read_beside(folder: Path) -> ReadFile:
     return read_file
 
 
-def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = find_quantity) -> Sequence:
+def parse_sequence(text: str, name: str, read_file: ReadFile) -> Sequence:
     """The sequence of a TOML text; `read_file` gives the bytes of the CSV and Python files that it names.
 
     The Python files run.
@@ -232,62 +222,61 @@ def parse_sequence(text: str, name: str, read_file: ReadFile, known: Known = fin
         InputError: the file, line and key that cannot be used, or the line of a Python file.
     """
     table, place = tables.parse_table(text, name)
-    sequence = tables.build_dataclass(Sequence, table, place, _KINDS)
-    sequence = replace(sequence, name=Path(name).name, source=text)
-    sequence = _with_functions(sequence, place, read_file)
-    for phase in ("setup", "main", "cleanup", "load"):
-        sequence = _with_csv(sequence, phase, place.at(phase), read_file)
+    sequence = replace(tables.build_dataclass(Sequence, table, place, _KINDS), name=Path(name).name, source=text)
+    sequence = _fill_in_files(sequence, place, read_file)
     _check_phases(sequence, place)
     _check_faults(sequence, place.at("faults"))
-    _check_parameters(sequence, place, known)
+    _check_parameters(sequence, place)
     _check_checks(sequence, place.at("checks"))
     return sequence
 
 
-def _with_csv(sequence: Sequence, phase: str, place: Place, read_file: ReadFile) -> Sequence:
-    """The sequence with the CSV segments of one phase filled in from their files."""
-    found: list[Segment] = []
-    embedded = dict(sequence.files)
-    for i, segment in enumerate(getattr(sequence, phase)):
-        if isinstance(segment, Csv):
-            here = place.at(i, "file")
-            try:
-                embedded[segment.file] = embedded.get(segment.file) or read_file(segment.file)
-                columns = parse_columns(embedded[segment.file], segment.file)
-            except InputError as error:
-                raise here.refuse(f"a readable command file; {error}") from error
-            values = columns.get("value" if phase == "load" or "com" not in columns else "com")
-            if values is None:
-                raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else 'com'}")
-            segment = replace(segment, values=tuple(values.tolist()))
-        found.append(segment)
-    filled: Any = {phase: tuple(found)}
-    return replace(sequence, files=embedded, **filled)
+def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
+    """The sequence with the columns and functions of its parts filled in from their files."""
+    embedded: dict[str, bytes] = {}
+    modules: dict[str, ModuleType] = {}
 
-
-def _with_functions(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
-    """The sequence with the functions of its parts in Python filled in from their files."""
-    modules, embedded = UserModules(Path(place.file).parent), dict(sequence.files)
-
-    def fill_in(part: PythonPart, here: Place) -> PythonPart:
-        file, name = require_function_name(part.python)
+    def read(file: str, here: Place, expected: str) -> bytes:
         try:
             embedded[file] = embedded.get(file) or read_file(file)
         except InputError as error:
-            raise here.at("python").refuse(f"a Python file beside the sequence; {error}") from error
-        function = modules.find_function(file, embedded[file], name)
-        function.require_arguments(VALUES_OF_PART[type(part)], part.arguments)
-        return replace(part, function=function)
+            raise here.refuse(f"{expected}; {error}") from error
+        return embedded[file]
+
+    def fill_in(part: Any, key: str, here: Place) -> Any:
+        if isinstance(part, Csv):
+            return replace(part, values=_read_column(part.file, read, key, here.at("file")))
+        if isinstance(part, PythonSegment | PythonCheck | Step):
+            file, name = require_function_name(part.python)
+            source = read(file, here.at("python"), "a Python file beside the sequence")
+            if file not in modules:
+                modules[file] = run_file(Path(place.file).parent / file, source)
+            given = 2 if isinstance(part, PythonSegment) else 1  # values that the function gets
+            return replace(part, function=load_function(modules[file], name, given, part.arguments))
+        return part
 
     filled: dict[str, Any] = {}
-    for key in ("setup", "main", "cleanup", "load", "checks", "steps"):
-        filled[key] = tuple(fill_in(part, place.at(key, i)) if isinstance(part, PythonPart) else part
-                            for i, part in enumerate(getattr(sequence, key)))
+    for key in (*PHASES, "checks", "steps"):
+        filled[key] = tuple(fill_in(part, key, place.at(key, i)) for i, part in enumerate(getattr(sequence, key)))
     return replace(sequence, files=embedded, **filled)
 
 
+def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str, here: Place) -> tuple[float, ...]:
+    """The values of a CSV segment, one a cycle."""
+    expected = "a readable command file"
+    data = read(file, here, expected)
+    try:
+        columns = parse_columns(data, file)
+    except InputError as error:
+        raise here.refuse(f"{expected}; {error}") from error
+    values = columns.get("value" if phase == "load" or "com" not in columns else "com")
+    if values is None:
+        raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else 'com'}")
+    return tuple(values.tolist())
+
+
 def _check_phases(sequence: Sequence, place: Place) -> None:
-    for phase in ("setup", "main", "cleanup", "load"):
+    for phase in PHASES:
         called = list_section_names(getattr(sequence, phase))
         for i, name in enumerate(called):
             if name in called[:i]:
@@ -305,19 +294,18 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
 def _check_sizes(sequence: Sequence, place: Place) -> None:
     """No demand and no load of a size that can only be a slip of units."""
     start = 0.0
-    for phase, most, unit in (("setup", FARTHEST, "m"), ("main", FARTHEST, "m"), ("cleanup", FARTHEST, "m"),
-                              ("load", STRONGEST, "N")):
+    for phase in PHASES:
+        most, unit, begin = (STRONGEST, "N", 0.0) if phase == "load" else (FARTHEST, "m", start)
         with np.errstate(all="ignore"):  # what overflows is refused below
             try:
-                values, sections, end = build_profile(getattr(sequence, phase), 0.0 if phase == "load" else start)
+                values, sections, start = build_profile(getattr(sequence, phase), begin)
             except InputError as error:  # a function that computes a segment
                 raise (place.at(phase).refuse(error.expected) if error.where == "segment" else error) from error
         for i, section in enumerate(sections):
-            last = end if i == len(sections) - 1 else 0.0
+            last = start if i == len(sections) - 1 else 0.0
             largest = np.abs((*values[section.start:section.stop], last)).max()
             if not largest <= most:  # nor NaN
                 raise place.at(phase, i).refuse(f"at most {most:g} {unit} either way, not {largest:g}")
-        start = end
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
@@ -338,17 +326,33 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
             others.append((first, last))
 
 
-def _check_parameters(sequence: Sequence, place: Place, known: Known) -> None:
-    """Names must exist. If `known` says what a name means (plant.model.find_quantity), values are tried as well."""
+def _check_parameters(sequence: Sequence, place: Place) -> None:
+    """Parameters must exist, values must be in their range, and on the nominal model they must go together."""
     chosen, plan = sequence.model, sequence.plan(0)
-    whole = check_overrides(chosen.overrides, place.at("model", "overrides"), known)
-    whole &= check_faults(plan, place.at("faults"), known)
-    if whole and chosen.name == "eha":  # another model's values are known when it runs
+    overrides, injected = place.at("model", "overrides"), place.at("faults")
+    for name, value in chosen.overrides.items():
+        quantity = _find_meaning(name, overrides.at(name))
+        with overrides.at(name).locate():
+            parse_value("", "", quantity, value)
+    for i, fault in enumerate(plan.faults):
+        if isinstance(fault, Parameter):
+            quantity = _find_meaning(fault.parameter, injected.at(i, "parameter"))
+            with injected.at(i).locate(has_field=True):
+                fault.find_target(quantity)
+    if chosen.name == "eha":  # another model's values are known when it runs
         try:
             model = Model().replace(chosen.overrides)
         except InputError as error:
-            raise place.at("model", "overrides").refuse(f"{error.field} {error.expected}") from error
-        check_together(plan, model, place.at("faults"))
+            raise overrides.refuse(f"{error.field} {error.expected}") from error
+        if (found := find_contradiction(plan, model)) is not None:
+            raise injected.at(found[0]).refuse(found[1])
+
+
+def _find_meaning(name: str, place: Place) -> Quantity:
+    try:
+        return find_quantity(name)
+    except InputError as error:
+        raise place.refuse(f"{error.expected}, not {name!r}") from error
 
 
 def _check_checks(sequence: Sequence, place: Place) -> None:
@@ -356,12 +360,12 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
     sections, labels = sequence.sections(), Counter(fault.label for fault in sequence.faults)
     used = Counter(check.name for check in sequence.checks)
     for i, check in enumerate(sequence.checks):
+        window, after = check.window, getattr(check, "after", 0.0)
         if used[check.name] > 1:
             raise place.at(i, "name").refuse(f"a name used once, not {used[check.name]} times {check.name!r}")
-        window = check.window
         if isinstance(window, str) and window != MAIN and window not in sections:
             raise place.at(i, "window").refuse(f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / RATE:
             raise place.at(i, "window").refuse(f"an end within main's {sequence.duration:g} s, not {window[1]:g}")
-        if isinstance(check, ResponseWithin | ShutOff) and isinstance(check.after, str) and labels[check.after] != 1:
-            raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(check.after, labels)}")
+        if isinstance(after, str) and labels[after] != 1:
+            raise place.at(i, "after").refuse(f"a time or one fault: {tables.list_choices(after, labels)}")

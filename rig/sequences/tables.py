@@ -1,45 +1,86 @@
 """Reads TOML text into frozen dataclasses. Errors name file and line, key, and what was expected there.
 
-The dataclass is the schema: its fields are the keys, its annotations the types (`Annotated[float, "s"]` adds the unit),
-its defaults say what may be left out. A base class whose subclasses are told apart by the key `kind` is read by the
-table of kinds given for it. A field with metadata {"key": False} is the program's own, not a key.
+The dataclass is the schema: its fields are the keys, its annotations the types (`Annotated[float, "s"]` adds the unit,
+`Annotated[float, Range("s", low=0)]` unit and range), its defaults say what may be left out. A base class whose
+kinds are told apart by the key `kind` is read by the table of kinds given for it. A field with metadata {"key": False}
+is the program's own, not a key; one with the name `kind` gets the kind.
 """
 from __future__ import annotations
 
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
-from math import isfinite
+from math import inf, isfinite
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plant.errors import InputError
 
 T = TypeVar("T")
-Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: subclass}
+Kinds = Mapping[type, Mapping[str, type]]  # base class -> {kind: class with its keys}
+
+
+class Range(NamedTuple):
+    """Unit and range of a number of a file. `low` and `high` are allowed; `above` and `below` are not."""
+
+    unit: str
+    low: float = -inf
+    high: float = inf
+    above: float = -inf
+    below: float = inf
+
+    def refuses(self, value: float) -> bool:
+        """True for a value outside the range."""
+        return not (self.low <= value <= self.high and self.above < value < self.below)
+
+    @property
+    def expected(self) -> str:
+        """The range in words.
+
+        >>> Range("s", low=0.0, high=3600.0).expected, Range("1", above=0.0, high=1.0).expected
+        ('from 0 to 3600 s', 'above 0 and at most 1')
+        """
+        bounds = {"from": self.low, "above": self.above, "at most": self.high, "below": self.below}
+        said = [f"{word} {bound if isinstance(bound, int) else format(bound, 'g')}" for word, bound in bounds.items()
+                if isfinite(bound)]
+        text = " and ".join(said).replace(" and at most", " to") if "from" in said[0] else " and ".join(said)
+        return text if self.unit == "1" else f"{text} {self.unit}"
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a value stands: a file, the keys that lead to it, and the lines of all keys."""
+    """Where a value stands: a file, the keys that lead to it ("main[3].time"), and the lines of all keys."""
 
     file: str
-    lines: Mapping[Path, int] = field(default_factory=dict, repr=False)
-    keys: Path = ()
+    lines: Mapping[str, int] = field(default_factory=dict, repr=False)
+    keys: str = ""
 
     def at(self, *keys: str | int) -> Place:
         """The place below this one."""
-        return Place(self.file, self.lines, self.keys + keys)
+        return Place(self.file, self.lines, _join_keys(self.keys, keys))
 
     def refuse(self, expected: str) -> InputError:
         """The error to raise for the value at this place, with the line of the nearest key that has one."""
-        known = (self.lines[self.keys[:n]] for n in range(len(self.keys), 0, -1) if self.keys[:n] in self.lines)
-        line = next(known, None)
-        text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.keys).lstrip(".")
-        return InputError(self.file if line is None else f"{self.file}:{line}", text, expected)
+        known = self.keys
+        while known and known not in self.lines:
+            known = known[:max(known.rfind("."), known.rfind("["), 0)]
+        return InputError(f"{self.file}:{self.lines[known]}" if known else self.file, self.keys, expected)
+
+    @contextmanager
+    def locate(self, *, has_field: bool = False) -> Iterator[None]:
+        """Turn an InputError raised within into one at this place, or, with `has_field`, at its field below."""
+        try:
+            yield
+        except InputError as error:
+            place = self.at(error.field) if has_field and error.field else self
+            raise place.refuse(error.expected) from error
+
+
+def _join_keys(path: str, keys: Iterable[str | int]) -> str:
+    return (path + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
 
 
 def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
@@ -59,12 +100,13 @@ def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | No
     kinds = kinds or {}
     if not isinstance(table, dict):
         raise place.refuse("a table")
-    pairs = dict(table)
+    pairs, made = dict(table), {}
     if cls in kinds:
         kind = pairs.pop("kind", None)
         if not isinstance(kind, str) or kind not in kinds[cls]:
             raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {list_choices(kind, kinds[cls])}")
         cls = kinds[cls][kind]
+        made = {f.name: kind for f in fields(cls) if f.name == "kind"}  # type: ignore[arg-type]
     hints = get_type_hints(cls, include_extras=True)
     known = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
     for key in pairs:
@@ -74,16 +116,14 @@ def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | No
         if key not in pairs and f.default is MISSING and f.default_factory is MISSING:
             raise place.refuse(f"also the key {key!r}, {describe_annotation(hints[key])}")
     values = {key: _convert(value, hints[key], place.at(key), kinds) for key, value in pairs.items()}
-    try:
-        return cls(**values)
-    except InputError as error:  # the class knows what is wrong with which field, not where it stands
-        raise (place.at(error.field) if error.field else place).refuse(error.expected) from error
+    with place.locate(has_field=True):  # the class knows what is wrong with which field, not where it stands
+        return cls(**made, **values)
 
 
 def list_choices(word: object, known: Iterable[str]) -> str:
     """The words that would have done in place of `word`, and the one that was probably meant.
 
-    >>> one_of("hodl", ["hold", "step"])
+    >>> list_choices("hodl", ["hold", "step"])
     "'hold' or 'step', not 'hodl' (did you mean 'hold'?)"
     """
     names = sorted(known)
@@ -94,34 +134,32 @@ def list_choices(word: object, known: Iterable[str]) -> str:
     return f"{listed}, not {word!r}" + (f" (did you mean {close[0]!r}?)" if close else "")
 
 
-def _convert(value: object, hint: Any, place: Place, kinds: Kinds) -> Any:
+def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:
     """`value` as the annotated type, or InputError at `place`."""
-    bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    bare, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     origin, args = get_origin(bare), get_args(bare)
     if bare in _SCALARS:
-        if not _is_scalar(value, bare):
-            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
-        return bare(value)
-    if origin is Literal:
-        if value not in args:
-            raise place.refuse(list_choices(value, args))
-        return value
-    if origin in (Union, UnionType):
+        if _is_scalar(value, bare) and not any(isinstance(note, Range) and note.refuses(value) for note in notes):
+            return bare(value)
+    elif origin is Literal:
+        if value in args:
+            return value
+        raise place.refuse(list_choices(value, args))
+    elif origin in (Union, UnionType):
         for member in (m for m in args if m is not NoneType):
             with suppress(InputError):
                 return _convert(value, member, place, kinds)
-        raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
-    if origin is tuple:
+    elif origin is tuple:
         members = args[:1] * len(value) if isinstance(value, list) and args[-1] is Ellipsis else args
-        if not isinstance(value, list) or len(value) != len(members):
-            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
-        return tuple(_convert(item, member, place.at(i), kinds) for i, (item, member) in
-                     enumerate(zip(value, members, strict=True)))
-    if origin is Mapping:
-        if not isinstance(value, dict):
-            raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
-        return dict(_flatten_names(value, args[1], place, kinds))
-    return build_dataclass(bare, value, place, kinds)
+        if isinstance(value, list) and len(value) == len(members):
+            return tuple(_convert(item, member, place.at(i), kinds) for i, (item, member) in
+                         enumerate(zip(value, members, strict=True)))
+    elif origin is Mapping:
+        if isinstance(value, dict):
+            return dict(_flatten_names(value, args[1], place, kinds))
+    else:
+        return build_dataclass(bare, value, place, kinds)
+    raise place.refuse(f"{describe_annotation(hint)}, not {value!r}")
 
 
 def _flatten_names(table: dict[str, Any], hint: Any, place: Place, kinds: Kinds,
@@ -138,16 +176,19 @@ _SCALARS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a te
 
 
 def _is_scalar(value: object, kind: Any) -> bool:
+    """Whether a value is of the kind; whole numbers are of 64 bits, as TOML has them, and floating ones are finite."""
     if kind is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
-    return type(value) is kind
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= 1e308
+    return type(value) is kind and not (isinstance(value, int) and abs(value) >= 1 << 63)
 
 
 def describe_annotation(hint: Any) -> str:
     """An annotation in words: what a user should write."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return f"{describe_annotation(args[0])} in {args[1]}"
+        words = describe_annotation(args[0])
+        note = args[1]
+        return f"{words} {note.expected}" if isinstance(note, Range) else f"{words} in {note}"
     if origin is Literal:
         return list_choices(None, args)
     if origin in (Union, UnionType):
@@ -160,127 +201,65 @@ def describe_annotation(hint: Any) -> str:
     return _SCALARS.get(hint, "a table")
 
 
-_MOST_PARTS = 100  # of a key
-Path = tuple[str | int, ...]  # ("main", 3, "time"): key, place in the array, key
-
+_MOST_PARTS = 100  # of a key that have a line of their own
 _TOKEN = re.compile(
     r"""
     (?P<skip> [ \t\r]+ | \#[^\n]* )
-  | (?P<newline> \n )
+  | (?P<mark> [\n\[\]{},=] )
   | (?P<string> \"\"\"(?:\\.|[^\\])*?\"{3,5} | '''.*?'{3,5} | "(?:\\.|[^"\\])*" | '[^']*' )
-  | (?P<mark> [\[\]{},=] )
   | (?P<bare> [^\s\[\]{},="'\#]+ )
     """,
     re.DOTALL | re.VERBOSE,
 )
 
 
-class _Token(NamedTuple):
-    kind: str
-    text: str
-    line: int
+def find_lines(text: str) -> dict[str, int]:
+    """Line number, from 1, of every key, array element and table header of a text that is TOML.
 
-
-def find_lines(text: str) -> dict[Path, int]:
-    """Line number, from 1, of every key, array element and table header.
-
-    Raises:
-        RecursionError: a key of more than 100 parts; the paths of all its parts would take a lot of memory.
+    >>> find_lines("a.b = [\\n1]\\n[[c]]")
+    {'a': 1, 'a.b': 1, 'a.b[0]': 2, 'c': 3, 'c[0]': 3}
     """
-    scanner = _Scanner(text)
-    scanner.document()
-    return scanner.found
-
-
-class _Scanner:
-    """Walks the tokens once; `found` grows on the way."""
-
-    def __init__(self, text: str) -> None:
-        self.found: dict[Path, int] = {}
-        self._tables: dict[Path, int] = {}  # how many elements an array of tables has so far
-        self._tokens: list[_Token] = []
-        line = 1
-        for match in _TOKEN.finditer(text):
-            if match.lastgroup != "skip":
-                self._tokens.append(_Token(str(match.lastgroup), match.group(), line))
-            line += match.group().count("\n")
-        self._tokens.append(_Token("end", "", line))
-        self._next = 0
-
-    def document(self) -> None:
-        prefix: Path = ()
-        while not self._at("end"):
-            if self._accept("\n"):
-                continue
-            if self._at("["):
-                prefix = self._header()
-            else:
-                self._pair(prefix)
-
-    def _header(self) -> Path:
-        """[a.b] or [[a.b]] -> the path below which the following pairs stand."""
-        line = self._take().line
-        is_array = self._accept("[")
-        path: Path = ()
-        for part in self._key():
-            path += (part,)
-            if path in self._tables:
-                path += (self._tables[path] - 1,)
-        self._accept("]")
-        self._accept("]")
-        if is_array:
-            path = path[:-1] if isinstance(path[-1], int) else path
-            self._tables[path] = self._tables.get(path, 0) + 1
-            self.found.setdefault(path, line)
-            path += (self._tables[path] - 1,)
-        self.found[path] = line
-        return path
-
-    def _pair(self, prefix: Path) -> None:
-        line = self._tokens[self._next].line
-        path = prefix
-        for part in self._key():
-            path += (part,)
-            self.found.setdefault(path, line)
-        self._accept("=")
-        self._value(path)
-
-    def _key(self) -> list[str]:
-        """A key's parts: a.b and a."b" are two."""
-        parts: list[str] = []
-        while not (self._at("=") or self._at("]") or self._at("end")):
-            token = self._take()
-            parts += [token.text[1:-1]] if token.kind == "string" else [p for p in token.text.split(".") if p]
-            if len(parts) > _MOST_PARTS:
-                raise RecursionError(f"a key of more than {_MOST_PARTS} parts")
-        return parts
-
-    def _value(self, path: Path) -> None:
-        if self._accept("["):
-            index = 0
-            while not (self._accept("]") or self._at("end")):
-                if self._accept("\n") or self._accept(","):
-                    continue
-                self.found[(*path, index)] = self._tokens[self._next].line
-                self._value((*path, index))
-                index += 1
-        elif self._accept("{"):
-            while not (self._accept("}") or self._at("end")):
-                if not (self._accept(",") or self._accept("\n")):
-                    self._pair(path)
-        else:
-            while self._tokens[self._next].kind in ("string", "bare"):  # a date and its time are two tokens
-                self._take()
-
-    def _at(self, text: str) -> bool:
-        token = self._tokens[self._next]
-        return token.kind == "end" if text == "end" else token.kind in ("mark", "newline") and token.text == text
-
-    def _accept(self, text: str) -> bool:
-        found = self._at(text)
-        self._next += found
-        return found
-
-    def _take(self) -> _Token:
-        self._next += 1
-        return self._tokens[self._next - 1]
+    found: dict[str, int] = {}
+    counts: dict[str, int] = {}  # elements so far of each array of tables
+    open_: list[tuple[str, int]] = [("", -1)]  # tables and arrays that are open, with the element; -1 in a table
+    key: list[str] = []
+    state, path, line = "key", "", 1
+    for match in _TOKEN.finditer(f"{text}\n"):
+        kind, token = match.lastgroup, match.group()
+        above, element = open_[-1]
+        if state == "value" and element >= 0 and kind != "skip" and token not in ("\n", ",", "]"):
+            path = f"{above}[{element}]"
+            found.setdefault(path, line)
+        if kind in ("string", "bare") and state != "value":
+            key += [token[1:-1]] if kind == "string" else [part for part in token.split(".") if part]
+        elif token == "[" and state == "key":
+            state = "header"
+        elif token == "[" and state == "header":
+            state = "array header"
+        elif token in ("[", "{"):
+            open_.append((path, 0 if token == "[" else -1))
+            state = "value" if token == "[" else "key"
+        elif token == "=" or (token == "\n" and "header" in state):
+            path = above if token == "=" else ""
+            for part in key[:_MOST_PARTS]:
+                if path in counts and token == "\n":
+                    path = f"{path}[{counts[path] - 1}]"
+                path = _join_keys(path, (part,))
+                found.setdefault(path, line)
+            if state == "array header":
+                counts[path] = counts.get(path, 0) + 1
+            if path in counts:
+                path = f"{path}[{counts[path] - 1}]"
+                found[path] = line
+            if token == "\n":
+                open_ = [(path, -1)]
+            state, key = "value" if token == "=" else "key", []
+        elif token in ("]", "}") and "header" not in state:
+            open_.pop()
+            state = "value"
+        elif token == "," and element >= 0:
+            open_[-1] = above, element + 1
+        elif token in (",", "\n") and element < 0:
+            state = "key"
+        line += token.count("\n")
+    return found

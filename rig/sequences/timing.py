@@ -3,12 +3,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil
-from typing import Literal
+from typing import Annotated, Literal
 
-from plant.errors import InputError
-from plant.segments import LONGEST, Second
+from plant.segments import LONGEST
+from rig.sequences.tables import Range
 
 PERIOD = 1e-3  # s, one cycle
+InCycle = Annotated[float, Range("s", above=0.0, high=PERIOD)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,22 +21,13 @@ class TimingPolicy:
     """
 
     overruns: Literal["count", "abort"] = "count"
-    tolerate: int | None = None  # overruns in a row; None: any number with "count", none with "abort"
-    share: float = 1e-3  # of all cycles; more make the timing of the run invalid
-    grace: Second = 0.1  # from the first cycle; overruns in it do not count
-    sync: Second = 0.5e-3  # SYNC after it was due
-    feedback: Second = 0.5e-3  # from SYNC to the feedback frame
-    operational: Second = 1.0  # from NMT start to OPERATIONAL
-
-    def __post_init__(self) -> None:
-        _require(self.tolerate is None or 0 <= self.tolerate <= 1_000_000, "tolerate",
-                 f"a number of overruns from 0 to 1000000, not {self.tolerate}")
-        _require(0 <= self.share <= 1, "share", f"a fraction from 0 to 1, not {self.share:g}")
-        _require(0 <= self.grace <= LONGEST, "grace", f"0 s or more, at most {LONGEST:g}, not {self.grace:g}")
-        for key in ("sync", "feedback"):
-            limit = getattr(self, key)
-            _require(0 < limit <= PERIOD, key, f"above 0 s and at most the cycle of {PERIOD:g} s, not {limit:g}")
-        _require(0 < self.operational <= 60, "operational", f"above 0 s and at most 60 s, not {self.operational:g}")
+    # overruns in a row; None: any number with "count", none with "abort"
+    tolerate: Annotated[int, Range("1", low=0, high=1_000_000)] | None = None
+    share: Annotated[float, Range("1", low=0.0, high=1.0)] = 1e-3  # of all cycles; more make the timing invalid
+    grace: Annotated[float, Range("s", low=0.0, high=LONGEST)] = 0.1  # overruns in it do not count
+    sync: InCycle = 0.5e-3  # SYNC after it was due
+    feedback: InCycle = 0.5e-3  # from SYNC to the feedback frame
+    operational: Annotated[float, Range("s", above=0.0, high=60.0)] = 1.0  # from NMT start to OPERATIONAL
 
     @property
     def most_in_a_row(self) -> int | None:
@@ -53,8 +45,3 @@ class TimingPolicy:
         periods_tolerated = 1.5  # after so many times 0x1006 without a SYNC some CANopen stacks call SYNC lost
         pause = (max(self.most_in_a_row or 0, in_a_row) + 1) * PERIOD + self.sync
         return 1000 * ceil(pause / periods_tolerated / PERIOD)
-
-
-def _require(holds: bool, key: str, expected: str) -> None:
-    if not holds:
-        raise InputError("timing", key, expected)

@@ -120,18 +120,19 @@ def _describe_off(off: float | None, name: str, model: Model) -> str:
 
 def list_checks(model: Model) -> Rows:
     """The kinds of checks of a sequence, with their own keys and defaults."""
-    from rig.sequences.sequence import CHECK_KINDS
+    from rig.sequences import checks
 
-    return [{"name": name, "measures": (kind.__doc__ or "").split("\n")[0].rstrip("."),
-             "unit": "any" if name == "python" else kind.si or "the signal's", "keys": "\n".join(_describe_keys(kind))}
-            for name, kind in CHECK_KINDS.items()]
+    return [{"name": name, "measures": kind.text.rstrip("."),
+             "unit": "any" if name == "python" else kind.unit or "the signal's",
+             "keys": "\n".join(_describe_keys(kind.keys))}
+            for name, kind in checks.KINDS.items()]
 
 
 def _describe_keys(kind: type[Any]) -> Iterator[str]:
     """The keys of a kind of check beside those that every check has."""
     from dataclasses import MISSING, fields
 
-    from rig.sequences.check import Check
+    from rig.sequences.checks import Check
 
     common = {f.name for f in fields(Check)} - {"window"}
     for f in fields(kind):

@@ -10,8 +10,7 @@ from plant import Model, load_model
 from plant.effects import CATALOGUE
 from rig.cli.commands.list import KINDS
 from rig.cli.main import FIRST_STEPS
-from rig.sequences import load_sequence
-from rig.sequences.sequence import CHECK_KINDS
+from rig.sequences import checks, load_sequence
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -39,7 +38,7 @@ def test_the_parameters_are_those_that_set_takes() -> None:
 
 
 def test_sequences_checks_and_models_can_be_used() -> None:
-    assert [row["name"] for row in rig("list", "checks", "--json").json["checks"]] == list(CHECK_KINDS)
+    assert [row["name"] for row in rig("list", "checks", "--json").json["checks"]] == list(checks.KINDS)
     for row in rig("list", "sequences", "--json").json["sequences"]:
         assert load_sequence(row["name"]).title == row["title"]
     for row in rig("list", "models", "--json").json["models"]:

@@ -27,7 +27,7 @@ from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop
 from rig.nodes.scenario import Scenario
 from rig.run.priority import enter_loop_thread
-from rig.sequences.faults import BusOff, Corrupted, Double, Drop, Duplicated, Fault, Lost, Plan, Schedule, Short
+from rig.sequences.faults import DOUBLE, DROP, BusOff, Corrupted, Duplicated, Fault, Lost, Plan, Schedule, Short
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
 
@@ -240,7 +240,7 @@ class TestServices:
         script: list[tuple[int, bytes]] = []
         for k in range(14):
             action = schedule.find_action("sync", k)
-            script += [(codec.SYNC, b"")] * (0 if isinstance(action, Drop) else 2 if isinstance(action, Double) else 1)
+            script += [(codec.SYNC, b"")] * ({DROP: 0, DOUBLE: 2}.get(action.code, 1))
             script.append((codec.DRIVE, codec.pack_drive(1e-4 * k, 15, k)))
         expected: list[tuple[int, bytes]] = []
         emulator = Emulator(lambda cob_id, data: expected.append((cob_id, data)), scenario)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from rig.sequences.check import CheckResult
+from rig.sequences.checks import CheckResult
 from rig.sequences.protocol import (
     Heartbeat,
     ProtocolLimits,
