@@ -1,13 +1,7 @@
 """A run as data: everything that determines its result, from the command line or from an earlier run's log."""
 from __future__ import annotations
 
-import atexit
-import contextlib
-import fcntl
-import os
-import shutil
-import stat
-import tempfile
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +17,7 @@ from fdi.foreign_code import (
     require_different_names,
     require_trust,
 )
+from fdi.output import write_whole
 from fdi.trace.trace import Trace
 from plant import InputError, Model, load_model
 from plant.effects import load_effects
@@ -108,7 +103,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     """
     trace = Trace.read(path, all=True)
     attachments, said = trace.attachments, trace.provenance
-    bundle = _select_attachments(attachments, _SEQUENCE_FOLDER)
+    bundle = {name.removeprefix(_SEQUENCE_FOLDER): data for name, data in attachments.items()
+              if name.startswith(_SEQUENCE_FOLDER)}
     if "model.toml" not in attachments or not bundle or not said.keys() >= _REQUIRED_SETTINGS:
         raise InputError(path, "attachments", "the sequence and the model of a run; only logs of `rig run` have them")
     effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
@@ -120,14 +116,14 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     settings = _read_settings(path, said)
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
     effects = _load_effect_files(effect_codes)
-    model = parse_model(parse_toml(_decode(path, "model.toml", attachments["model.toml"]), f"{path}: model.toml"),
-                        f"{path}: model.toml")
-    require_bench_cycle(model, f"{path}: model.toml")
+    where = f"{path}: model.toml"
+    try:
+        text = attachments["model.toml"].decode()
+    except UnicodeDecodeError as error:
+        raise InputError(path, "attachment model.toml", "text in UTF-8") from error
+    model = parse_model(parse_toml(text, where), where)
+    require_bench_cycle(model, where)
     return Job(sequence=Sequence.from_bundle(bundle), model=model, effects=effects, **settings)
-
-
-def _select_attachments(attachments: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
-    return {name.removeprefix(prefix): data for name, data in attachments.items() if name.startswith(prefix)}
 
 
 def _require_file_name(log: Path, name: str) -> None:
@@ -136,13 +132,6 @@ def _require_file_name(log: Path, name: str) -> None:
     if not plain.isprintable() or "/" in plain or "\\" in plain or plain.startswith(".") or not 0 < len(plain) <= 100:
         shown = name if len(name) <= 100 else f"{name[:100]}.. ({len(name)} characters)"
         raise InputError(log, f"attachment {shown!r}", "the name of a file, without folders, of at most 100 characters")
-
-
-def _decode(log: Path, name: str, data: bytes) -> str:
-    try:
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise InputError(log, f"attachment {name}", "text in UTF-8") from error
 
 
 def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
@@ -163,59 +152,23 @@ def _read_settings(log: Path, said: Mapping[str, str]) -> dict[str, Any]:
         share = -1.0
     if not 0.0 <= share <= 1.0:  # nor NaN
         raise InputError(log, "metadata run.max_overruns", f"a fraction from 0 to 1, not {overruns[:100]!r}")
-    return {"seed": int(said["seed"]), "bus": said["bus"], "pace": said["pace"], "controller": said["controller"],
-            "plant": said["plant"], "max_overruns": share}
+    return {**{name: said[name] for name in ("bus", "pace", "controller", "plant")}, "seed": int(said["seed"]),
+            "max_overruns": share}
 
 
 def _load_effect_files(codes: list[ForeignCode]) -> tuple[Path, ...]:
-    """Write user effects to files and run them. The files outlive this call: nodes in other processes read them."""
-    if not codes:
-        return ()
-    folder = make_effect_folder()
-    files = tuple(folder / code.name.removeprefix(_EFFECT_FOLDER) for code in codes)
-    for file, code in zip(files, codes, strict=True):
-        file.write_bytes(code.content)
-        load_effects(file, code.content)
-    return files
+    """Write user effects to files and run them. The files outlive this process: nodes in other processes read them."""
+    from plant.compile import find_cache_folder
 
-
-_PREFIX = "eha-rig-effects-"
-
-
-def make_effect_folder() -> Path:
-    """A new folder in the system's folder for temporary files, which the end of this process removes.
-
-    A killed process leaves its folder behind; the next one that makes a folder removes it.
-    """
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-    _lock(folder)
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    # Another process may just have made one, and be about to lock it: a minute is enough for that.
-    remove_left_folders(folder.parent, folder.stat().st_mtime - 60.0)
-    return folder
-
-
-def remove_left_folders(where: Path, before: float) -> None:
-    """Remove this user's effect folders that no process holds a lock on and that are older than `before`, s (epoch)."""
-    for folder in where.glob(_PREFIX + "*"):
-        with contextlib.suppress(OSError):  # somebody else removes it, or it is in use
-            facts = folder.lstat()
-            is_own = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid()
-            if is_own and facts.st_mtime < before:
-                lock = _lock(folder)
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(lock)
-
-
-def _lock(folder: Path) -> int:
-    """Lock a folder until the descriptor returned is closed or this process ends. Raises OSError if it is locked."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
+    digest = hashlib.sha256(repr([(code.name, code.content) for code in codes]).encode()).hexdigest()
+    files = []
+    for code in codes:
+        files.append(find_cache_folder() / f"effects-{digest[:16]}" / code.name.removeprefix(_EFFECT_FOLDER))
+        files[-1].parent.mkdir(exist_ok=True)
+        with write_whole(files[-1]) as part:
+            part.write_bytes(code.content)
+        load_effects(files[-1], code.content)
+    return tuple(files)
 
 
 class JobChoice(NamedTuple):
@@ -292,13 +245,11 @@ class Differences(NamedTuple):
 def find_differences(job: Job) -> Differences:
     """What of a job differs from the nominal test."""
     model = job.model
-    faults = []
-    for fault in job.sequence.faults:
-        until = "" if fault.end is None else f" to {fault.end:g} s"
-        faults.append(f"{fault.label!r} from {fault.start:g} s{until}")
+    faults = tuple(f"{fault.label!r} from {fault.start:g} s" + ("" if fault.end is None else f" to {fault.end:g} s")
+                   for fault in job.sequence.faults)
     return Differences(model="" if model.name == "eha" else model.name, parameters=model.list_changes(),
                        effects=tuple(model.effects), effect_files=tuple(path.name for path in job.effects),
-                       faults=tuple(faults))
+                       faults=faults)
 
 
 def _describe_parameter(name: str, value: float) -> str:

@@ -3,7 +3,7 @@
 Loading takes as long as drawing. In lockstep the second process uses the time and a CPU that the run leaves idle. In
 real time it would compete with the loop: there the run begins when the process has loaded everything and waits
 (`wait_until_loaded`). On one CPU there is nothing to gain: then the page is written here. It is written here as well if
-the second process cannot start or ends early: a run that was measured never lacks its page.
+the second process cannot start or fails: a run that was measured never lacks its page, and an error is raised here.
 """
 from __future__ import annotations
 
@@ -17,21 +17,17 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
-from plant.errors import InputError
-
-_LOADED = "loaded\n"  # what the second process says when it waits for work
-
 
 class PageWriter:
     """A context for one page, `start_page` and `finish_page`; whatever happens, no process is left behind."""
 
-    def __init__(self, *, in_background: bool) -> None:
-        self._in_background = in_background and len(os.sched_getaffinity(0)) > 1
+    def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
+        if len(os.sched_getaffinity(0)) > 1:
+            with contextlib.suppress(OSError):  # the system refuses a process
+                self._process = _start_process()
 
     def __enter__(self) -> PageWriter:
-        if self._in_background:
-            self._process = _start_process()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
@@ -43,9 +39,7 @@ class PageWriter:
     def wait_until_loaded(self, seconds: float = 60.0) -> None:
         """Wait until the second process has loaded everything, or has ended; at most that long."""
         if self._process is not None and self._process.stdout is not None:
-            ready, _, _ = select.select([self._process.stdout], [], [], seconds)
-            if ready:
-                self._process.stdout.readline()
+            select.select([self._process.stdout], [], [], seconds)
 
     def start_page(self, source: Path, out: Path) -> None:
         """Start to write the page of the trace `source` as the HTML file `out`; `finish_page` waits for it."""
@@ -62,10 +56,7 @@ class PageWriter:
             InputError: a trace that cannot be read, or a file that cannot be written.
         """
         if self._process is not None:
-            answer, _ = self._process.communicate()
-            answer = answer.removeprefix(_LOADED)
-            if answer:
-                raise InputError(*json.loads(answer))
+            self._process.communicate()
             if self._process.returncode == 0:
                 return
         from fdi.report.run_report import write_run_page
@@ -73,25 +64,19 @@ class PageWriter:
         write_run_page(self._source, self._out)
 
 
-def _start_process() -> subprocess.Popen[str] | None:
-    """Start `main` in a process of its own; None where the system refuses one.
+def _start_process() -> subprocess.Popen[str]:
+    """Start `main` in a process of its own.
 
     It imports from the same folders as this process (-P: not from the working directory, where a file of the user's may
     have a module's name). In a session of its own: Ctrl-C is for the run, which has clean-up to do.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    try:
-        return subprocess.Popen([sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                stderr=subprocess.DEVNULL, text=True, start_new_session=True, env=environment)
-    except OSError:
-        return None
+    return subprocess.Popen([sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                            stderr=subprocess.DEVNULL, text=True, start_new_session=True, env=environment)
 
 
 def main() -> None:
-    """Load what a page needs, then write the page that a line of standard input names; without a line, write none.
-
-    A trace or file that cannot be used is answered by the fields of the InputError, as one line of JSON.
-    """
+    """Load what a page needs and say so, then write the page that a line of standard input names; without one, none."""
     gc.disable()  # this process ends with its page; looking through matplotlib's objects takes a tenth of its time
     import fdi.report.run_figures  # noqa: F401 - loads matplotlib
     from fdi.report.drawing import start_figure, to_svg
@@ -103,15 +88,9 @@ def main() -> None:
         to_svg(figure, "none")
     load_templates().get_template("page.html")
     with contextlib.suppress(BrokenPipeError):  # the run was killed: the next line ends this process
-        print(end=_LOADED, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        return
-    source, out = json.loads(line)
-    try:
-        write_run_page(source, out)
-    except InputError as error:
-        print(json.dumps([error.where, error.field, error.expected]))
+        print("loaded", flush=True)
+    if line := sys.stdin.readline():
+        write_run_page(*json.loads(line))
 
 
 if __name__ == "__main__":

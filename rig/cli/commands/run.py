@@ -86,7 +86,7 @@ def run_command(args: argparse.Namespace) -> int:
     folder = Path(args.out) if args.out else make_folder(Path("runs"), Path(job.sequence.name).stem)
     junit = choose_junit(args)
     clock = WallClock()
-    with PageWriter(in_background=True) as pages, catch_signals() as is_to_stop:
+    with PageWriter() as pages, catch_signals() as is_to_stop:
         with (announce_run(job, why, is_silent=args.json or args.quiet or args.live == TERMINAL) as progress,
               choose_observer(job, place, is_live=args.live is not None) as observe):
             prepare = pages.wait_until_loaded if job.realtime else do_nothing
