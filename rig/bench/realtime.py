@@ -137,7 +137,7 @@ class _Log:
         self._history, self._recorder = history, recorder
 
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        self._history.add(signals, timing)
+        self._history.cycle(t_ns, signals, timing)
         self._recorder.cycle(t_ns, signals, timing)
 
 

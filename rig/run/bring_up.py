@@ -9,7 +9,6 @@ from rig.network.link import EmbeddedWire
 from rig.network.master import HEARTBEAT_LIMIT, PATIENT, Master
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, Gains, Identity, read_gains
 from rig.nodes.scenario import Scenario
-from rig.recorder import Signals, Timing
 from rig.run.attribution import Mask, find_start_problem
 from rig.run.hard_loop import open_loop
 from rig.run.job import Job
@@ -26,10 +25,9 @@ from rig.run.probe import (
     has_no_answers,
     list_first_steps,
     list_inputs,
-    make_probe_scenario,
 )
 from rig.run.state import Journal, SafeState, Stage
-from rig.sequences.faults import Schedule
+from rig.sequences.faults import Plan, Schedule
 
 
 class BringUp:
@@ -44,11 +42,6 @@ class BringUp:
         self.start_times: dict[int, float] = {}  # s from NMT start to OPERATIONAL, by node
         self.gains: Gains | None = None  # object 0x2110 of the controller, if it has it
         self.probes: list[History] = []  # played before set-up
-        self._probe = History()  # the one being played
-
-    def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
-        """Keep a complete cycle of a probe (called by the loop)."""
-        self._probe.add(signals, timing)
 
     def start_nodes(self, scenario: Scenario, *, is_run: bool = False) -> None:
         """Reset, identify, configure and start the nodes, for a probe or the run. Raises BusError and InputError."""
@@ -96,29 +89,29 @@ class BringUp:
 
     def _play_probe(self, steps: tuple[Step, ...]) -> History:
         """Play one probe after a reset of the nodes. Raises BusError."""
-        scenario = make_probe_scenario(self._job.scenario)
+        # The plant of the run in its initial state, without faults and loads.
+        scenario, probe = Scenario(self._job.scenario.model, Plan(stop=0), (), self._job.seed), History()
         self.start_nodes(scenario)
-        self._probe = History()
         if self._safety.aborted:  # a node did not become OPERATIONAL
-            return self._probe
-        self._stage.loop = open_loop(self._master, Schedule(scenario.plan, scenario.model.values), self, self._job.bus,
-                                     self._job.period_ns, self._job.realtime)
+            return probe
+        loop = self._stage.loop = open_loop(self._master, Schedule(scenario.plan), probe, self._job.bus,
+                                            self._job.period_ns, self._job.realtime)
         try:
             for step in list_inputs(steps, BEFORE, 0.0):
-                self._stage.loop.cycle(step)
+                loop.cycle(step)
                 if self._job.realtime and self._stop():
                     self._safety.stop()
-                if self._safety.aborted or has_no_answers(self._probe):
-                    self._stage.loop.hold(BEFORE)
+                if self._safety.aborted or has_no_answers(probe):
+                    loop.hold(BEFORE)
                     break
-            self._stage.loop.finish()
+            loop.finish()
         except BaseException:
             self._master.stop()
             raise
         finally:
-            self._stage.loop.close()
+            loop.close()
             self._stage.loop = None
-        return self._probe
+        return probe
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse a firmware that the sequence is not meant for.

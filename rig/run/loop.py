@@ -256,8 +256,8 @@ class History:
     def __len__(self) -> int:
         return len(self._numbers) // len(_FIELDS)
 
-    def add(self, row: Signals, timing: Timing) -> None:
-        """Append one cycle."""
+    def cycle(self, t_ns: int, row: Signals, timing: Timing) -> None:
+        """Append one cycle (called by a loop)."""
         self._numbers.extend((row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load, row.flags,
                               timing.lateness, timing.response, timing.feedback_response, timing.valve_response,
                               timing.execution, row.control, row.status))

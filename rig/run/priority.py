@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -27,15 +28,13 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     interpreter lock, other programs must not keep it from going on, for the loop would wait with it. A thread that has
     a real-time priority keeps it: a compiled loop that runs already (`enter_loop_thread`) is not to be slowed down.
     """
-    others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
-    raised = [thread for thread in others if thread is not None and _is_ordinary(thread) and _set_fifo(thread, 1)]
+    raised = [thread for thread in _list_other_threads() if _is_ordinary(thread) and _set_fifo(thread, 1)]
     raised += [0] if _set_fifo(0, priority) else []
     try:
         yield
     finally:
         for thread in raised:
-            with contextlib.suppress(OSError):  # it has ended meanwhile
-                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+            _is_granted(os.sched_setscheduler, thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextlib.contextmanager
@@ -47,12 +46,11 @@ def enter_loop_thread(from_last: int = 2) -> Iterator[str]:
     """
     _set_fifo(0, LOOP_PRIORITY)
     cpus = list_cpus()
-    others = [thread.native_id for thread in threading.enumerate() if thread is not threading.current_thread()]
     moved = []
     if len(cpus) > 1:
         own = cpus[-min(from_last, len(cpus))]
         rest = [cpu for cpu in cpus if cpu != own]
-        moved = [thread for thread in others if thread is not None and _set_cpus(thread, rest)]
+        moved = [thread for thread in _list_other_threads() if _set_cpus(thread, rest)]
         _set_cpus(0, [own])
     try:
         yield name_scheduler()
@@ -100,7 +98,7 @@ def prevent_deep_sleep() -> Iterator[None]:
 
 def list_cpus() -> list[int]:
     """The CPUs that this thread may use."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    return sorted(os.sched_getaffinity(0))
 
 
 @contextlib.contextmanager
@@ -124,30 +122,36 @@ def _is_ordinary(thread: int) -> bool:
     """Whether the kernel schedules a thread without real-time priority."""
     try:
         return os.sched_getscheduler(thread) == os.SCHED_OTHER
-    except (AttributeError, OSError):  # not Linux; or the thread has ended
+    except OSError:  # the thread has ended
         return False
 
 
 def _set_fifo(thread: int, priority: int) -> bool:
-    try:
-        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
-    except (AttributeError, OSError):
-        return False
-    return True
+    return _is_granted(os.sched_setscheduler, thread, os.SCHED_FIFO, os.sched_param(priority))
 
 
 def _set_cpus(thread: int, cpus: Collection[int]) -> bool:
+    return _is_granted(os.sched_setaffinity, thread, cpus)
+
+
+def _is_granted(ask: Callable[..., None], *arguments: object) -> bool:
+    """Ask the kernel for something; False without the right to it, and for a thread that has ended."""
     try:
-        os.sched_setaffinity(thread, cpus)
-    except (AttributeError, OSError):  # not Linux; or the thread has ended
+        ask(*arguments)
+    except OSError:
         return False
     return True
+
+
+def _list_other_threads() -> list[int]:
+    return [thread.native_id for thread in threading.enumerate()
+            if thread is not threading.current_thread() and thread.native_id is not None]
 
 
 def name_scheduler() -> str:
     """How the kernel schedules this thread."""
     names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
-    return names.get(os.sched_getscheduler(0), "unknown") if hasattr(os, "sched_getscheduler") else "unknown"
+    return names.get(os.sched_getscheduler(0), "unknown")
 
 
 R = TypeVar("R")
@@ -188,19 +192,8 @@ def measure_timer_lateness(seconds: float, period_ns: int = 1_000_000) -> Latene
 
 def run_under_fifo(function: Callable[[], R], priority: int = 1) -> R | None:
     """`function()` in a thread of its own under SCHED_FIFO; None where the right to it is not granted."""
-    result: list[R] = []
-
-    def work() -> None:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))  # 0: this thread only
-        except OSError:
-            return
-        result.append(function())
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    return result[0] if result else None
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: function() if _set_fifo(0, priority) else None).result()  # 0: this thread only
 
 
 def read_clock_resolution_ns() -> float:

@@ -8,17 +8,14 @@ the rows of the sequence are those of a run without probes. After clean-up the c
 """
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from plant.effects import CATALOGUE
-from plant.model import Model
 from plant.segments import RATE
 from rig.network.codec import Control
-from rig.nodes.scenario import Scenario
 from rig.run.loop import CycleInput, History
-from rig.sequences.faults import Plan, Schedule
+from rig.sequences.faults import Schedule
 from rig.sequences.protocol import Mask, Rows
 
 BEFORE, AFTER = 3, 4  # phase numbers, beside those of set-up, main and clean-up; the log has their frames only
@@ -59,17 +56,6 @@ def list_inputs(steps: tuple[Step, ...], phase: int, demand: float) -> list[Cycl
             for _ in range(step.cycles)]
 
 
-def make_probe_scenario(scenario: Scenario) -> Scenario:
-    """The plant of a run in its initial state, without faults and loads."""
-    return Scenario(scenario.model, Plan(stop=0), (), scenario.seed)
-
-
-def has_firmware_effects(model: Model) -> bool:
-    """Whether effects act inside the reference firmware, which then does not follow its gains."""
-    acting = (CATALOGUE[name] for name in model.effects)
-    return any(effect.firmware and effect.is_active(model.values) for effect in acting)
-
-
 def has_no_answers(probe: History) -> bool:
     """Whether the last cycles were all without a drive frame."""
     last = probe.column("cor")[-_MISSED_LIMIT:]
@@ -85,17 +71,6 @@ def find_gap(probe: History, on_time: Mask, cycles: int) -> str:
     if np.isnan(probe.column("xj")[-cycles:]).any() or (missing & ~on_time[-cycles:]).any():
         return "bench"
     return "controller" if missing.any() else ""
-
-
-def select_last(rows: Rows, cycles: int) -> Rows:
-    """The last `cycles` of a probe: without its warm-up."""
-    columns: Any = (column[-cycles:] for column in rows)
-    return Rows(*columns)
-
-
-def leave_out_gaps(rows: Rows) -> Rows:
-    """The rows of a probe as if there were no answer in cycles without feedback: there is nothing to answer to."""
-    return rows._replace(cor=np.where(np.isnan(rows.xj), np.nan, rows.cor))
 
 
 def read_rows(history: History, on_time: Mask) -> Rows:

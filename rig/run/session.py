@@ -30,17 +30,14 @@ from rig.run.bring_up import BringUp
 from rig.run.hard_loop import open_loop
 from rig.run.job import Job
 from rig.run.loop import CycleInput, History
-from rig.run.participants import Participants
+from rig.run.participants import Participants, find_firmware_parameters
 from rig.run.probe import (
     AFTER,
     LAST_STEPS,
     count_cycles,
-    has_firmware_effects,
-    leave_out_gaps,
     list_first_steps,
     list_inputs,
     read_rows,
-    select_last,
 )
 from rig.run.state import Journal, SafeState, Stage
 from rig.run.watch import NodeWatch, OverrunWatch
@@ -72,10 +69,10 @@ class CycleLog:
     def cycle(self, t_ns: int, signals: Signals, timing: Timing) -> None:
         """Record a complete cycle (called by the loop)."""
         if signals.phase == AFTER:
-            self.after.add(signals, timing)
+            self.after.cycle(t_ns, signals, timing)
             return
         self._journal.log_due(signals.cycle, t_ns)
-        self.history.add(signals, timing)
+        self.history.cycle(t_ns, signals, timing)
         self.due_ns.append(t_ns)
         self._nodes.add(signals)
         if self._is_realtime:
@@ -104,9 +101,8 @@ class CycleLog:
         """The first guard that one of the rows since the last call has passed."""
         rows, self._unjudged = self._unjudged, []
         for row in rows:
-            passed = self._guards.find_passed({"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12,
-                                               "xs": row.xs, "load": row.load, "error": row.com - row.xj})
-            if passed:
+            signals = {"com": row.com, "xj": row.xj, "cor": row.cor, "p12": row.p12, "xs": row.xs, "load": row.load}
+            if passed := self._guards.find_passed({**signals, "error": row.com - row.xj}):
                 return passed
         return None
 
@@ -116,8 +112,7 @@ class FaultAgenda:
 
     def __init__(self, faults: Schedule, stage: Stage, journal: Journal, master: Master) -> None:
         self._faults, self._stage, self._journal, self._master = faults, stage, journal, master
-        self._edges = sorted(faults.edges)
-        self._resets = list(faults.resets)
+        self._edges, self._resets = sorted(faults.edges), list(faults.resets)
         self._injected = 0  # cycles whose frames of other nodes are sent
 
     def announce(self) -> None:
@@ -314,17 +309,19 @@ class Session:
 
         def read(history: History) -> Rows:
             rows = read_rows(history, start.find_on_time_of(history))
-            return leave_out_gaps(rows) if job.realtime else rows
+            if job.realtime:  # without feedback there is nothing to answer to
+                return rows._replace(cor=np.where(np.isnan(rows.xj), np.nan, rows.cor))
+            return rows
 
         history, after = self.log.history, self.log.after
         return ProtocolRecord(
             run=read_rows(history, judged & start.find_on_time_of(history, self._faults)),
-            probes=[select_last(read(probe), cycles) for probe in start.probes if len(probe)],
+            probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in start.probes if len(probe)],
             after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
             deaf_cycles=self._faults.list_bus_off_cycles("rig").tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             current_limit=model["controller.current_limit"] if start.gains is None else start.gains.current_limit,
-            gains=None if has_firmware_effects(model) else start.gains, realtime=job.realtime,
+            gains=None if find_firmware_parameters(model) else start.gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)

@@ -134,10 +134,9 @@ class NodeWatch:
         if self._master.is_deaf:
             return
         heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
-        self._silence.look(now, {node: heard[node] for node, state in self._master.states.items()
-                                 if node in heard and state == NmtState.OPERATIONAL})
         answering = [node for node in self.last_answers if self._is_answering(node, recent=1)]
-        found = self._silence.find_silent(answering)
+        found = self._silence.find_silent(now, {node: heard[node] for node, state in self._master.states.items()
+                                                if node in heard and state == NmtState.OPERATIONAL}, answering)
         for node in self._silent - found.keys():
             self._silent.discard(node)
             self._handle_return(node)
@@ -202,20 +201,19 @@ class SilenceWatch:
         self._heard_ns: dict[int, int] = {}
         self._silent_ns: dict[int, int] = {}
 
-    def look(self, now_ns: int, heard_ns: Mapping[int, int]) -> None:
-        """Take note of the last heartbeats.
+    def find_silent(self, now_ns: int, heard_ns: Mapping[int, int], answering: Collection[int] = ()
+                    ) -> dict[int, float]:
+        """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s.
 
         Args:
             now_ns: time.
             heard_ns: when the last heartbeat of each node came that is to be watched.
+            answering: nodes that take part in the cycles.
         """
         passed = min(now_ns - self._looked_ns, self._step)
         self._looked_ns = now_ns
         self._silent_ns = {node: self._silent_ns.get(node, 0) + passed if heard == self._heard_ns.get(node) else 0
                            for node, heard in heard_ns.items()}
         self._heard_ns = dict(heard_ns)
-
-    def find_silent(self, answering: Collection[int] = ()) -> dict[int, float]:
-        """Nodes that are silent and not `answering`, with the time for which the rig has listened in vain, s."""
         return {node: silent * 1e-9 for node, silent in self._silent_ns.items()
                 if silent >= self._limit and node not in answering}

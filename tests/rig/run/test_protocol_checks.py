@@ -149,7 +149,7 @@ def test_a_report_before_or_after_the_cycles_of_the_run_ends_nothing(tmp_path: P
 def test_a_gap_where_the_bench_was_late_is_not_the_controllers() -> None:
     probe = History()
     for k in range(10):
-        probe.add(Signals(k, 3, 0.0, 0.0, nan if k == 5 else 0.0, 0.0, 0.0, 0.0, 7, 7, 0),
+        probe.cycle(k, Signals(k, 3, 0.0, 0.0, nan if k == 5 else 0.0, 0.0, 0.0, 0.0, 7, 7, 0),
                   Timing(k, False, 0.0, 1e-4, 2e-4, 1e-4, 1e-4, 0.0))
     on_time = np.ones(10, bool)
     assert find_gap(probe, on_time, 10) == "controller" and find_gap(probe, on_time, 4) == ""
