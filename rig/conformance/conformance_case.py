@@ -1,13 +1,16 @@
 """A test case: its number, what it expects, and the function that finds out; and what can come of it."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+from fdi.report.numbers import count_nouns
 
 if TYPE_CHECKING:
     from rig.conformance.target import Target
 
+Item = TypeVar("Item")
 CHAPTERS = {
     1: "Electronic data sheet",
     2: "Object dictionary",
@@ -35,7 +38,11 @@ class CaseEnd(Exception):
 
 
 class CaseFailed(CaseEnd):
-    """The node does not do what is expected."""
+    """The node does not do what is expected, and the case cannot go on."""
+
+
+class Problem(CaseFailed):
+    """One thing is not as expected. A case that looks at many things looks at the others all the same."""
 
 
 class CaseNotApplicable(CaseEnd):
@@ -68,61 +75,52 @@ class Case(NamedTuple):
         """Number of the chapter."""
         return int(self.number.partition(".")[0])
 
-    @property
-    def order(self) -> tuple[int, int]:
-        """Key that sorts 3.2 before 3.10."""
-        chapter, _, position = self.number.partition(".")
-        return int(chapter), int(position)
+
+def for_each(select: Callable[[Target], Iterable[Item]], probe: Callable[[Target, Item], str | None], noun: str = "",
+             text: str = "{}") -> Check:
+    """A check that probes one thing after the other: objects, PDOs, requests that must be refused.
+
+    The probe raises Problem for a thing that is wrong, and CaseNotApplicable for one that does not count. The check
+    measures the number of things, if there is a noun for them, or else what the probe returns for each; `text` is the
+    sentence around it. Without anything that counts the case is not applicable.
+    """
+    def check(t: Target) -> str:
+        found: list[str] = []
+        problems: list[str] = []
+        reason: CaseNotApplicable | None = None
+        for item in select(t):
+            try:
+                found.append(probe(t, item) or "")
+            except Problem as problem:
+                problems.append(str(problem))
+            except CaseNotApplicable as end:
+                reason = reason or end
+        require(not problems, join_labels(problems))
+        if not found:
+            raise reason or CaseNotApplicable("the EDS has no such object")
+        return text.format(count_nouns(len(found), noun) if noun else join_labels(found, 8))
+
+    return check
 
 
-class Result(NamedTuple):
-    """What became of one case."""
-
-    number: str
-    name: str
-    section: str
-    expected: str
-    measured: str
-    verdict: Verdict
-    seconds: float  # on the clock of the bus
-
-    @property
-    def chapter(self) -> int:
-        """Number of the chapter."""
-        return int(self.number.partition(".")[0])
-
-
-def case(number: str, name: str, section: str, expected: str, is_timed: bool = False) -> Callable[[Check], Case]:
-    """Decorator that makes a test case of a function that measures."""
-
-    def make(check: Check) -> Case:
-        return Case(number, name, section, expected, check, is_timed)
-
-    return make
-
-
-def require(condition: bool, measured: str) -> None:
-    """Fail the case unless the condition holds. Raises CaseFailed."""
+def require(condition: object, measured: str) -> None:
+    """Raises Problem unless the condition holds."""
     if not condition:
-        raise CaseFailed(measured)
+        raise Problem(measured)
 
 
-def require_applicable(condition: object, reason: str) -> None:
-    """End the case as not applicable unless the condition holds. Raises CaseNotApplicable."""
+def require_applicable(condition: object, reason: str = "") -> None:
+    """Raises CaseNotApplicable unless the condition holds."""
     if not condition:
         raise CaseNotApplicable(reason)
 
 
-def require_none(problems: Sequence[str]) -> None:
-    """Fail the case with the problems that were found, unless there are none. Raises CaseFailed."""
-    require(not problems, join_labels(problems))
-
-
 def join_labels(labels: Sequence[str], most: int = 4) -> str:
-    """A few of the labels, and how many more there are.
+    """A few of the labels, and how many more there are. Semicolons part labels that have commas.
 
-    >>> join_labels(["a", "b", "c"], 2)
-    'a, b and 1 more'
+    >>> join_labels(["a", "b", "c"], 2), join_labels(["a, b", "c"])
+    ('a, b and 1 more', 'a, b; c')
     """
-    shown = ", ".join(labels[:most])
+    mark = "; " if any("," in label for label in labels) else ", "
+    shown = mark.join(labels[:most])
     return f"{shown} and {len(labels) - most} more" if len(labels) > most else shown

@@ -1,19 +1,14 @@
 """Chapter 2: the object dictionary holds what the EDS says, and refuses what it must."""
 from __future__ import annotations
 
-from fdi.report.numbers import count_nouns
-from rig.conformance.conformance_case import (
-    CaseFailed,
-    CaseNotApplicable,
-    case,
-    join_labels,
-    require,
-    require_applicable,
-    require_none,
-)
-from rig.conformance.data_sheet import DOMAIN, MAPPING, RPDO, TPDO, Variable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from canopen.objectdictionary.datatypes import DOMAIN
+
+from rig.conformance.conformance_case import Case, CaseFailed, for_each, require, require_applicable
+from rig.conformance.data_sheet import HISTORY, Variable
 from rig.conformance.target import (
-    HEAD,
     NO_DATA,
     NO_OBJECT,
     NO_SUB,
@@ -28,271 +23,29 @@ from rig.conformance.target import (
     Refusal,
     Target,
     format_abort,
+    require_abort,
 )
 
-
-@case("2.1", "every object can be read", "7.2.4.2", "an upload of each readable object is answered with its value")
-def check_all_readable(t: Target) -> str:
-    """Read everything. An empty field of the error history, and a string without a value, may say so."""
-    problems, count = [], 0
-    for variable in list_readable(t):
-        code = t.try_upload(variable.index, variable.sub)
-        if code and not (code in (NO_DATA, NO_SUB) and (variable.index == 0x1003 or not variable.size)):
-            problems.append(f"{variable.label}: {format_abort(code)}")
-        count += 1
-    require_none(problems)
-    return f"{count_nouns(count, 'object')} read"
+Value = tuple[Variable, bytes]  # an object, and what it holds
 
 
-@case("2.2", "lengths", "7.1.4", "each value has as many bytes as its data type")
-def check_lengths(t: Target) -> str:
-    """An UNSIGNED16 has two bytes."""
-    problems, count = [], 0
-    for variable in list_readable(t):
-        data = _read(t, variable)
-        if data is None or not variable.size:
-            continue
-        count += 1
-        if len(data) != variable.size:
-            problems.append(f"{variable.label} has {len(data)} bytes, expected {variable.size}")
-    require_none(problems)
-    return count_nouns(count, "value")
+class Offer(NamedTuple):
+    """A request that the node must refuse: an upload, or a download if there is data."""
+
+    what: str
+    key: tuple[int, int]
+    data: bytes | None
+    codes: tuple[int, ...]  # that are right
+    before: bytes | None = None  # what is written back if the node accepts the data
 
 
-@case("2.3", "constants", "7.4, 7.5.2.21", "const objects, device type and identity hold the values of the EDS")
-def check_constants(t: Target) -> str:
-    """What cannot change is as the EDS says. The serial number is the device's own."""
-    problems, count = [], 0
-    for variable in list_readable(t):
-        is_fixed = variable.access == "const" or variable.index in (0x1000, 0x1018)
-        if not is_fixed or variable.default_bytes is None or (variable.index, variable.sub) == (0x1018, 4):
-            continue
-        count += 1
-        data = _read(t, variable)
-        if data != variable.default_bytes:
-            problems.append(_describe_difference(variable, data))
-    require_none(problems)
-    return count_nouns(count, "constant")
-
-
-@case("2.4", "defaults after a reset", "7.3.2.2.1",
-      "communication objects hold the defaults of the EDS after a reset of the communication")
-def check_defaults(t: Target) -> str:
-    """Not where the node can store parameters: stored values take the place of the defaults."""
-    require_applicable(0x1010 not in t.sheet.objects, "the node can store parameters (0x1010)")
-    problems, count = [], 0
-    for variable in list_readable(t):
-        if not (variable.is_communication and variable.is_writable) or variable.default_bytes is None:
-            continue
-        if variable.index in (0x1003, 0x1010, 0x1011):
-            continue
-        count += 1
-        data = _read(t, variable)
-        if data != variable.default_bytes:
-            problems.append(_describe_difference(variable, data))
-    require_none(problems)
-    return count_nouns(count, "object")
-
-
-@case("2.5", "values within their limits", "7.4", "each value lies between LowLimit and HighLimit of the EDS")
-def check_values_in_range(t: Target) -> str:
-    """The limits of the EDS hold for what is read."""
-    problems, count = [], 0
-    for variable in list_readable(t):
-        if not variable.is_number or (variable.low is None and variable.high is None):
-            continue
-        data = _read(t, variable)
-        if data is None or len(data) != variable.size:
-            continue
-        count += 1
-        value = variable.decode(data)
-        if (variable.low is not None and value < variable.low) or (variable.high is not None and value > variable.high):
-            problems.append(f"{variable.label} is {value}, limits {variable.low} to {variable.high}")
-    require_applicable(count, "the EDS gives no limits")
-    require_none(problems)
-    return count_nouns(count, "value")
-
-
-@case("2.6", "sub 0 of arrays and records", "7.4", "sub 0 holds the highest sub-index of the EDS")
-def check_highest_sub(t: Target) -> str:
-    """Not for the error history and mappings, whose sub 0 counts."""
-    problems, count = [], 0
-    for index, variables in t.sheet.objects.items():
-        if len(variables) < 2 or index == 0x1003 or any(base + MAPPING <= index < base + 2 * MAPPING
-                                                        for base in (RPDO, TPDO)):
-            continue
-        count += 1
-        highest, found = max(variable.sub for variable in variables), t.read(index, 0)
-        if found != highest:
-            problems.append(f"0x{index:04X}:0 is {found}, the highest sub-index is {highest}")
-    require_none(problems)
-    return count_nouns(count, "object")
-
-
-@case("2.7", "unknown object", "7.2.4.3.17, table 22", "upload and download are refused with 0x06020000")
-def check_unknown_object(t: Target) -> str:
-    """An index that the EDS does not have, in each area of the dictionary."""
-    areas = (range(0x1002, 0x1200), range(0x1F00, 0x2000), range(0x2000, 0x6000), range(0x6000, 0xA000),
-             range(0xFFFF, 0x10000))
-    tried, problems = [], []
-    for area in areas:
-        index = next((index for index in area if index not in t.sheet.objects), None)
-        if index is None:
-            continue
-        tried.append(f"0x{index:04X}")
-        for what, request in (("upload", HEAD.pack(0x40, index, 0)), ("download", HEAD.pack(0x2F, index, 0))):
-            code = t.find_abort(request.ljust(8, b"\0"))
-            if code != NO_OBJECT:
-                problems.append(f"{what} of 0x{index:04X}: {format_abort(code)}")
-    require_none(problems)
-    return f"refused: {', '.join(tried)}"
-
-
-@case("2.8", "unknown sub-index", "7.2.4.3.17, table 22", "upload and download are refused with 0x06090011")
-def check_unknown_sub(t: Target) -> str:
-    """One sub-index beyond the last of each object, and 255."""
-    problems, count = [], 0
-    for index, variables in t.sheet.objects.items():
-        if variables[0].is_active:
-            continue
-        for sub in (max(variable.sub for variable in variables) + 1, 0xFE):
-            requests = [("upload", HEAD.pack(0x40, index, sub))]
-            if index == 0x1018:  # nothing is written there, whatever the node does
-                requests.append(("download", HEAD.pack(0x2F, index, sub)))
-            for what, request in requests:
-                count += 1
-                code = t.find_abort(request.ljust(8, b"\0"))
-                if code != NO_SUB:
-                    problems.append(f"{what} of 0x{index:04X}:{sub:X}: {format_abort(code)}")
-    require_none(problems)
-    return f"{count_nouns(count, 'request')} refused"
-
-
-@case("2.9", "read-only objects", "7.2.4.3.17, table 22",
-      "a download of the value they hold is refused with 0x06010002")
-def check_read_only(t: Target) -> str:
-    """`ro`, `const` and nothing else; the value offered is the one that is there."""
-    problems, count = [], 0
-    for variable in list_readable(t):
-        data = None if variable.is_writable or variable.is_active else _read(t, variable)
-        if data is None:
-            continue
-        count += 1
-        code = t.try_download(variable.index, variable.sub, data or b"\0")
-        if code != READ_ONLY:
-            problems.append(f"{variable.label} ({variable.access}): {format_abort(code)}")
-    require_none(problems)
-    return f"{count_nouns(count, 'download')} refused"
-
-
-@case("2.10", "write-only objects", "7.2.4.3.17, table 22", "an upload is refused with 0x06010001")
-def check_write_only(t: Target) -> str:
-    """`wo` in the EDS."""
-    chosen = [variable for variable in t.sheet.variables if not variable.is_readable]
-    require_applicable(chosen, "the EDS has no write-only object")
-    problems = []
-    for variable in chosen:
-        code = t.try_upload(variable.index, variable.sub)
-        if code != WRITE_ONLY:
-            problems.append(f"{variable.label}: {format_abort(code)}")
-    require_none(problems)
-    return f"refused: {join_labels([variable.label for variable in chosen])}"
-
-
-@case("2.11", "a value is written back", "7.2.4.2",
-      "an object that may be written takes the value read from it and keeps it")
-def check_write_back(t: Target) -> str:
-    """Every writable object but those that start something, mappings and the error history."""
-    problems, count = [], 0
-    for variable in t.sheet.variables:
-        if not (variable.is_writable and variable.is_readable) or variable.is_active or variable.index == 0x1003 or any(
-                base + MAPPING <= variable.index < base + 2 * MAPPING for base in (RPDO, TPDO)):
-            continue
-        data = _read(t, variable)
-        if not data or variable.data_type == DOMAIN:
-            continue
-        count += 1
-        code = t.try_download(variable.index, variable.sub, data)
-        if code:
-            problems.append(f"{variable.label}: {format_abort(code)}")
-        elif _read(t, variable) != data:
-            problems.append(f"{variable.label} holds another value then")
-    require_applicable(count, "the EDS has no such object")
-    require_none(problems)
-    return count_nouns(count, "object")
-
-
-@case("2.12", "wrong length", "7.2.4.3.17, table 22",
-      "one byte too many is refused with 0x06070012, one too few with 0x06070013 (or 0x06070010)")
-def check_wrong_length(t: Target) -> str:
-    """In communication objects; with --write in all numbers that may be written."""
-    problems, count = [], 0
-    for variable in _list_writable_numbers(t):
-        data = _read(t, variable)
-        if data is None:
-            continue
-        offers = [(data + b"\0", TOO_LONG, "too long")]
-        if variable.size > 1:
-            offers.append((data[:-1], TOO_SHORT, "too short"))
-        for offered, expected, what in offers:
-            count += 1
-            code = t.try_download(variable.index, variable.sub, offered)
-            if code not in (expected, WRONG_LENGTH):
-                problems.append(f"{variable.label}, {what}: {format_abort(code)}")
-                if not code:
-                    t.try_download(variable.index, variable.sub, data)
-    require_applicable(count, "the EDS has no such object")
-    require_none(problems)
-    return f"{count_nouns(count, 'download')} refused"
-
-
-@case("2.13", "value out of range", "7.2.4.3.17, table 22",
-      "a value beyond LowLimit or HighLimit is refused with 0x06090030, 0x06090031 or 0x06090032")
-def check_out_of_range(t: Target) -> str:
-    """In communication objects; with --write in all numbers that may be written."""
-    problems, count = [], 0
-    for variable in _list_writable_numbers(t):
-        for limit, step, codes in ((variable.high, 1, (VALUE, TOO_HIGH)), (variable.low, -1, (VALUE, TOO_LOW))):
-            if limit is None:
-                continue
-            try:
-                offered = variable.encode(limit + step)
-            except (OverflowError, ValueError):
-                continue
-            data = _read(t, variable)
-            count += 1
-            code = t.try_download(variable.index, variable.sub, offered)
-            if code not in codes:
-                problems.append(f"{variable.label} = {limit + step}: {format_abort(code)}")
-                if not code and data is not None:
-                    t.try_download(variable.index, variable.sub, data)
-    require_applicable(count, "no writable object has limits in the EDS")
-    require_none(problems)
-    return f"{count_nouns(count, 'value')} refused"
-
-
-@case("2.14", "device name and versions", "7.5.2.8 to 7.5.2.10",
-      "0x1008, 0x1009 and 0x100A are texts of printable characters")
-def check_names(t: Target) -> str:
-    """What the device says about itself."""
-    found = []
-    for index in (0x1008, 0x1009, 0x100A):
-        if t.sheet.find(index) is None:
-            continue
-        data = t.upload(index).rstrip(b"\0")
-        if any(not 0x20 <= byte < 0x7F for byte in data):
-            raise CaseFailed(f"0x{index:04X} holds {data!r}")
-        found.append(data.decode("ascii"))
-    require_applicable(found, "the node has none of them")
-    return ", ".join(found)
-
-
-@case("2.15", "error register", "7.5.2.2", "0x1001 is 0 after a reset: the node reports no error")
-def check_error_register(t: Target) -> str:
-    """A node that is in error from the start cannot be judged further on."""
-    register = t.read(0x1001)
-    require(register == 0, f"0x{register:02X}")
-    return "0x00"
+def check_refused(t: Target, offer: Offer) -> str:
+    """The node refuses an offer with the right code."""
+    code = t.try_upload(*offer.key) if offer.data is None else t.try_download(*offer.key, offer.data)
+    if not code and offer.before is not None:
+        t.try_download(*offer.key, offer.before)
+    require_abort(code, offer.codes, offer.what)
+    return offer.what
 
 
 def list_readable(t: Target) -> list[Variable]:
@@ -300,27 +53,179 @@ def list_readable(t: Target) -> list[Variable]:
     return [variable for variable in t.sheet.variables if variable.is_readable]
 
 
-def _list_writable_numbers(t: Target) -> list[Variable]:
+def read_values(t: Target, is_wanted: Callable[[Variable], object],
+                ignored: type[CaseFailed] = Refusal) -> Iterator[Value]:
+    """The readable objects that are wanted, and what each holds; without those whose reading ends as is ignored."""
+    for variable in filter(is_wanted, list_readable(t)):
+        try:
+            data = t.upload(*variable.key)
+        except ignored:
+            continue
+        yield variable, data
+
+
+def check_readable(t: Target, variable: Variable) -> None:
+    """An empty field of the error history, and a string without a value, may say so."""
+    code = t.try_upload(*variable.key)
+    is_empty = code in (NO_DATA, NO_SUB) and (variable.index == HISTORY or not variable.size)
+    require(not code or is_empty, f"{variable.label}: {format_abort(code)}")
+
+
+def check_length(t: Target, value: Value) -> None:
+    """An UNSIGNED16 has two bytes."""
+    value[0].decode(value[1])
+
+
+def check_limits(t: Target, value: Value) -> None:
+    """The limits of the EDS hold for what is read."""
+    variable, number = value[0], value[0].decode(value[1])
+    require(variable.is_inside(number), f"{variable.label} is {number}, limits {variable.low} to {variable.high}")
+
+
+def check_default(t: Target, variable: Variable) -> None:
+    """It holds what the EDS says."""
+    data, expected = t.upload(*variable.key), variable.default_bytes or b""
+    require(data == expected, f"{variable.label} is {variable.show(data)}, the EDS says {variable.show(expected)}")
+
+
+def list_constants(t: Target) -> list[Variable]:
+    """What cannot change. The serial number is the device's own."""
+    return [variable for variable in list_readable(t)
+            if (variable.access == "const" or variable.index in (0x1000, 0x1018))
+            and variable.default_bytes is not None and variable.key != (0x1018, 4)]
+
+
+def list_reset(t: Target) -> list[Variable]:
+    """What a reset restores. Not where the node can store parameters: these take the place of the defaults."""
+    require_applicable(0x1010 not in t.sheet.objects, "the node can store parameters (0x1010)")
+    return [variable for variable in list_readable(t) if variable.is_communication and variable.is_writable
+            and variable.default_bytes is not None and variable.index not in (HISTORY, 0x1011)]
+
+
+def check_highest_sub(t: Target, variables: list[Variable]) -> None:
+    """Arrays and records say how many sub-indices they have."""
+    found, highest = t.read(variables[0].index), variables[-1].sub
+    require(found == highest, f"0x{variables[0].index:04X}:0 is {found}, the highest sub-index is {highest}")
+
+
+def offer_unknown_objects(t: Target) -> Iterator[Offer]:
+    """An index that the EDS does not have, in each area of the dictionary."""
+    for area in (range(0x1002, 0x1200), range(0x1F00, 0x2000), range(0x2000, 0x6000), range(0x6000, 0xA000),
+                 range(0xFFFF, 0x10000)):
+        for index in [index for index in area if index not in t.sheet.objects][:1]:
+            yield Offer(f"upload of 0x{index:04X}", (index, 0), None, (NO_OBJECT,))
+            yield Offer(f"download of 0x{index:04X}", (index, 0), b"\0", (NO_OBJECT,))
+
+
+def offer_unknown_subs(t: Target) -> Iterator[Offer]:
+    """One sub-index beyond the last of each object, and 254."""
+    for index, variables in t.sheet.objects.items():
+        for sub in () if variables[0].is_active else (variables[-1].sub + 1, 0xFE):
+            yield Offer(f"upload of 0x{index:04X}:{sub:X}", (index, sub), None, (NO_SUB,))
+            if index == 0x1018:  # nothing is written there, whatever the node does
+                yield Offer(f"download of 0x{index:04X}:{sub:X}", (index, sub), b"\0", (NO_SUB,))
+
+
+def offer_read_only(t: Target) -> Iterator[Offer]:
+    """`ro`, `const` and nothing else; the value offered is the one that is there."""
+    for variable, data in read_values(t, lambda each: not each.is_writable and not each.is_active):
+        yield Offer(f"{variable.label} ({variable.access})", variable.key, data or b"\0", (READ_ONLY,))
+
+
+def offer_write_only(t: Target) -> list[Offer]:
+    """`wo` in the EDS."""
+    return [Offer(each.label, each.key, None, (WRITE_ONLY,)) for each in t.sheet.variables if not each.is_readable]
+
+
+def is_safe_to_write_back(variable: Variable) -> bool:
+    """Every writable object but those that start something, mappings and the error history."""
+    return (variable.is_writable and not variable.is_active and not variable.is_mapping
+            and variable.index != HISTORY and variable.data_type != DOMAIN)
+
+
+def check_write_back(t: Target, value: Value) -> None:
+    """An object takes what was read from it, and keeps it."""
+    variable, data = value
+    require_applicable(data)
+    t.download(*variable.key, data)
+    t.require_value(variable, data, "holds another value then")
+
+
+def read_writable_numbers(t: Target) -> Iterator[Value]:
     """Numbers to which a wrong value can be offered without harm: their meaning is known, or --write allows it."""
     harmless = ((0x1017, 0), (0x1029, 1), (0x1016, 1), (0x1006, 0), (0x1007, 0), (0x1015, 0))
-    chosen = [variable for variable in t.sheet.variables if variable.is_number and variable.is_writable
-              and variable.is_readable and not variable.is_active
-              and ((variable.index, variable.sub) in harmless
-                   or (t.options.may_write and not variable.is_communication))]
-    if not chosen:
-        raise CaseNotApplicable("the EDS has no such object")
-    return chosen
+    return read_values(t, lambda each: each.size and each.is_writable and not each.is_active and (
+        each.key in harmless or (t.options.may_write and not each.is_communication)))
 
 
-def _read(t: Target, variable: Variable) -> bytes | None:
-    """What it holds, None if the node gives nothing."""
-    try:
-        return t.upload(variable.index, variable.sub)
-    except Refusal:
-        return None
+def offer_wrong_lengths(t: Target) -> Iterator[Offer]:
+    """In communication objects; with --write in all numbers that may be written."""
+    for variable, data in read_writable_numbers(t):
+        yield Offer(f"{variable.label}, too long", variable.key, data + b"\0", (TOO_LONG, WRONG_LENGTH), data)
+        if variable.size > 1:
+            yield Offer(f"{variable.label}, too short", variable.key, data[:-1], (TOO_SHORT, WRONG_LENGTH), data)
 
 
-def _describe_difference(variable: Variable, data: bytes | None) -> str:
-    """What it holds and what the EDS says."""
-    found = "nothing" if data is None else variable.show(data)
-    return f"{variable.label} is {found}, the EDS says {variable.show(variable.default_bytes or b'')}"
+def offer_values_out_of_range(t: Target) -> Iterator[Offer]:
+    """In communication objects; with --write in all numbers that may be written."""
+    for variable, data in read_writable_numbers(t):
+        for limit, step, code in ((variable.high, 1, TOO_HIGH), (variable.low, -1, TOO_LOW)):
+            if limit is not None and variable.can_hold(limit + step):
+                offered = variable.encode(limit + step)
+                yield Offer(f"{variable.label} = {limit + step}", variable.key, offered, (VALUE, code), data)
+
+
+def check_name(t: Target, index: int) -> str:
+    """What the device says about itself."""
+    data = t.upload(index).rstrip(b"\0")
+    require(all(0x20 <= byte < 0x7F for byte in data), f"0x{index:04X} holds {data!r}")
+    return data.decode("ascii")
+
+
+def check_error_register(t: Target) -> str:
+    """A node that is in error from the start cannot be judged further on."""
+    register = t.read(0x1001)
+    require(register == 0, f"0x{register:02X}")
+    return "0x00"
+
+
+CASES = (
+    Case("2.1", "every object can be read", "7.2.4.2", "an upload of each readable object is answered with its value",
+         for_each(list_readable, check_readable, "object", "{} read")),
+    Case("2.2", "lengths", "7.1.4", "each value has as many bytes as its data type",
+         for_each(lambda t: read_values(t, lambda each: each.size), check_length, "value")),
+    Case("2.3", "constants", "7.4, 7.5.2.21", "const objects, device type and identity hold the values of the EDS",
+         for_each(list_constants, check_default, "constant")),
+    Case("2.4", "defaults after a reset", "7.3.2.2.1",
+         "communication objects hold the defaults of the EDS after a reset of the communication",
+         for_each(list_reset, check_default, "object")),
+    Case("2.5", "values within their limits", "7.4", "each value lies between LowLimit and HighLimit of the EDS",
+         for_each(lambda t: read_values(t, lambda each: each.size and (each.low, each.high) != (None, None)),
+                  check_limits, "value")),
+    Case("2.6", "sub 0 of arrays and records", "7.4", "sub 0 holds the highest sub-index of the EDS",
+         for_each(lambda t: [each for index, each in t.sheet.objects.items() if len(each) > 1 and index != HISTORY
+                             and not each[0].is_mapping], check_highest_sub, "object")),
+    Case("2.7", "unknown object", "7.2.4.3.17, table 22", "upload and download are refused with 0x06020000",
+         for_each(offer_unknown_objects, check_refused, "request", "{} refused")),
+    Case("2.8", "unknown sub-index", "7.2.4.3.17, table 22", "upload and download are refused with 0x06090011",
+         for_each(offer_unknown_subs, check_refused, "request", "{} refused")),
+    Case("2.9", "read-only objects", "7.2.4.3.17, table 22",
+         "a download of the value they hold is refused with 0x06010002",
+         for_each(offer_read_only, check_refused, "download", "{} refused")),
+    Case("2.10", "write-only objects", "7.2.4.3.17, table 22", "an upload is refused with 0x06010001",
+         for_each(offer_write_only, check_refused, text="refused: {}")),
+    Case("2.11", "a value is written back", "7.2.4.2",
+         "an object that may be written takes the value read from it and keeps it",
+         for_each(lambda t: read_values(t, is_safe_to_write_back), check_write_back, "object")),
+    Case("2.12", "wrong length", "7.2.4.3.17, table 22",
+         "one byte too many is refused with 0x06070012, one too few with 0x06070013 (or 0x06070010)",
+         for_each(offer_wrong_lengths, check_refused, "download", "{} refused")),
+    Case("2.13", "value out of range", "7.2.4.3.17, table 22",
+         "a value beyond LowLimit or HighLimit is refused with 0x06090030, 0x06090031 or 0x06090032",
+         for_each(offer_values_out_of_range, check_refused, "value", "{} refused")),
+    Case("2.14", "device name and versions", "7.5.2.8 to 7.5.2.10",
+         "0x1008, 0x1009 and 0x100A are texts of printable characters",
+         for_each(lambda t: [index for index in (0x1008, 0x1009, 0x100A) if t.sheet.find(index)], check_name)),
+    Case("2.15", "error register", "7.5.2.2", "0x1001 is 0 after a reset: the node reports no error",
+         check_error_register),
+)

@@ -1,541 +1,476 @@
 """Chapter 4: PDOs: parameters, transmission types, COB-IDs, mapping, wrong lengths, and what a received one does."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
-from rig.conformance.conformance_case import CaseSkipped, case, join_labels, require, require_applicable
-from rig.conformance.data_sheet import Pdo, Variable, list_restricted_ends
+from rig.conformance.conformance_case import (
+    Case,
+    CaseNotApplicable,
+    CaseSkipped,
+    Problem,
+    for_each,
+    join_labels,
+    require,
+    require_applicable,
+)
+from rig.conformance.data_sheet import RESTRICTED_ENDS, Pdo
 from rig.conformance.target import (
+    CANNOT_MAP,
+    COMMANDS,
+    INVALID,
     NO_OBJECT,
     OPERATIONAL,
+    PDO_TOO_LONG,
+    PRE_OPERATIONAL,
     STATE,
     VALUE,
     Target,
     format_abort,
+    read_error_code,
+    require_abort,
 )
 from rig.network.frame import Frame
 
-INVALID, EXTENDED = 1 << 31, 1 << 29
+EXTENDED, PRODUCER = 1 << 29, 1 << 30  # in a COB-ID: 29 bits; in that of SYNC: the node sends it
 LAST_SYNCHRONOUS = 240
-TOO_SHORT = 0x8210
-CANNOT_MAP, PDO_TOO_LONG = 0x06040041, 0x06040042
+TOO_SHORT, TOO_LONG = 0x8210, 0x8220  # error codes
 SETTLE = 0.1  # s: the time in which a frame that is not expected would come
 
 
-@case("4.1", "communication parameters", "7.5.2.35, 7.5.2.37",
-      "sub 0 is 2 or more; COB-ID and transmission type can be read")
-def check_parameters(t: Target) -> str:
-    """Of every PDO."""
-    found = []
-    for pdo in _list_pdos(t):
-        highest, word, kind = (t.read(pdo.parameter, sub) for sub in (0, 1, 2))
-        require(2 <= highest <= 6, f"{pdo.name}: sub 0 is {highest}")
-        require(not 241 <= kind <= 251, f"{pdo.name}: transmission type {kind} is reserved")
-        found.append(f"{pdo.name} {'off' if word & INVALID else f'0x{word & 0x7FF:03X}'} type {kind}")
-    return join_labels(found, 8)
+def check_parameters(t: Target, pdo: Pdo) -> str:
+    """COB-ID and transmission type of a PDO."""
+    highest, word, kind = (t.read(pdo.parameter, sub) for sub in (0, 1, 2))
+    require(2 <= highest <= 6, f"{pdo.name}: sub 0 is {highest}")
+    require(not LAST_SYNCHRONOUS < kind <= 251, f"{pdo.name}: transmission type {kind} is reserved")
+    return f"{pdo.name} {'off' if word & INVALID else f'0x{word & 0x7FF:03X}'} type {kind}"
 
 
-@case("4.2", "mapping", "7.5.2.36, 7.5.2.38", "mapped objects exist with that length; at most 64 bits")
-def check_mapping(t: Target) -> str:
+def check_mapping(t: Target, pdo: Pdo) -> str:
     """As the node itself has it, beside the EDS."""
-    found = []
-    for pdo in _list_pdos(t):
-        bits = 0
-        for index, sub, length in read_mapping(t, pdo):
-            bits += length
-            if 0 < index < 0x20:
-                continue
-            variable = t.sheet.find(index, sub)
-            require(variable is not None, f"{pdo.name} maps 0x{index:04X}:{sub:X}, which the EDS does not have")
-            assert variable is not None
-            require(variable.bits == length, f"{pdo.name} maps {variable.label} with {length} bits")
-        require(bits <= 64, f"{pdo.name} has {bits} bits")
-        found.append(f"{pdo.name} {bits} bits")
-    return join_labels(found, 8)
+    return describe_mapping(t, pdo, read_mapping(t, pdo))
 
 
-@case("4.3", "synchronous transmission", "7.2.2.2, 7.5.2.37",
-      "type 1, 2 and 3: one frame at every, every second and every third SYNC, as long as its mapping")
-def check_cyclic(t: Target) -> str:
+def describe_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> str:
+    """The length of a mapping. Raises Problem for objects that the EDS does not have, or with another length."""
+    for word in words:
+        index, sub, bits = split_entry(word)
+        if 0 < index < 0x20:  # a dummy entry
+            continue
+        name, mapped = f"{pdo.name} maps 0x{index:04X}:{sub:X}", t.sheet.find(index, sub)
+        if mapped is None:
+            raise Problem(f"{name}, which is not there")
+        require(mapped.bits == bits, f"{name} with {bits} bits, it has {mapped.bits}")
+    total = sum(split_entry(word)[2] for word in words)
+    require(total <= 64, f"{pdo.name} has {total} bits")
+    return f"{pdo.name} {total} bits"
+
+
+def check_cyclic(t: Target, pdo: Pdo) -> str:
     """Six SYNCs for each type that the node accepts."""
-    found = []
-    for pdo in _list_valid(t, is_sent=True):
-        accepted = []
-        for kind in (1, 2, 3):
-            if not _set_type(t, pdo, kind):
-                continue
-            accepted.append(str(kind))
-            with operational(t):
-                frames = _count_answers(t, pdo, 6, expected=6 // kind)
-            require(len(frames) == 6 // kind, f"{pdo.name}, type {kind}: {len(frames)} frames at 6 SYNCs")
-            length = _length(t, pdo)
-            wrong = [len(data) for data in frames if len(data) != length]
-            require(not wrong, f"{pdo.name}: {wrong[0] if wrong else 0} bytes, the mapping has {length}")
-        if accepted:
-            found.append(f"{pdo.name} types {', '.join(accepted)}")
-    require_applicable(found, "no TPDO accepts a synchronous type")
-    return "; ".join(found)
+    accepted = []
+    for kind in (1, 2, 3):
+        if not set_type(t, pdo, kind):
+            continue
+        accepted.append(str(kind))
+        with operational(t):
+            frames = answer_syncs(t, identify(t, pdo), 6, expected=6 // kind)
+        require(len(frames) == 6 // kind, f"{pdo.name}, type {kind}: {len(frames)} frames at 6 SYNCs")
+        wrong = [len(frame.data) for frame in frames if len(frame.data) != count_bytes(t, pdo)]
+        require(not wrong, f"{pdo.name}: {wrong[:1]} bytes, the mapping has {count_bytes(t, pdo)}")
+    require_applicable(accepted, "no TPDO accepts a synchronous type")
+    return f"{pdo.name} types {', '.join(accepted)}"
 
 
-@case("4.4", "acyclic synchronous transmission", "7.2.2.2, 7.5.2.37",
-      "type 0: nothing without SYNC, at most one frame at each")
-def check_acyclic(t: Target) -> str:
+def check_acyclic(t: Target, pdo: Pdo) -> str:
     """Whether there is something to send is the application's business."""
-    found = []
-    for pdo in _list_valid(t, is_sent=True):
-        if not _set_type(t, pdo, 0):
-            continue
-        with operational(t):
-            before = [frame for frame in t.listen(SETTLE) if frame.cob_id == _cob_id(t, pdo)]
-            require(not before, f"{pdo.name}: {len(before)} frames without SYNC")
-            frames = _count_answers(t, pdo, 4, expected=0)
-        require(len(frames) <= 4, f"{pdo.name}: {len(frames)} frames at 4 SYNCs")
-        found.append(f"{pdo.name} {len(frames)} at 4 SYNCs")
-    require_applicable(found, "no TPDO accepts type 0")
-    return "; ".join(found)
+    require_type(t, pdo, 0)
+    with operational(t):
+        before = t.listen(SETTLE, identify(t, pdo))
+        require(not before, f"{pdo.name}: {len(before)} frames without SYNC")
+        frames = answer_syncs(t, identify(t, pdo), 4, expected=0)
+    require(len(frames) <= 4, f"{pdo.name}: {len(frames)} frames at 4 SYNCs")
+    return f"{pdo.name} {len(frames)} at 4 SYNCs"
 
 
-@case("4.5", "event timer", "7.5.2.37", "type 254 or 255 with event timer 50 ms: a frame every 50 ms", is_timed=True)
-def check_event_timer(t: Target) -> str:
+def check_event_timer(t: Target, pdo: Pdo) -> str:
     """Sub 5 of the parameters, where the node has it."""
-    found = []
-    for pdo in _list_valid(t, is_sent=True):
-        if not t.sheet.is_writable(pdo.parameter, 5) or not (_set_type(t, pdo, 255) or _set_type(t, pdo, 254)):
-            continue
-        if t.try_download(pdo.parameter, 5, (50).to_bytes(2, "little")):
-            continue
-        with operational(t):
-            times = [frame.t_ns for frame in t.listen(1.0, _cob_id(t, pdo))]
-        require(len(times) >= 2, f"{pdo.name}: {len(times)} frames in 1 s")
-        period = (times[-1] - times[0]) * 1e-9 / (len(times) - 1)
-        require(abs(period - 0.05) <= 0.005 + t.options.tolerance, f"{pdo.name}: every {1e3 * period:.1f} ms")
-        found.append(f"{pdo.name} every {1e3 * period:.1f} ms")
-    require_applicable(found, "no TPDO has an event timer")
-    return "; ".join(found)
+    require_applicable(t.sheet.is_writable(pdo.parameter, 5), "no TPDO has an event timer")
+    require_type(t, pdo, 255, 254)
+    require_applicable(t.try_download(pdo.parameter, 5, 50) == 0, "no TPDO has an event timer")
+    with operational(t):
+        times = [frame.t_ns for frame in t.listen(1.0, identify(t, pdo))]
+    require(len(times) >= 2, f"{pdo.name}: {len(times)} frames in 1 s")
+    period = (times[-1] - times[0]) * 1e-9 / (len(times) - 1)
+    text = f"every {1e3 * period:.1f} ms"
+    require(abs(period - 0.05) <= 0.005 + t.options.tolerance, f"{pdo.name}: {text}")
+    return f"{pdo.name} {text}"
 
 
-@case("4.6", "reserved transmission types", "7.5.2.35, 7.5.2.37", "types 241 and 251 are refused with 0x06090030")
-def check_reserved_types(t: Target) -> str:
+def check_reserved_types(t: Target, pdo: Pdo) -> str:
     """An unsupported type is refused as well, so only the reserved ones are tried."""
-    found = []
-    for pdo in _list_pdos(t):
-        if not t.sheet.is_writable(pdo.parameter, 2):
-            continue
-        with t.restore_afterwards(t.variable(pdo.parameter, 2)):
-            for kind in (241, 251):
-                code = t.try_download(pdo.parameter, 2, bytes((kind,)))
-                require(code == VALUE, f"{pdo.name}, type {kind}: {format_abort(code)}")
-        found.append(pdo.name)
-    require_applicable(found, "no transmission type can be written")
-    return f"refused by {', '.join(found)}"
+    require_applicable(t.sheet.is_writable(pdo.parameter, 2), "no transmission type can be written")
+    with t.restore_afterwards((pdo.parameter, 2)):
+        for kind in (241, 251):
+            require_abort(t.try_download(pdo.parameter, 2, kind), (VALUE,), f"{pdo.name}, type {kind}")
+    return pdo.name
 
 
-@case("4.7", "COB-ID of a valid PDO", "7.5.2.35, 7.5.2.37",
-      "it cannot be changed: an abort, and the old one stays in force")
-def check_fixed_while_valid(t: Target) -> str:
-    """Bits 0 to 29 may only be changed while bit 31 says that the PDO is off."""
-    found = []
-    for pdo in _list_changeable(t):
-        word = t.read(pdo.parameter, 1)
-        free = t.find_free_identifiers(1)[0]
-        with _restored_pdo(t, pdo):
-            code = t.try_download(pdo.parameter, 1, (word & ~0x7FF | free).to_bytes(4, "little"))
-            is_refused = code in (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000)  # the standard names no code
-            require(is_refused, f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}: {format_abort(code)}")
-            require(t.read(pdo.parameter, 1) == word, f"{pdo.name} has changed all the same")
-        found.append(f"{pdo.name} {format_abort(code)}")
-    return "; ".join(found)
+def check_fixed_while_valid(t: Target, pdo: Pdo) -> str:
+    """Bits 0 to 29 may only be changed while bit 31 says that the PDO is off. The standard names no abort code."""
+    word, free = t.read(pdo.parameter, 1), t.find_free_identifier()
+    with t.restore_afterwards((pdo.parameter, 1)):
+        code = t.try_download(pdo.parameter, 1, word & ~0x7FF | free)
+        said = require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000),
+                             f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}")
+        require(t.read(pdo.parameter, 1) == word, f"{pdo.name} has changed all the same")
+    return f"{pdo.name} {said}"
 
 
-@case("4.8", "restricted COB-IDs", "7.3.5, table 40", "each is refused with 0x06090030, at both ends of every range")
-def check_restricted(t: Target) -> str:
+def check_restricted(t: Target, pdo: Pdo) -> str:
     """The PDO is switched off first, so that nothing else can be the reason."""
-    found = []
-    for pdo in _list_changeable(t):
-        word = t.read(pdo.parameter, 1)
-        accepted = []
-        with _restored_pdo(t, pdo):
-            for can_id in list_restricted_ends():
-                code = t.try_download(pdo.parameter, 1, (word | INVALID).to_bytes(4, "little"))
-                require(code == 0, f"{pdo.name} cannot be switched off: {format_abort(code)}")
-                code = t.try_download(pdo.parameter, 1, (word & ~0x7FF & ~INVALID | can_id).to_bytes(4, "little"))
-                if code != VALUE:
-                    accepted.append(f"0x{can_id:03X} {format_abort(code)}")
-        require(not accepted, f"{pdo.name}: {join_labels(accepted)}")
-        found.append(pdo.name)
-    return f"{len(list_restricted_ends())} identifiers refused by {', '.join(found)}"
+    accepted = list_accepted(t, (pdo.parameter, 1))
+    require(not accepted, f"{pdo.name}: {join_labels(accepted)}")
+    return pdo.name
 
 
-@case("4.9", "29-bit COB-IDs", "7.5.2.35, 7.5.2.37", "supported, or refused with 0x06090030")
-def check_extended(t: Target) -> str:
+def check_extended(t: Target, pdo: Pdo) -> str:
     """Bit 29 of the COB-ID."""
-    found = []
-    for pdo in _list_changeable(t):
-        word = t.read(pdo.parameter, 1)
-        with _restored_pdo(t, pdo):
-            t.try_download(pdo.parameter, 1, (word | INVALID).to_bytes(4, "little"))
-            code = t.try_download(pdo.parameter, 1, (INVALID | EXTENDED | 0x12345).to_bytes(4, "little"))
-            require(code in (0, VALUE), f"{pdo.name}: {format_abort(code)}")
-            if not code:
-                kept = t.read(pdo.parameter, 1)
-                require(kept & 0x3FFFFFFF == EXTENDED | 0x12345, f"{pdo.name} accepts it and holds 0x{kept:08X}")
-        found.append(f"{pdo.name} {'refused' if code else 'supported'}")
-    return ", ".join(found)
+    word, wide = t.read(pdo.parameter, 1), EXTENDED | 0x12345
+    with t.restore_afterwards((pdo.parameter, 1)):
+        t.try_download(pdo.parameter, 1, word | INVALID)
+        code = t.try_download(pdo.parameter, 1, INVALID | wide)
+        require_abort(code, (0, VALUE), pdo.name)
+        kept = t.read(pdo.parameter, 1)
+        require(code or kept & 0x3FFFFFFF == wide, f"{pdo.name} accepts it and holds 0x{kept:08X}")
+    return f"{pdo.name} {'refused' if code else 'supported'}"
 
 
-@case("4.10", "a TPDO is switched off and on", "7.5.2.37", "not sent while bit 31 is set; sent again afterwards")
-def check_tpdo_switch(t: Target) -> str:
+def check_tpdo_switch(t: Target, pdo: Pdo) -> str:
     """With transmission type 1, at SYNC."""
-    found = []
-    for pdo in _list_changeable(t, is_sent=True):
-        if not _set_type(t, pdo, 1):
-            continue
-        word = t.read(pdo.parameter, 1)
-        with operational(t), _restored_pdo(t, pdo):
-            counts = []
-            for value, expected in ((word, 3), (word | INVALID, 0), (word, 3)):
-                t.write(pdo.parameter, 1, value)
-                counts.append(len(_count_answers(t, pdo, 3, word & 0x7FF, expected)))
-            require(counts == [3, 0, 3], f"{pdo.name}: at 3 SYNCs each {counts[0]} frames on, {counts[1]} off, "
-                                         f"{counts[2]} on again")
-        found.append(pdo.name)
-    require_applicable(found, "no TPDO accepts transmission type 1")
-    return f"3, 0 and 3 frames: {', '.join(found)}"
+    require_type(t, pdo, 1)
+    word, counts = t.read(pdo.parameter, 1), []
+    with operational(t), t.restore_afterwards((pdo.parameter, 1)):
+        for value, expected in ((word, 3), (word | INVALID, 0), (word, 3)):
+            t.write(pdo.parameter, 1, value)
+            counts.append(len(answer_syncs(t, word & 0x7FF, 3, expected)))
+    require(counts == [3, 0, 3], f"{pdo.name}: at 3 SYNCs each {counts[0]} frames on, {counts[1]} off, "
+                                 f"{counts[2]} on again")
+    return pdo.name
 
 
-@case("4.11", "a TPDO gets another COB-ID", "7.5.2.37", "off, changed, on: it is sent under the new one only")
-def check_tpdo_move(t: Target) -> str:
+def check_tpdo_move(t: Target, pdo: Pdo) -> str:
     """As a master links PDOs."""
-    found = []
-    for pdo in _list_changeable(t, is_sent=True):
-        if not _set_type(t, pdo, 1):
-            continue
-        word, free = t.read(pdo.parameter, 1), t.find_free_identifiers(1)[0]
-        with operational(t), _restored_pdo(t, pdo):
-            _move(t, pdo, word, free)
-            mark = len(t.frames)
-            new = len(_count_answers(t, pdo, 3, free))
-            old = sum(frame.cob_id == word & 0x7FF for frame in t.frames[mark:])
-            require((new, old) == (3, 0), f"{pdo.name}: {new} frames under 0x{free:03X}, {old} under the old COB-ID")
-        found.append(f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}")
-    require_applicable(found, "no TPDO accepts transmission type 1")
-    return "; ".join(found)
+    require_type(t, pdo, 1)
+    old, free = identify(t, pdo), t.find_free_identifier()
+    with operational(t), t.restore_afterwards((pdo.parameter, 1)):
+        move(t, pdo, free)
+        mark = len(t.frames)
+        new_count, old_count = len(answer_syncs(t, free, 3, 3)), len(t.heard(mark, old))
+        require((new_count, old_count) == (3, 0),
+                f"{pdo.name}: {new_count} frames under 0x{free:03X}, {old_count} under the old COB-ID")
+    return f"{pdo.name} 0x{old:03X} to 0x{free:03X}"
 
 
-@case("4.12", "received PDO too short", "7.2.2.5, table 26", "EMCY 0x8210, and the values stay as they were")
-def check_short_rpdo(t: Target) -> str:
+def check_short_rpdo(t: Target, pdo: Pdo) -> str:
     """A byte less than the mapping has."""
-    _require_emcy(t)
-    found = []
-    for pdo in _list_valid(t, is_sent=False):
-        values = read_mapped(t, pdo)
-        with operational(t):
-            before = read_mapped(t, pdo)
-            frame = send_short(t, pdo, values)
-            require(frame is not None, f"{pdo.name}: no EMCY 0x8210 after {_length(t, pdo) - 1} bytes")
-            require(read_mapped(t, pdo) == before, f"{pdo.name}: values were taken over")
-            _send_values(t, pdo, values)
-        found.append(pdo.name)
-    require_applicable(found, "no RPDO is valid")
-    return f"EMCY 0x8210 for {', '.join(found)}"
+    require_emcy(t)
+    values = read_mapped(t, pdo)
+    with operational(t):
+        before = read_mapped(t, pdo)
+        require(send_short(t, pdo, values), f"{pdo.name}: no EMCY 0x8210 after {count_bytes(t, pdo) - 1} bytes")
+        require(read_mapped(t, pdo) == before, f"{pdo.name}: values were taken over")
+        send_values(t, pdo, values)
+    return pdo.name
 
 
-@case("4.13", "received PDO too long", "7.2.2.5, table 26", "the first bytes are used or not; EMCY, if any, is 0x8220")
-def check_long_rpdo(t: Target) -> str:
+def check_long_rpdo(t: Target, pdo: Pdo) -> str:
     """A byte more than the mapping has, where 8 bytes allow that. The values are those that are there."""
-    found = []
-    for pdo in _list_valid(t, is_sent=False):
-        length = _length(t, pdo)
-        if length > 7:
-            continue
-        data = b"".join(read_mapped(t, pdo))
-        with operational(t):
-            t.send(_cob_id(t, pdo), data + b"\0")
-            codes = [int.from_bytes(frame.data[:2], "little") for frame in t.listen(SETTLE, t.emcy_id)]
-        require(all(code == 0x8220 for code in codes), f"{pdo.name}: EMCY {', '.join(f'0x{c:04X}' for c in codes)}")
-        found.append(f"{pdo.name} {'EMCY 0x8220' if codes else 'no EMCY'}")
-    require_applicable(found, "every RPDO has 8 bytes")
-    return "; ".join(found)
+    require_applicable(count_bytes(t, pdo) <= 7, "every RPDO has 8 bytes")
+    data = b"".join(read_mapped(t, pdo))
+    with operational(t):
+        t.send(identify(t, pdo), data + b"\0")
+        codes = {read_error_code(frame) for frame in t.listen(SETTLE, t.emcy_id)}
+    require(codes <= {TOO_LONG}, f"{pdo.name}: EMCY {', '.join(f'0x{code:04X}' for code in codes)}")
+    return f"{pdo.name} {'EMCY 0x8220' if codes else 'no EMCY'}"
 
 
-@case("4.14", "an RPDO is switched off, moved and on", "7.5.2.35",
-      "a frame that is too short is noticed (EMCY 0x8210) only under the COB-ID in force")
-def check_rpdo_move(t: Target) -> str:
+def check_rpdo_move(t: Target, pdo: Pdo) -> str:
     """The wrong length shows whether a frame is received, and changes nothing."""
-    _require_emcy(t)
-    found = []
-    for pdo in _list_changeable(t, is_sent=False):
-        word, free = t.read(pdo.parameter, 1), t.find_free_identifiers(1)[0]
-        values = read_mapped(t, pdo)
-        with operational(t), _restored_pdo(t, pdo):
-            t.write(pdo.parameter, 1, word | INVALID)
-            require(send_short(t, pdo, values, word & 0x7FF, False) is None, f"{pdo.name} is received while it is off")
-            _move(t, pdo, word, free)
-            found_old = send_short(t, pdo, values, word & 0x7FF, False)
-            require(found_old is None, f"{pdo.name} is received under its old COB-ID")
-            require(send_short(t, pdo, values, free) is not None, f"{pdo.name} is not received under 0x{free:03X}")
-            _send_values(t, pdo, values, free)
-        found.append(f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}")
-    return "; ".join(found)
+    require_emcy(t)
+    old, free = identify(t, pdo), t.find_free_identifier()
+    values = read_mapped(t, pdo)
+    with operational(t), t.restore_afterwards((pdo.parameter, 1)):
+        t.write(pdo.parameter, 1, t.read(pdo.parameter, 1) | INVALID)
+        require(not send_short(t, pdo, values, old, False), f"{pdo.name} is received while it is off")
+        move(t, pdo, free)
+        require(not send_short(t, pdo, values, old, False), f"{pdo.name} is received under its old COB-ID")
+        require(send_short(t, pdo, values, free), f"{pdo.name} is not received under 0x{free:03X}")
+        send_values(t, pdo, values)
+    return f"{pdo.name} 0x{old:03X} to 0x{free:03X}"
 
 
-@case("4.15", "values of a received PDO", "7.2.2.2, 7.5.2.35",
-      "type 0 to 240: in the dictionary after the next SYNC, not before; 254 and 255: at once")
-def check_rpdo_values(t: Target) -> str:
-    """Each number changes in its lowest bit, and is set back. Only with --write."""
+def check_rpdo_values(t: Target, pdo: Pdo) -> str:
+    """Each number changes by the smallest step, and is set back. Only with --write."""
     if not t.options.may_write:
         raise CaseSkipped("values are changed only with --write")
-    found = []
-    for pdo in _list_valid(t, is_sent=False):
-        mapped = [t.sheet.find(index, sub) for index, sub, _ in read_mapping(t, pdo)]
-        if any(variable is None or not variable.is_readable for variable in mapped):
-            continue
-        is_synchronous = t.read(pdo.parameter, 2) <= LAST_SYNCHRONOUS
-        with operational(t):
-            before = read_mapped(t, pdo)
-            other = [_flip(variable, data) for variable, data in zip(mapped, before, strict=True) if variable]
-            t.send(_cob_id(t, pdo), b"".join(other))
-            if is_synchronous:
-                t.wait(SETTLE / 2)
-                require(read_mapped(t, pdo) == before, f"{pdo.name}: the values are there before SYNC")
-                t.sync()
-            arrived = _wait_for_values(t, pdo, other)
-            _send_values(t, pdo, before)
-            require(arrived, f"{pdo.name}: the values are not in the dictionary")
-            require(_wait_for_values(t, pdo, before), f"{pdo.name}: a second frame has no effect")
-        found.append(f"{pdo.name} {'at SYNC' if is_synchronous else 'at once'}")
-    require_applicable(found, "no valid RPDO maps readable objects alone")
-    return "; ".join(found)
+    mapped = [t.sheet.find(*split_entry(word)[:2]) for word in read_mapping(t, pdo)]
+    readable = [variable for variable in mapped if variable is not None and variable.is_readable]
+    require_applicable(len(readable) == len(mapped), "no valid RPDO maps readable objects alone")
+    is_synchronous = t.read(pdo.parameter, 2) <= LAST_SYNCHRONOUS
+    with operational(t):
+        before = read_mapped(t, pdo)
+        other = [variable.change(data) for variable, data in zip(readable, before, strict=True)]
+        t.send(identify(t, pdo), b"".join(other))
+        if is_synchronous:
+            t.wait(SETTLE / 2)
+            require(read_mapped(t, pdo) == before, f"{pdo.name}: the values are there before SYNC")
+            t.sync()
+        has_arrived = wait_for_values(t, pdo, other)
+        send_values(t, pdo, before)
+        require(has_arrived, f"{pdo.name}: the values are not in the dictionary")
+        require(wait_for_values(t, pdo, before), f"{pdo.name}: a second frame has no effect")
+    return f"{pdo.name} {'at SYNC' if is_synchronous else 'at once'}"
 
 
-@case("4.16", "values of a transmitted PDO", "7.2.2, 7.5.2.38",
-      "the mapped objects in their order, least significant byte first")
-def check_tpdo_values(t: Target) -> str:
+def check_tpdo_values(t: Target, pdo: Pdo) -> str:
     """Five SYNCs; after each frame SDO reads the objects twice, and values that move meanwhile are left out.
 
     Three of five must agree: an application may change a value between its PDO and the reading.
     """
-    found, rounds = [], 5
-    for pdo in _list_valid(t, is_sent=True):
-        if not _set_type(t, pdo, 1):
-            continue
-        mapping, cob_id = read_mapping(t, pdo), _cob_id(t, pdo)
-        differences = []
-        with operational(t):
-            for _ in range(rounds):
-                t.sync()
-                frame = t.wait_for(cob_id, t.options.timeout)
-                require(frame is not None, f"{pdo.name}: no frame at a SYNC")
-                assert frame is not None
-                first, second = read_mapped(t, pdo), read_mapped(t, pdo)
-                differences.append(_compare_values(mapping, frame.data, first, second))
-        wrong = [each for each in differences if each]
-        require(len(wrong) <= rounds // 2, f"{pdo.name}: {wrong[-1] if wrong else ''}")
-        found.append(f"{pdo.name} {rounds - len(wrong)} of {rounds}")
-    require_applicable(found, "no TPDO accepts transmission type 1")
-    return ", ".join(found)
+    require_type(t, pdo, 1)
+    mapping, cob_id = read_mapping(t, pdo), identify(t, pdo)
+    wrong: list[str] = []
+    with operational(t):
+        for _ in range(5):
+            t.sync()
+            frames = t.wait_for(cob_id, t.options.timeout)
+            require(frames, f"{pdo.name}: no frame at a SYNC")
+            at, differences = 0, []
+            for word, first, second in zip(mapping, read_mapped(t, pdo), read_mapped(t, pdo), strict=True):
+                sent = frames[0].data[at:at + len(first)]
+                at += len(first)
+                if first == second != sent:
+                    label = f"0x{word >> 16:04X}:{word >> 8 & 0xFF:X}"
+                    differences.append(f"{label} was sent as {sent.hex()}, SDO reads {first.hex()}")
+            wrong += differences[:1]
+    require(len(wrong) <= 2, f"{pdo.name}: {join_labels(wrong, 1)}")
+    return f"{pdo.name} {5 - len(wrong)} of 5"
 
 
-@case("4.17", "changes of the mapping", "7.5.2.36, 7.5.2.38",
-      "refused while the PDO is valid; so are unknown objects, those that cannot be mapped, more than 64 bits")
-def check_mapping_rules(t: Target) -> str:
+def check_mapping_rules(t: Target, pdo: Pdo) -> str:
     """Where the mapping can be changed at all."""
-    found = []
-    for pdo in _list_changeable(t):
-        if not (t.sheet.is_writable(pdo.mapping, 0) and t.sheet.is_writable(pdo.mapping, 1)):
-            continue
-        mapping, word, first = read_mapping(t, pdo), t.read(pdo.parameter, 1), t.read(pdo.mapping, 1)
-        code = t.try_download(pdo.mapping, 0, b"\0")
-        require(code != 0, f"{pdo.name}: the number of mapped objects was changed while the PDO is valid")
-        with _restored_pdo(t, pdo):
-            t.write(pdo.parameter, 1, word | INVALID)
-            t.write(pdo.mapping, 0, 0)
-            try:
-                offers = ((0xFFFF0020, (NO_OBJECT, CANNOT_MAP), "an unknown object"),
-                          (0x10180120, (CANNOT_MAP,), "the vendor-ID"))
-                for entry, codes, what in offers:
-                    code = t.try_download(pdo.mapping, 1, entry.to_bytes(4, "little"))
-                    code = code or t.try_download(pdo.mapping, 0, b"\1")
-                    require(code in codes, f"{pdo.name}, {what}: {format_abort(code)}")
-                    t.try_download(pdo.mapping, 0, b"\0")
-                copies = 64 // (first & 0xFF) + 1
-                if t.sheet.find(pdo.mapping, copies) is not None:
-                    codes_seen = [t.try_download(pdo.mapping, sub, first.to_bytes(4, "little"))
-                                  for sub in range(1, copies + 1)]
-                    codes_seen.append(t.try_download(pdo.mapping, 0, bytes((copies,))))
-                    require(PDO_TOO_LONG in codes_seen, f"{pdo.name}, more than 64 bits: accepted")
-            finally:
-                t.try_download(pdo.mapping, 0, b"\0")
-                for sub, (index, mapped_sub, bits) in enumerate(mapping, 1):
-                    t.try_download(pdo.mapping, sub, (index << 16 | mapped_sub << 8 | bits).to_bytes(4, "little"))
-                t.try_download(pdo.mapping, 0, bytes((len(mapping),)))
-        found.append(pdo.name)
-    require_applicable(found, "the mappings are constant")
-    return ", ".join(found)
+    is_free = t.sheet.is_writable(pdo.mapping, 0) and t.sheet.is_writable(pdo.mapping, 1)
+    require_applicable(is_free, "the mappings are constant")
+    words = read_mapping(t, pdo)
+    copies = 64 // (words[0] & 0xFF) + 1
+    require(t.try_download(pdo.mapping, 0, 0),
+            f"{pdo.name}: the number of mapped objects was changed while the PDO is valid")
+    with t.restore_afterwards((pdo.parameter, 1)):
+        t.write(pdo.parameter, 1, t.read(pdo.parameter, 1) | INVALID)
+        try:
+            for entry, codes, what in ((0xFFFF0020, (NO_OBJECT, CANNOT_MAP), "an unknown object"),
+                                       (0x10180120, (CANNOT_MAP,), "the vendor-ID")):
+                require_abort(next(iter(write_mapping(t, pdo, [entry])), 0), codes, f"{pdo.name}, {what}")
+            if t.sheet.find(pdo.mapping, copies) is not None:
+                seen = write_mapping(t, pdo, [words[0]] * copies)
+                require(PDO_TOO_LONG in seen, f"{pdo.name}, more than 64 bits: accepted")
+        finally:
+            write_mapping(t, pdo, words)
+    return pdo.name
 
 
 @contextmanager
 def operational(t: Target) -> Iterator[None]:
-    """Within, the node is OPERATIONAL; afterwards PRE-OPERATIONAL. Raises CaseFailed if it does not follow."""
+    """Within, the node is OPERATIONAL; afterwards PRE-OPERATIONAL. Raises Problem if it does not follow."""
     if t.fixed_heartbeat is None:
         t.beat()
     t.enter(OPERATIONAL)
     try:
         yield
     finally:
-        t.command(128)
+        t.command(COMMANDS[PRE_OPERATIONAL])
         t.wait(0.01)
 
 
-def read_mapping(t: Target, pdo: Pdo) -> list[tuple[int, int, int]]:
-    """What the node maps: (index, sub, bits) each. Raises Refusal, CaseFailed."""
-    words = [t.read(pdo.mapping, sub) for sub in range(1, t.read(pdo.mapping, 0) + 1)]
-    return [(word >> 16, word >> 8 & 0xFF, word & 0xFF) for word in words]
+def split_entry(word: int) -> tuple[int, int, int]:
+    """Index, sub-index and bits of a mapped object."""
+    return word >> 16, word >> 8 & 0xFF, word & 0xFF
+
+
+def read_mapping(t: Target, pdo: Pdo) -> list[int]:
+    """What the node maps, a word each. Raises Refusal, Problem."""
+    return [t.read(pdo.mapping, sub) for sub in range(1, t.read(pdo.mapping, 0) + 1)]
+
+
+def write_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> list[int]:
+    """Write the mapping of a PDO that is off; the abort codes that came."""
+    writes = [(0, 0), *enumerate(words, 1), (0, len(words))]
+    codes = [t.try_download(pdo.mapping, sub, value) for sub, value in writes]
+    return [code for code in codes if code]
 
 
 def read_mapped(t: Target, pdo: Pdo) -> list[bytes]:
-    """What the mapped objects hold; zeros for what cannot be read. Raises Refusal, CaseFailed."""
-    values = []
-    for index, sub, bits in read_mapping(t, pdo):
-        variable = t.sheet.find(index, sub)
-        is_readable = variable is not None and variable.is_readable
-        values.append(t.upload(index, sub) if is_readable else bytes(bits // 8))
-    return values
+    """What the mapped objects hold; zeros for what cannot be read. Raises Refusal, Problem."""
+    entries = [split_entry(word) for word in read_mapping(t, pdo)]
+    mapped = [(t.sheet.find(index, sub), bits) for index, sub, bits in entries]
+    return [t.upload(*variable.key) if variable is not None and variable.is_readable else bytes(bits // 8)
+            for variable, bits in mapped]
+
+
+def send_values(t: Target, pdo: Pdo, values: list[bytes]) -> None:
+    """Send an RPDO, and a SYNC if it waits for one."""
+    t.send(identify(t, pdo), b"".join(values))
+    t.wait(0.005)
+    if t.read(pdo.parameter, 2) <= LAST_SYNCHRONOUS:
+        t.sync(1, 0.005)
 
 
 def send_short(t: Target, pdo: Pdo, values: list[bytes], cob_id: int | None = None,
-               is_expected: bool = True) -> Frame | None:
-    """Send an RPDO without its last byte; the EMCY 0x8210 that comes, None if none does.
+               is_expected: bool = True) -> list[Frame]:
+    """Send an RPDO without its last byte; the EMCY 0x8210 that comes, none if it does not.
 
     An expected one is waited for longer than one that should not come.
     """
-    t.send(_cob_id(t, pdo) if cob_id is None else cob_id, b"".join(values)[:-1])
+    t.send(identify(t, pdo) if cob_id is None else cob_id, b"".join(values)[:-1])
     found = t.wait_for_error(SETTLE, TOO_SHORT)
-    if found is None:  # some nodes look at a synchronous one only at SYNC
+    if not found:  # some nodes look at a synchronous one only at SYNC
         t.sync()
         found = t.wait_for_error(t.options.timeout if is_expected else SETTLE, TOO_SHORT)
     return found
 
 
-def have_all_come(t: Target, mark: int, ids: set[int]) -> bool:
-    """Whether a frame of each of these COB-IDs is among those since `mark`."""
-    return {frame.cob_id for frame in t.frames[mark:]} >= ids
-
-
-def _list_pdos(t: Target) -> list[Pdo]:
-    """All PDOs of the EDS. Raises CaseNotApplicable if it has none."""
-    require_applicable(t.sheet.pdos, "the EDS has no PDO")
-    return t.sheet.pdos
-
-
-def _list_valid(t: Target, is_sent: bool) -> list[Pdo]:
-    """The PDOs of one direction that are on and map something."""
-    return [pdo for pdo in _list_pdos(t) if pdo.is_sent is is_sent
-            and not t.read(pdo.parameter, 1) & INVALID and t.read(pdo.mapping, 0)]
-
-
-def _list_changeable(t: Target, is_sent: bool | None = None) -> list[Pdo]:
-    """Those whose COB-ID can be written. Raises CaseNotApplicable if there is none."""
-    chosen = [pdo for direction in (False, True) if is_sent in (None, direction) for pdo in _list_valid(t, direction)
-              if t.sheet.is_writable(pdo.parameter, 1)]
-    require_applicable(chosen, "no COB-ID of a PDO can be written")
-    return chosen
-
-
-def _require_emcy(t: Target) -> None:
-    require_applicable(t.sheet.find(0x1014), "the node sends no EMCY (no 0x1014)")
-
-
-def _cob_id(t: Target, pdo: Pdo) -> int:
-    return t.read(pdo.parameter, 1) & 0x7FF
-
-
-def _length(t: Target, pdo: Pdo) -> int:
-    """Bytes of its mapping."""
-    return (sum(bits for _, _, bits in read_mapping(t, pdo)) + 7) // 8
-
-
-def _set_type(t: Target, pdo: Pdo, kind: int) -> bool:
-    """Give a PDO a transmission type; whether the node has it now."""
-    if t.read(pdo.parameter, 2) == kind:
-        return True
-    return t.sheet.is_writable(pdo.parameter, 2) and not t.try_download(pdo.parameter, 2, bytes((kind,)))
-
-
-def _count_answers(t: Target, pdo: Pdo, syncs: int, cob_id: int | None = None,
-                   expected: int | None = None) -> list[bytes]:
-    """Send so many SYNCs, 20 ms apart; the data of the PDO's frames until shortly after the last.
-
-    As many as are `expected` (default: one at each SYNC) are waited for longer.
-    """
-    cob_id = _cob_id(t, pdo) if cob_id is None else cob_id
-    mark = len(t.frames)
-
-    def find() -> list[bytes]:
-        return [frame.data for frame in t.frames[mark:] if frame.cob_id == cob_id]
-
-    for _ in range(syncs):
-        t.sync()
-        t.wait(0.02)
-    t.wait(t.options.timeout, lambda: len(find()) >= (syncs if expected is None else expected))
-    t.wait(SETTLE)
-    return find()
-
-
-@contextmanager
-def _restored_pdo(t: Target, pdo: Pdo) -> Iterator[None]:
-    """Whatever happens within, give the PDO its COB-ID back, by way of "off". Raises CaseFailed."""
-    word = t.read(pdo.parameter, 1)
-    try:
-        yield
-    finally:
-        if t.read(pdo.parameter, 1) != word:
-            t.try_download(pdo.parameter, 1, (word | INVALID).to_bytes(4, "little"))
-            t.try_download(pdo.parameter, 1, word.to_bytes(4, "little"))
-
-
-def _move(t: Target, pdo: Pdo, word: int, can_id: int) -> None:
-    """Off, another identifier, on. Raises Refusal."""
-    t.write(pdo.parameter, 1, word | INVALID)
-    t.write(pdo.parameter, 1, word & ~0x7FF | INVALID | can_id)
-    t.write(pdo.parameter, 1, word & ~0x7FF & ~INVALID | can_id)
-
-
-def _compare_values(mapping: list[tuple[int, int, int]], data: bytes, first: list[bytes], second: list[bytes]) -> str:
-    """The first object that a PDO carries otherwise than two equal readings have it; empty if there is none."""
-    at = 0
-    for (index, sub, _), before, after in zip(mapping, first, second, strict=True):
-        sent = data[at:at + len(before)]
-        at += len(before)
-        if before == after != sent:
-            return f"0x{index:04X}:{sub:X} was sent as {sent.hex()}, SDO reads {before.hex()}"
-    return ""
-
-
-def _send_values(t: Target, pdo: Pdo, values: list[bytes], cob_id: int | None = None) -> None:
-    """Send an RPDO, and a SYNC if it waits for one."""
-    t.send(_cob_id(t, pdo) if cob_id is None else cob_id, b"".join(values))
-    t.wait(0.005)
-    if t.read(pdo.parameter, 2) <= LAST_SYNCHRONOUS:
-        t.sync()
-        t.wait(0.005)
-
-
-def _wait_for_values(t: Target, pdo: Pdo, values: list[bytes]) -> bool:
+def wait_for_values(t: Target, pdo: Pdo, values: list[bytes]) -> bool:
     """Whether the mapped objects hold these values soon."""
     end = t.now() + round(t.options.timeout * 1e9)
-    while True:
-        if read_mapped(t, pdo) == values:
-            return True
+    while read_mapped(t, pdo) != values:
         if t.now() >= end:
             return False
         t.wait(0.01)
+    return True
 
 
-def _flip(variable: Variable, data: bytes) -> bytes:
-    """Another value of the same length: the lowest bit changed."""
-    other = bytes((data[0] ^ 1,)) + data[1:]
-    value = variable.decode(other) if variable.is_number else 0
-    is_inside = (variable.low is None or value >= variable.low) and (variable.high is None or value <= variable.high)
-    return other if is_inside else data
+def answer_syncs(t: Target, cob_id: int, count: int, expected: int) -> list[Frame]:
+    """Send SYNCs, 20 ms apart; the frames of that COB-ID until shortly after the last.
+
+    As many as are expected are waited for longer.
+    """
+    mark = len(t.frames)
+    t.sync(count, 0.02)
+    t.wait(t.options.timeout, lambda: len(t.heard(mark, cob_id)) >= expected)
+    t.wait(SETTLE)
+    return t.heard(mark, cob_id)
+
+
+def list_valid(t: Target, is_sent: bool | None = None, is_changeable: bool = False) -> list[Pdo]:
+    """The PDOs, of one direction or both, that are on and map something, with a COB-ID that can be written if need be.
+
+    Raises CaseNotApplicable if there is none.
+    """
+    chosen = [pdo for pdo in t.sheet.pdos if is_sent in (None, pdo.is_sent)
+              and not t.read(pdo.parameter, 1) & INVALID and t.read(pdo.mapping, 0)
+              and (not is_changeable or t.sheet.is_writable(pdo.parameter, 1))]
+    require_applicable(chosen, f"no such PDO is valid{' and can get another COB-ID' if is_changeable else ''}")
+    return chosen
+
+
+def list_accepted(t: Target, key: tuple[int, int]) -> list[str]:
+    """The restricted identifiers that a COB-ID takes while it is off, or refuses with another code than 0x06090030."""
+    word, found = t.read(*key), []
+    is_switchable = t.variable(*key).has_valid_bit
+    base = word & ~(0x7FF | (INVALID if is_switchable else PRODUCER))
+    with t.restore_afterwards(key):
+        for can_id in RESTRICTED_ENDS:
+            if is_switchable:
+                require_abort(t.try_download(*key, word | INVALID), (0,), "it cannot be switched off")
+            code = t.try_download(*key, base | can_id)
+            if code != VALUE:
+                found.append(f"0x{can_id:03X} {format_abort(code)}")
+    return found
+
+
+def require_emcy(t: Target) -> None:
+    """Raises CaseNotApplicable for a node without emergencies."""
+    require_applicable(t.sheet.find(0x1014), "the node sends no EMCY (no 0x1014)")
+
+
+def identify(t: Target, pdo: Pdo) -> int:
+    """The identifier of a PDO."""
+    return t.read(pdo.parameter, 1) & 0x7FF
+
+
+def count_bytes(t: Target, pdo: Pdo) -> int:
+    """Bytes of its mapping."""
+    return (sum(split_entry(word)[2] for word in read_mapping(t, pdo)) + 7) // 8
+
+
+def set_type(t: Target, pdo: Pdo, *kinds: int) -> bool:
+    """Give a PDO the first of these transmission types that it takes; whether it has one now."""
+    for kind in kinds:
+        if t.read(pdo.parameter, 2) == kind:
+            return True
+        if t.sheet.is_writable(pdo.parameter, 2) and not t.try_download(pdo.parameter, 2, kind):
+            return True
+    return False
+
+
+def require_type(t: Target, pdo: Pdo, *kinds: int) -> None:
+    """The same. Raises CaseNotApplicable for a PDO that takes none."""
+    if not set_type(t, pdo, *kinds):
+        raise CaseNotApplicable(f"no TPDO accepts transmission type {' or '.join(map(str, kinds))}")
+
+
+def move(t: Target, pdo: Pdo, can_id: int) -> None:
+    """Off, another identifier, on. Raises Refusal."""
+    word = t.read(pdo.parameter, 1) & ~(0x7FF | INVALID)
+    for value in (word | INVALID, word | INVALID | can_id, word | can_id):
+        t.write(pdo.parameter, 1, value)
+
+
+list_received, list_sent = partial(list_valid, is_sent=False), partial(list_valid, is_sent=True)
+list_changeable = partial(list_valid, is_changeable=True)
+
+CASES = (
+    Case("4.1", "communication parameters", "7.5.2.35, 7.5.2.37",
+         "sub 0 is 2 or more; COB-ID and transmission type can be read",
+         for_each(lambda t: t.sheet.pdos, check_parameters)),
+    Case("4.2", "mapping", "7.5.2.36, 7.5.2.38", "mapped objects exist with that length; at most 64 bits",
+         for_each(lambda t: t.sheet.pdos, check_mapping)),
+    Case("4.3", "synchronous transmission", "7.2.2.2, 7.5.2.37",
+         "type 1, 2 and 3: one frame at every, every second and every third SYNC, as long as its mapping",
+         for_each(list_sent, check_cyclic)),
+    Case("4.4", "acyclic synchronous transmission", "7.2.2.2, 7.5.2.37",
+         "type 0: nothing without SYNC, at most one frame at each", for_each(list_sent, check_acyclic)),
+    Case("4.5", "event timer", "7.5.2.37", "type 254 or 255 with event timer 50 ms: a frame every 50 ms",
+         for_each(list_sent, check_event_timer), is_timed=True),
+    Case("4.6", "reserved transmission types", "7.5.2.35, 7.5.2.37", "types 241 and 251 are refused with 0x06090030",
+         for_each(lambda t: t.sheet.pdos, check_reserved_types, text="refused by {}")),
+    Case("4.7", "COB-ID of a valid PDO", "7.5.2.35, 7.5.2.37",
+         "it cannot be changed: an abort, and the old one stays in force",
+         for_each(list_changeable, check_fixed_while_valid)),
+    Case("4.8", "restricted COB-IDs", "7.3.5, table 40", "each is refused with 0x06090030, at both ends of every range",
+         for_each(list_changeable, check_restricted, text=f"{len(RESTRICTED_ENDS)} identifiers refused by {{}}")),
+    Case("4.9", "29-bit COB-IDs", "7.5.2.35, 7.5.2.37", "supported, or refused with 0x06090030",
+         for_each(list_changeable, check_extended)),
+    Case("4.10", "a TPDO is switched off and on", "7.5.2.37",
+         "not sent while bit 31 is set; sent again afterwards",
+         for_each(partial(list_changeable, is_sent=True), check_tpdo_switch, text="3, 0 and 3 frames: {}")),
+    Case("4.11", "a TPDO gets another COB-ID", "7.5.2.37", "off, changed, on: it is sent under the new one only",
+         for_each(partial(list_changeable, is_sent=True), check_tpdo_move)),
+    Case("4.12", "received PDO too short", "7.2.2.5, table 26", "EMCY 0x8210, and the values stay as they were",
+         for_each(list_received, check_short_rpdo, text="EMCY 0x8210 for {}")),
+    Case("4.13", "received PDO too long", "7.2.2.5, table 26",
+         "the first bytes are used or not; EMCY, if any, is 0x8220", for_each(list_received, check_long_rpdo)),
+    Case("4.14", "an RPDO is switched off, moved and on", "7.5.2.35",
+         "a frame that is too short is noticed (EMCY 0x8210) only under the COB-ID in force",
+         for_each(partial(list_changeable, is_sent=False), check_rpdo_move)),
+    Case("4.15", "values of a received PDO", "7.2.2.2, 7.5.2.35",
+         "type 0 to 240: in the dictionary after the next SYNC, not before; 254 and 255: at once",
+         for_each(list_received, check_rpdo_values)),
+    Case("4.16", "values of a transmitted PDO", "7.2.2, 7.5.2.38",
+         "the mapped objects in their order, least significant byte first", for_each(list_sent, check_tpdo_values)),
+    Case("4.17", "changes of the mapping", "7.5.2.36, 7.5.2.38",
+         "refused while the PDO is valid; so are unknown objects, those that cannot be mapped, more than 64 bits",
+         for_each(list_changeable, check_mapping_rules)),
+)

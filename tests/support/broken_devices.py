@@ -76,7 +76,7 @@ def examine(patch: Break, node: int = 3, chapters: tuple[str, ...] = (), eds: Pa
 
 def failures(outcome: Outcome) -> list[str]:
     """Numbers of the cases that failed."""
-    return [result.number for result in outcome.results if result.verdict is Verdict.FAIL]
+    return [result.case.number for result in outcome.results if result.verdict is Verdict.FAIL]
 
 
 def nothing(device: Any) -> None:

@@ -49,9 +49,9 @@ def edited(folder: Path, *changes: tuple[str, str, str]) -> Path:
     ("1017", "DataType=0x0006", "DataType=0x0007", "1.6", "0x1017:0 has DataType 0x0007, expected 0x0006"),
     ("1001", "AccessType=ro", "AccessType=rw", "1.6", "0x1001:0 is rw, expected ro"),
     ("1A01sub2", "0x22030010", "0x22030020", "1.8", "TPDO2 maps 0x2203:0 with 32 bits, it has 16"),
-    ("1A01sub2", "0x22030010", "0x22110110", "1.8", "TPDO2 maps 0x2211:1, which has PDOMapping=0"),
+    ("1A01sub2", "0x22030010", "0x22110110", "1.8", "TPDO2 maps 0x2211:1, which is ro with PDOMapping=0"),
     ("1A01sub2", "0x22030010", "0x29990010", "1.8", "which is not there"),
-    ("1A01sub2", "0x22030010", "0x22060010", "1.8", "TPDO2 maps 0x2206:0, which is rww"),
+    ("1A01sub2", "0x22030010", "0x22060010", "1.8", "TPDO2 maps 0x2206:0, which is rww with PDOMapping=1"),
     ("1801sub1", "$NODEID+0x280", "0x5FF", "1.10", "TPDO2 uses 0x5FF, which is restricted"),
     ("1801sub1", "$NODEID+0x280", "$NODEID+0x180", "1.10", "TPDO2 and TPDO1 send 0x183"),
 ])  # fmt: skip

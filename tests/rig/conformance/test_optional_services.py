@@ -39,7 +39,7 @@ def write_sheet(folder: Path, *changes: tuple[str, str, str]) -> Path:
 
 def measured(outcome: Outcome, number: str) -> tuple[Verdict, str]:
     """Verdict and measured text of one case."""
-    return next((each.verdict, each.measured) for each in outcome.results if each.number == number)
+    return next((each.verdict, each.measured) for each in outcome.results if each.case.number == number)
 
 
 def with_timer(folder: Path) -> Path:

@@ -35,7 +35,7 @@ class StallingWire(EmbeddedWire):
 def test_a_late_tester_does_not_blame_the_node() -> None:
     target = Target(StallingWire(VirtualClock(), [Firmware]), DataSheet(EDS[2], 2), Options(may_write=True))
     outcome = run_cases(target, choose_cases(["7"]))
-    jitter = next(result for result in outcome.results if result.number == "7.4")
+    jitter = next(result for result in outcome.results if result.case.number == "7.4")
     assert jitter.verdict is Verdict.SKIPPED and jitter.measured.startswith("this machine was 70 ms late itself")
     assert (failures(outcome), outcome.verdict) == ([], "INVALID_TIMING")
 
@@ -103,5 +103,5 @@ def test_another_master_on_the_bus_is_left_alone() -> None:
 def test_other_nodes_are_not_commanded() -> None:
     """A command to all nodes would start them too; the node-ID used as a stranger's is nobody's."""
     outcome = run_cases(make_target(0x700 + 126))
-    skipped = [result.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
+    skipped = [result.case.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
     assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["6.5"], ["Other nodes on the bus: 126."])
