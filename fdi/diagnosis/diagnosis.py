@@ -19,13 +19,11 @@ from fdi.diagnosis.bands import (
     load_default_bands,
     matches_command,
 )
-from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Level, find_ruling_fault, judge_size
+from fdi.diagnosis.faults import FAULTS, Estimate, Level, find_ruling_fault, judge_size
 from fdi.diagnosis.joint_search import Beside
 from fdi.diagnosis.precursors import Precursor, measure_precursors
 from fdi.diagnosis.refine import (
     COARSE_STARTS,
-    LARGEST_FSS,
-    LARGEST_KINTAS,
     Refinement,
     choose_size_excerpt,
     get_positive,
@@ -213,12 +211,9 @@ def _find_unhealthy(refinement: Refinement, model: Model) -> dict[str, Estimate]
 def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
     """The sizes of both faults; where more than noise is left, their intervals are wider by as much."""
     wider = 1.0 if found.is_explained else max(found.ratio.values())
-
-    def widen(e: Estimate, most: float) -> Estimate:
-        low, high = e.value - wider * (e.value - e.low), e.value + wider * (e.high - e.value)
-        return Estimate(e.value, max(low, 0.0), min(high, most))
-
-    return {CLOGGING.name: widen(found.kintas, LARGEST_KINTAS), FRICTION.name: widen(found.fss, LARGEST_FSS)}
+    return {f.name: Estimate(e.value, max(e.value - wider * (e.value - e.low), 0.0),
+                             min(e.value + wider * (e.high - e.value), f.largest))
+            for f in FAULTS for e in (found.sizes[f.name],)}
 
 
 def _decide_verdict(levels: Mapping[str, Level | None], is_explained: bool) -> str:

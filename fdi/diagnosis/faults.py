@@ -41,10 +41,11 @@ class Fault(NamedTuple):
     healthy: float
     middle: float  # MidBand
     most: float  # MaxBand
+    largest: float  # that a fit may find
 
 
-CLOGGING = Fault("filter_clogging", "kintas", "filter.clogging", "1", 0.0, 0.25, 0.35)
-FRICTION = Fault("spool_friction", "fss", "spool.static_friction", "N", 5.0, 35.0, 70.0)
+CLOGGING = Fault("filter_clogging", "kintas", "filter.clogging", "1", 0.0, 0.25, 0.35, 0.95)
+FRICTION = Fault("spool_friction", "fss", "spool.static_friction", "N", 5.0, 35.0, 70.0, 1000.0)
 FAULTS = CLOGGING, FRICTION
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,10 @@ from fdi.diagnosis.refine import (
     CountedProblem,
     Refinement,
     choose_start,
+    descend,
     estimate_offsets,
     find_flat,
+    guess_first_covariance,
     is_noise_left,
     learn_left_noise,
     list_unknowns,
@@ -39,9 +42,8 @@ from fdi.discovery.explain import find_marks
 from fdi.discovery.explain_runs import list_fitted_parameters
 from fdi.discovery.search import Prospect, scan_effects
 from fdi.estimation.fit import Fit, follow_population
-from fdi.estimation.likelihood import Free, scale_noise
-from fdi.estimation.long_recordings import judge_on_all
-from fdi.estimation.unidentifiable import descend_valley, guess_covariance, linearise_across
+from fdi.estimation.likelihood import scale_noise
+from fdi.estimation.unidentifiable import linearise_across, start_fit
 from fdi.estimation.unknowns import UNREPLAYED, complete_model
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -59,17 +61,6 @@ from plant.model import Model, list_searched_effects
 from plant.threads import R, T, map_in_threads
 
 Floats = NDArray[np.float64]
-
-# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT`: pressures, spool
-# forces, torques, and all that goes with the jack's area
-EFFECT_POWERS: tuple[Mapping[str, float], ...] = (
-    {"supply_droop.slope": -1.0},
-    {"supply_droop.slope": 1.0, "flow_force.coefficient": 1.0},
-    {},
-    {"supply_droop.slope": -1.0, "compressibility.coefficient": 1.0, "aero_stiffness.stiffness": 1.0,
-     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0},
-)
-
 
 def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Mapping[str, float],
                         progress: Progress = ignore_progress, workers: int = 2, whole: Trace | None = None) -> Beside:
@@ -115,13 +106,9 @@ def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
 
 
 def _explain(effects: tuple[str, ...], fit: Fit, problem: CountedProblem, whole: Trace | None) -> Explanation:
-    found = replace(report_fit(fit, problem), worst=FITTED_RUN_WORST)
-    if whole is not None and whole is not problem.trace:
-        judged = judge_on_all(problem, [fit], whole, FINE_STEPS)[0]
-        found = replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
     values = {name: Estimate(v.value, v.low, v.high) for effect in effects
               for name, v in list_fitted_parameters(effect, fit, problem.model).items()}
-    return Explanation(effects, values, found)
+    return Explanation(effects, values, replace(report_fit(fit, problem, whole), worst=FITTED_RUN_WORST))
 
 
 # factor on the noise and generations of a search by a population
@@ -144,7 +131,7 @@ class JointSearch:
         it still misses, and a rival that has been fitted to the end beats it although it is wrong.
         """
         free = list_unknowns(self.model)
-        begun = self.descend(replace(alone, free=free, covariance=guess_joint_covariance(free)), ((1.0, 2),))
+        begun = self.descend(replace(alone, free=free), ((1.0, 2),))
         parents: list[Named] = [((), begun)]
         found = self.deepen(parents)
         for count in range(1, most_effects + 1):
@@ -194,7 +181,9 @@ class JointSearch:
             prospects.append(self.scan(afresh, effects, fit.cost if is_enough else np.inf))
             if not is_enough:
                 prospects.append(self.scan_with_more_noise(afresh, effects))
-        worth = _interleave(prospects, (8 if is_enough else 10) if count == 1 else 5)
+        mixed = [p for group in zip_longest(*prospects) for p in group if p is not None]  # the best of each in turn
+        most = 8 if is_enough else 10
+        worth = mixed[:most if count == 1 else 5]
         if not worth:
             return []
         named = ", ".join(dict.fromkeys(p.effect for p in worth))
@@ -226,8 +215,7 @@ class JointSearch:
         """A unit with the best pair of faults and no other deviation: an effect may lead fits into a local minimum."""
         free = list_unknowns(self.model)
         x = choose_start(self.problem, free, COARSE_STARTS)
-        flat = self.find_flat(free, x)
-        return linearise_across(self.problem, free, x, guess_joint_covariance(free), flat)
+        return linearise_across(self.problem, free, x, guess_first_covariance(free), find_flat(self.alone, free, x))
 
     def finish(self, found: Sequence[Named]) -> list[Named]:
         """The likely ones to the end with finer steps, under the noise that the best one leaves."""
@@ -270,13 +258,18 @@ class JointSearch:
 
         The population takes so many solver steps a cycle; its end is fitted with those of the problem.
         """
-        coarse = replace(self.problem, steps=steps, workers=1, _lanes={})
+        def descend_coarsely(problem: CountedProblem, fit: Fit, rounds: int, factor: float = 1.0) -> Fit:
+            return descend(problem, fit, ((factor, rounds),), self.alone)
+
+        coarse = replace(self.alone, steps=steps)
         home = self._place_home(fit)
-        begun = self._descend_in(coarse, replace(fit, x=home), 3, POPULATION_STAGES[0][0])
-        frictions = np.array([_get_friction_width(f) for f in fit.free])
+        begun = descend_coarsely(coarse, replace(fit, x=home), 3, POPULATION_STAGES[0][0])
+        width = 0.1  # of a population's first trials along a friction of ram or spool, of its logarithm
+        frictions = np.array([width / f.scale if f.name.endswith("_friction") and f.name.startswith(("jack.", "spool."))
+                              else 0.0 for f in fit.free])
         spread = 9.0 * begun.covariance + np.diag(frictions**2)
         begun = replace(begun, x=np.where(frictions > 0.0, home, begun.x))
-        end = follow_population(coarse, begun, spread, POPULATION_STAGES, seed, self._descend_in)
+        end = follow_population(coarse, begun, spread, POPULATION_STAGES, seed, descend_coarsely)
         return self.descend(end, ((1.0, 8),))
 
     def _begin_again(self, done: Sequence[Named], most: int = 2) -> list[Named]:
@@ -297,8 +290,7 @@ class JointSearch:
         effects, fit = named
         dropped = set(CATALOGUE[effect].fitted)
         kept = [k for k, f in enumerate(fit.free) if f.name not in dropped]
-        none = np.empty((0, 0))
-        begun = replace(fit, free=tuple(fit.free[k] for k in kept), x=fit.x[kept], cost=np.inf, jacobian=none)
+        begun = start_fit([fit.free[k] for k in kept], fit.x[kept])
         return tuple(e for e in effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8)))
 
     def is_near(self, fit: Fit, far: float = 7.0) -> bool:
@@ -307,7 +299,7 @@ class JointSearch:
 
     def restart(self, fit: Fit, part: float) -> Fit:
         """The fit from a point on the line to a unit with these faults and effects and no other deviation."""
-        begun = replace(fit, x=fit.x + part * (self._place_home(fit) - fit.x), cost=np.inf)
+        begun = start_fit(fit.free, fit.x + part * (self._place_home(fit) - fit.x))
         return self.descend(begun, ((6.0, 4), (1.0, 8)))
 
     def _place_home(self, fit: Fit) -> Floats:
@@ -317,20 +309,14 @@ class JointSearch:
         home[kept] = fit.x[kept]
         return home
 
+    @property
+    def alone(self) -> CountedProblem:
+        """The problem for one thread."""
+        return replace(self.problem, workers=1, _lanes={})
+
     def descend(self, fit: Fit, schedule: Sequence[tuple[float, int]]) -> Fit:
         """The fit after rounds with the noise so many times as large: (factor, rounds) each."""
-        for factor, rounds in schedule:
-            fit = self._descend_in(replace(self.problem, workers=1, _lanes={}), fit, rounds, factor)
-        return fit
-
-    def _descend_in(self, problem: CountedProblem, fit: Fit, rounds: int, factor: float) -> Fit:
-        """The fit to this problem after so many rounds, with its noise so many times as large."""
-        start = replace(fit, covariance=guess_joint_covariance(fit.free), cost=np.inf)
-        return descend_valley(scale_noise(problem, factor), start, rounds, self.find_flat(fit.free, fit.x))
-
-    def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
-        """Directions that the data do not see, with what of the effects goes along."""
-        return find_flat(replace(self.problem, workers=1, _lanes={}), free, x, EFFECT_POWERS)
+        return descend(self.alone, fit, schedule)
 
     def map_alone(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """By all threads; each fit keeps to one of them."""
@@ -338,34 +324,11 @@ class JointSearch:
 
     def _begin_fit(self, p: Prospect) -> Fit:
         """Begin at the scan's linear forecast, with the noise first taken for larger."""
-        free = tuple(p.free)
-        none = np.empty((0, 0))
-        fit = Fit(free, p.x, np.inf, np.inf, guess_joint_covariance(free), none, none, none)
-        return self.descend(fit, (NOISE_SCHEDULE[1], (1.0, 3)))
+        return self.descend(start_fit(p.free, p.x), (NOISE_SCHEDULE[1], (1.0, 3)))
 
     def _name_added(self, fit: Fit, present: Sequence[str]) -> str:
         names = {f.name for f in fit.free}
         return next(e for e in self.effects if e not in present and set(CATALOGUE[e].fitted) & names)
-
-
-def guess_joint_covariance(free: Sequence[Free]) -> Floats:
-    """A first covariance, (p, p): an effect's parameter by the width of its first difference."""
-    guess = guess_covariance(free)
-    for k, f in enumerate(free):
-        if not np.isfinite(f.prior):
-            guess[k, k] = (f.step / 3.0) ** 2
-    return guess
-
-
-def _get_friction_width(f: Free, width: float = 0.1) -> float:
-    """Width, scaled, of a population's first trials along a friction of ram or spool, given of the logarithm."""
-    return width / f.scale if f.name.endswith("_friction") and f.name.split(".")[0] in ("jack", "spool") else 0.0
-
-
-def _interleave(prospects: Sequence[Sequence[Prospect]], most: int) -> list[Prospect]:
-    """The best of each list in turn, until there are so many."""
-    mixed = [p for group in zip(*(list(each) + [None] * most for each in prospects), strict=False) for p in group]
-    return [p for p in mixed if p is not None][:most]
 
 
 def _get_cost(each: Named) -> float:
@@ -398,7 +361,7 @@ class Explanation:
     @property
     def sizes(self) -> dict[str, Estimate]:
         """Both faults, by name."""
-        return {fault.name: getattr(self.refinement, fault.symbol) for fault in FAULTS}
+        return self.refinement.sizes
 
     @property
     def levels(self) -> dict[str, Level | None]:
@@ -494,10 +457,9 @@ def mix_estimates(estimates: Sequence[Estimate], weights: Sequence[float]) -> Es
 
 def _is_disputed(fault: Fault, explanations: Sequence[Explanation]) -> bool:
     """Whether explanations that contradict each other in the size give different levels."""
-    for first in explanations:
-        for second in explanations:
-            a, b = first.sizes[fault.name], second.sizes[fault.name]
-            apart = not b.low <= a.value <= b.high and not a.low <= b.value <= a.high
-            if apart and first.levels[fault.name] != second.levels[fault.name]:
-                return True
-    return False
+    def contradict(first: Explanation, second: Explanation) -> bool:
+        a, b = first.sizes[fault.name], second.sizes[fault.name]
+        return not b.low <= a.value <= b.high and not a.low <= b.value <= a.high
+
+    return any(contradict(first, second) and first.levels[fault.name] != second.levels[fault.name]
+               for first, second in combinations(explanations, 2))

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC, Estimate
+from fdi.diagnosis.faults import CLOGGING, DYNAMIC, FAULTS, FRICTION, STATIC_OVER_DYNAMIC, Estimate
 from fdi.estimation import noise as noises
 from fdi.estimation.fit import Fit
 from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, scale_noise, span_all_rows
@@ -57,14 +57,22 @@ from plant.threads import map_in_threads
 
 Floats = NDArray[np.float64]
 
-SMALLEST_FSS, LARGEST_FSS = 0.05, 1000.0  # N, bounds of a fit
-LARGEST_KINTAS = 0.95  # bound of a fit
-FAULT_PARAMETERS = (CLOGGING.parameter, FRICTION.parameter, "spool.dynamic_friction")
+SMALLEST_FSS = 0.05  # N, bound of a fit
+FAULT_PARAMETERS = (CLOGGING.parameter, FRICTION.parameter, DYNAMIC)
 # (Kintas, FSS in N) from which fits begin, beside the grid's answers
 COARSE_STARTS = tuple(product((0.0, 0.12, 0.24, 0.36, 0.48), 5.0 * 1.4 ** np.arange(-1.0, 10.0)))
 # (factor on the noise, rounds): small stops of the ram count only once the fit is near
 NOISE_SCHEDULE = ((30.0, 4), (6.0, 4), (1.0, 8))
 FINE_STEPS = 20  # solver steps a cycle of the last fit
+# powers of effects' parameters in the directions of `fdi.estimation.unidentifiable.FLAT`: pressures, spool
+# forces, torques, and all that goes with the jack's area
+EFFECT_POWERS: tuple[Mapping[str, float], ...] = (
+    {"supply_droop.slope": -1.0},
+    {"supply_droop.slope": 1.0, "flow_force.coefficient": 1.0},
+    {},
+    {"supply_droop.slope": -1.0, "compressibility.coefficient": 1.0, "aero_stiffness.stiffness": 1.0,
+     "mount_compliance.compliance": -1.0, "mount_compliance.mass": 1.0},
+)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -101,11 +109,11 @@ def list_unknowns(model: Model, fault_spread: float = 150.0) -> tuple[Free, ...]
     `fault_spread` is the prior standard deviation of the faults in tolerances: they may be of any size, and where no
     signal shows them, this is what is known.
     """
-    clogging = LogOpenFilter(CLOGGING.parameter, 0.0, UNIT_TOLERANCE, fault_spread, math.log(1.0 - LARGEST_KINTAS), 0.0,
-                             1.0)
+    clogging = LogOpenFilter(CLOGGING.parameter, 0.0, UNIT_TOLERANCE, fault_spread, math.log(1.0 - CLOGGING.largest),
+                             0.0, 1.0)
     friction = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, fault_spread,
-                        math.log(SMALLEST_FSS), math.log(LARGEST_FSS), 1.0)
-                for name in ("spool.static_friction", "spool.dynamic_friction")]
+                        math.log(SMALLEST_FSS), math.log(FRICTION.largest), 1.0)
+                for name in ("spool.static_friction", DYNAMIC)]
     suspects = [_make_suspect(s, model) for s in SUSPECTS]
     usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
     ratio = LogFrictionRatio("jack.static_friction", usual, 0.03, 1.0, 0.0, usual + 1.0, 0.3)
@@ -130,9 +138,9 @@ def make_start(free: Sequence[Free], kintas: float, fss: float, offsets: Mapping
 
     FDS goes with FSS, but not beyond `sliding` N.
     """
-    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), LARGEST_KINTAS)),
+    logs = {CLOGGING.parameter: math.log(1.0 - min(max(kintas, 0.0), CLOGGING.largest)),
             FRICTION.parameter: math.log(max(fss, SMALLEST_FSS)),
-            "spool.dynamic_friction": math.log(min(max(fss, SMALLEST_FSS) / STATIC_OVER_DYNAMIC, sliding)),
+            DYNAMIC: math.log(min(max(fss, SMALLEST_FSS) / STATIC_OVER_DYNAMIC, sliding)),
             **(offsets or {})}
     return np.array([(logs.get(f.name, f.centre) - f.centre) / f.scale for f in free])
 
@@ -156,6 +164,11 @@ class Refinement:
     method: str = "least squares"
     everywhere: Mapping[str, float] = field(default_factory=dict)  # of a long recording: typical error over noise
     worst: float = RESIDUAL_WORST  # error over noise that a few stops of the ram may leave
+
+    @property
+    def sizes(self) -> dict[str, Estimate]:
+        """Both faults, by name."""
+        return {fault.name: getattr(self, fault.symbol) for fault in FAULTS}
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -198,7 +211,7 @@ def choose_size_excerpt(model: Model, trace: Trace, floor: Mapping[str, float], 
     problem = make_problem(model, trace, floor)
     sliding = FRICTION.middle / STATIC_OVER_DYNAMIC
     changes = [{CLOGGING.parameter: CLOGGING.middle},
-               {FRICTION.parameter: FRICTION.middle, "spool.dynamic_friction": sliding},
+               {FRICTION.parameter: FRICTION.middle, DYNAMIC: sliding},
                *({f.name: f.value(1.0)} for f in (_make_suspect(s, model) for s in SUSPECTS))]
     return choose_excerpt(trace, problem.model, floor, changes, progress)
 
@@ -223,11 +236,7 @@ def refine_sizes(model: Model, trace: Trace, starts: Sequence[tuple[float, float
     free = list_unknowns(model)
     first = _fit_coarsely(problem, free, starts)
     problem = learn_left_noise(problem, first)
-    found = report_fit(last := _fit_finely(problem, first), problem)
-    if whole is None or whole is trace:
-        return found
-    judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
-    return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
+    return report_fit(_fit_finely(problem, first), problem, whole)
 
 
 def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequence[tuple[float, float]]) -> Fit:
@@ -237,14 +246,11 @@ def _fit_coarsely(problem: CountedProblem, free: Sequence[Free], starts: Sequenc
     healthy = make_start(free, CLOGGING.healthy, FRICTION.healthy, estimate_offsets(problem))
     if _blames_a_fault(free, begin[0]):
         begin.append(healthy)
-    fits = map_in_threads(lambda x: _fit_in_stages(alone, free, x), begin, problem.workers)
+    fits = map_in_threads(lambda x: descend(alone, start_fit(free, x), NOISE_SCHEDULE), begin, problem.workers)
     if len(fits) == 1 and (not is_noise_left(problem, fits[0]) or _blames_a_fault(free, fits[0].x)):
-        fits.append(_fit_in_stages(problem, free, healthy))
+        fits.append(descend(problem, start_fit(free, healthy), NOISE_SCHEDULE))
     best = min(fits, key=lambda f: f.cost)
-    if not is_noise_left(problem, best):
-        for factor, rounds in ((3.0, 4), (1.0, 8)):
-            best = _continue_fit(problem, best, factor, rounds)
-    return best
+    return best if is_noise_left(problem, best) else descend(problem, best, ((3.0, 4), (1.0, 8)))
 
 
 def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
@@ -277,31 +283,38 @@ def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], ro
     alone = replace(problem, workers=1, _lanes={})
 
     def fit_from(part: float) -> Fit:
-        begun = _fit_in_stages(alone, free, found.x + part * (home - found.x))
+        begun = descend(alone, start_fit(free, found.x + part * (home - found.x)), NOISE_SCHEDULE)
         flat = find_flat(alone, free, begun.x)
         return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat, problem.stage)
 
     return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
 
-def _fit_in_stages(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Fit:
-    """A fit from `x` (p,) that takes the noise for larger at first: small stops of the ram count late."""
-    found = start_fit(free, x)
-    for factor, rounds in NOISE_SCHEDULE:
-        found = _continue_fit(problem, found, factor, rounds)
+def descend(problem: CountedProblem, found: Fit, schedule: Sequence[tuple[float, int]],
+            shown_by: CountedProblem | None = None) -> Fit:
+    """The fit after (factor, rounds) each: the noise so many times as large, so that small stops of the ram count late.
+
+    Its covariance begins anew each time. `shown_by` tells which directions no signal shows, by default the problem.
+    """
+    for factor, rounds in schedule:
+        begun = replace(found, covariance=guess_first_covariance(found.free))
+        flat = find_flat(shown_by or problem, found.free, found.x)
+        found = descend_valley(scale_noise(problem, factor), begun, rounds, flat, problem.stage)
     return found
 
 
-def _continue_fit(problem: CountedProblem, found: Fit, factor: float, rounds: int) -> Fit:
-    start = replace(found, covariance=guess_covariance(found.free))
-    flat = find_flat(problem, found.free, found.x)
-    return descend_valley(scale_noise(problem, factor), start, rounds, flat, problem.stage)
+def guess_first_covariance(free: Sequence[Free]) -> Floats:
+    """A first covariance, (p, p): an effect's parameter, which has no prior, by the width of its first difference."""
+    guess = guess_covariance(free)
+    for k, f in enumerate(free):
+        if not np.isfinite(f.prior):
+            guess[k, k] = (f.step / 3.0) ** 2
+    return guess
 
 
-def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats,
-              scaled: Sequence[Mapping[str, float]] = ({}, {}, {}, {})) -> Floats:
-    """Directions (p, k) at `x` (p,) that no signal shows; `scaled` is that of `find_flat_directions`."""
-    return find_flat_directions(problem, free, x, (FLAPPER,), scaled, PRIORS_KNOW_MORE_MISFIT)
+def find_flat(problem: CountedProblem, free: Sequence[Free], x: Floats) -> Floats:
+    """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects goes along."""
+    return find_flat_directions(problem, free, x, (FLAPPER,), EFFECT_POWERS, PRIORS_KNOW_MORE_MISFIT)
 
 
 def _blames_a_fault(free: Sequence[Free], x: Floats) -> bool:
@@ -325,7 +338,7 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
     """The start, (p,) scaled, with the smallest misfit, searched on ever finer grids around the best one."""
     loud = scale_noise(replace(problem, workers=1, _lanes={}), NOISE_SCHEDULE[0][0])
     offsets = estimate_offsets(problem)
-    usual = problem.model["spool.dynamic_friction"]
+    usual = problem.model[DYNAMIC]
 
     def try_starts(tried: Sequence[tuple[float, float]], sliding: float) -> tuple[float, tuple[float, float], Floats]:
         x = np.array([make_start(free, *s, offsets, sliding) for s in tried])
@@ -336,7 +349,7 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
     def search(sliding: float) -> tuple[float, Floats]:
         cost, best, x = try_starts(starts, sliding)
         for step, factor in ((0.05, 1.2), (0.02, 1.08), (0.01, 1.03)):  # of Kintas, of FSS
-            around = [(min(max(best[0] + i * step, 0.0), LARGEST_KINTAS), best[1] * factor**j)
+            around = [(min(max(best[0] + i * step, 0.0), CLOGGING.largest), best[1] * factor**j)
                       for i, j in product(range(-2, 3), repeat=2)]
             cost, best, x = try_starts(around, sliding)
         return cost, x
@@ -375,8 +388,8 @@ def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
     return replace(problem, noise=tuple(learnt), _lanes={})
 
 
-def report_fit(last: Fit, problem: CountedProblem) -> Refinement:
-    """What a fit found, with the noise of its problem as the floor."""
+def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -> Refinement:
+    """What a fit found, with the noise of its problem as the floor; judged on the `whole` recording if it is cut."""
     outputs = problem.trace.outputs
     errors = {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(outputs, last.residuals, strict=True)}
     floor = {s: n.level for s, n in zip(outputs, problem.noise, strict=True)}
@@ -384,10 +397,14 @@ def report_fit(last: Fit, problem: CountedProblem) -> Refinement:
     i, j = names.index(CLOGGING.parameter), names.index(FRICTION.parameter)
     spread = np.sqrt(np.diag(last.covariance))
     correlation = float(last.covariance[i, j] / (spread[i] * spread[j]))
-    return Refinement(estimate_parameter(last, CLOGGING.parameter),
-                      estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
-                      {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
-                      sum(problem.counts))
+    found = Refinement(estimate_parameter(last, CLOGGING.parameter),
+                       estimate_parameter(last, FRICTION.parameter, FSS_INTERVAL_FACTOR), correlation,
+                       {s.parameter: estimate_parameter(last, s.parameter) for s in SUSPECTS}, last, errors, floor,
+                       sum(problem.counts))
+    if whole is None or whole is problem.trace:
+        return found
+    judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
+    return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
 
 
 def estimate_parameter(found: Fit, name: str, factor: float = 1.0) -> Estimate:

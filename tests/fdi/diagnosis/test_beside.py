@@ -12,7 +12,6 @@ from synthetic_run import build_command
 from fdi.diagnosis.diagnosis import Diagnosis, diagnose
 from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level
 from fdi.diagnosis.joint_search import (
-    EFFECT_POWERS,
     Beside,
     Explanation,
     average_explanations,
@@ -21,7 +20,7 @@ from fdi.diagnosis.joint_search import (
     mix_estimates,
     weigh_costs,
 )
-from fdi.diagnosis.refine import find_flat, list_unknowns, make_problem, make_start
+from fdi.diagnosis.refine import EFFECT_POWERS, find_flat, list_unknowns, make_problem, make_start
 from fdi.estimation.replay import hold_inputs
 from fdi.estimation.unidentifiable import find_flat_directions
 from fdi.estimation.unknowns import list_effect_unknowns

@@ -6,10 +6,17 @@ import pytest
 from noisy_traces import record_plant
 
 from fdi.diagnosis.diagnosis import diagnose
-from fdi.diagnosis.faults import CLOGGING, FRICTION, Estimate, Level, compute_severity, find_ruling_fault, judge_size
+from fdi.diagnosis.faults import (
+    CLOGGING,
+    FAULTS,
+    FRICTION,
+    Estimate,
+    Level,
+    compute_severity,
+    find_ruling_fault,
+    judge_size,
+)
 from fdi.diagnosis.refine import (
-    LARGEST_FSS,
-    LARGEST_KINTAS,
     Refinement,
     list_unknowns,
     make_problem,
@@ -111,8 +118,9 @@ def test_no_slope_and_only_priors_along_what_is_flat(off_grid: Refinement) -> No
 def test_sizes_are_within_what_is_possible() -> None:
     """Also where a lag that no fault explains makes the intervals wide."""
     sizes = diagnose(record_plant({"sensor_lag.time": 3e-3})).sizes
-    for size, most in zip(sizes.values(), (LARGEST_KINTAS, LARGEST_FSS), strict=True):
-        assert 0.0 <= size.low <= size.value <= size.high <= most
+    for fault in FAULTS:
+        size = sizes[fault.name]
+        assert 0.0 <= size.low <= size.value <= size.high <= fault.largest
 
 
 @pytest.mark.parametrize(("size", "expected"), [
