@@ -159,10 +159,12 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
     stepped = tuple(_make_step_band(i, s, period, rubbing, clogged) for i, s in enumerate(parts) if s.kind == "step")
     ramped = tuple(_make_ramp_band(i, s, com, period, [*rubbing, easy], amounts)
                    for i, s in enumerate(parts) if is_slow_ramp(s, period))
+    text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
     tables = {"healthy": healthy[:faulty], CLOGGING.name: clogged[0],
               FRICTION.name: rubbing[amounts.index(FRICTION.middle)]}
     facts = {"made": "by simulation", "command": name, "model": model.name, "parameters": format_design(model),
-             "runs": str(count), "faulty": str(faulty), "seed": str(seed), **_describe_origin(parts, period)}
+             "runs": str(count), "faulty": str(faulty), "seed": str(seed),
+             "command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
     if np.abs(load).max() > 0.0:
         facts["load"] = f"up to {np.abs(load).max():.4g} N"
     bands = Bands(tuple(parts), period, np.array(amounts), stepped, ramped, 1.0, 1.0, facts,
@@ -196,12 +198,16 @@ def _make_step_band(number: int, s: Section, period: float, rubbing: Sequence[Fl
     return StepBand(number, fine.astype(float) * period, healthy, shift, spread, shifts[-2], shifts[-1])
 
 
+def _measure_ramp(x: Floats, com: Floats, s: Section, period: float) -> tuple[Floats, Floats]:
+    """Following error, m, and speed beyond the demand's, m/s, of runs `x` (m, n) on a ramp, in its direction."""
+    rows, way = select_ramp_rows(s, period), np.sign(s.rate)
+    return way * (com[rows] - x[:, rows]), way * compute_speed(x, period)[:, rows] - abs(s.rate)
+
+
 def _make_ramp_band(number: int, s: Section, com: Floats, period: float, rubbing: Sequence[Floats],
                     amounts: Sequence[float]) -> RampBand:
     """The band of a ramp from units with rising friction; the last ones have Table 2's lesser FSS and a low FDS."""
-    rows, way = select_ramp_rows(s, period), np.sign(s.rate)
-    errors = [way * (com[rows] - x[:, rows]) for x in rubbing]
-    speeds = [way * compute_speed(x, period)[:, rows] - abs(s.rate) for x in rubbing]
+    errors, speeds = zip(*(_measure_ramp(x, com, s, period) for x in rubbing), strict=True)
     lesser, greater = (list(amounts).index(size) for size in (FRICTION.middle, FRICTION.most))
     position, velocity = (_make_width(x[0], x[lesser], x[greater]) for x in (errors, speeds))
     half = np.array([np.median(compute_half_range(e)) for e in errors])
@@ -230,13 +236,12 @@ def _find_limit_share(bands: Bands, com: Floats, units: Floats, is_most: bool) -
 
     From the mean and scatter of its logarithm: the lowest of some hundred units estimates the lowest of all poorly.
     """
-    reached = []
-    for x in units:
+    def find_furthest(x: Floats) -> float:
         found, _, _ = find_excursions(com, x, bands.period, bands, list(bands.sections))
-        own = [e for e in found if e.fault == CLOGGING.name and np.isfinite(e.departure).any()]
-        furthest = [float(find_lasting_peak(e.departure / (e.most if is_most else e.middle))) for e in own]
-        reached.append(max(furthest, default=1.0))
-    logs = np.log(reached)
+        return max((float(find_lasting_peak(e.departure / (e.most if is_most else e.middle))) for e in found
+                    if e.fault == CLOGGING.name and np.isfinite(e.departure).any()), default=1.0)
+
+    logs = np.log([find_furthest(x) for x in units])
     return float(np.exp(logs.mean() - STEP_FAULT_LEAVES_SD[is_most] * logs.std(ddof=1)))
 
 
@@ -254,11 +259,6 @@ def _average_known(values: Floats) -> float:
     """Mean over the units that show a precursor; NaN where most units do not show it."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if 2 * len(known) > len(values) else float("nan")
-
-
-def _describe_origin(parts: Sequence[Section], period: float) -> dict[str, str]:
-    text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
-    return {"command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
                 if any(level > Level.ACCEPTABLE for level in judge_position(c, x, period, base).levels.values())]
     if doubtful:
         words = "beyond MidBand of simulated healthy units: " + ", ".join(doubtful)
-        found = replace(found, provenance={**found.provenance, "doubtful": words})
+        return replace(found, provenance={**found.provenance, "doubtful": words})
     return found
 
 
@@ -325,34 +325,27 @@ class _Fleet:
     """Positions of a fleet, (m, n) m, and the simulated bands that they correct."""
 
     def __init__(self, x: Floats, com: Floats, base: Bands) -> None:
-        self.x, self.com, self.base, self.count = x, com, base, len(x)
+        self.x, self.com, self.base, self.freedom = x, com, base, len(x) - 1
         from scipy.stats import norm, t
 
-        freedom = self.count - 1 + FLEET_PRIOR_TRACES
-        unsure = float(t.isf(norm.sf(BAND_NEAREST_LIMIT_SD), freedom)) / BAND_NEAREST_LIMIT_SD
-        self.wider = unsure * float(np.sqrt(1 + 1 / self.count))
+        unsure = float(t.isf(norm.sf(BAND_NEAREST_LIMIT_SD), self.freedom + FLEET_PRIOR_TRACES)) / BAND_NEAREST_LIMIT_SD
+        self.wider = unsure * float(np.sqrt(1 + 1 / len(x)))
 
     def join_scatter(self, values: Floats, simulated: Floats) -> Floats:
         """Standard deviation over the fleet, of (m, ..), shrunk to the simulated one and widened."""
-        freedom = self.count - 1
-        squares = FLEET_PRIOR_TRACES * simulated**2 + freedom * values.var(axis=0, ddof=1)
-        out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + freedom))
+        squares = FLEET_PRIOR_TRACES * simulated**2 + self.freedom * values.var(axis=0, ddof=1)
+        out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + self.freedom))
         return out
 
     def correct_step(self, s: StepBand) -> StepBand:
         """The fleet's mean and scatter; friction and clogging add to them what they add to a simulated unit's."""
-        start = self.base.sections[s.section].start
-        rows = start + np.rint(s.t / self.base.period).astype(int)
-        own = self.join_scatter(self.x[:, rows], s.spread[0])
+        x = self.x[:, self.base.sections[s.section].start + np.rint(s.t / self.base.period).astype(int)]
         more = np.maximum(s.spread**2 - s.spread[0]**2, 0.0)
-        return s._replace(healthy=self.x[:, rows].mean(axis=0), spread=np.sqrt(own**2 + more))
+        return s._replace(healthy=x.mean(axis=0), spread=np.sqrt(self.join_scatter(x, s.spread[0])**2 + more))
 
     def correct_ramp(self, r: RampBand) -> RampBand:
         """The fleet's centres and healthy widths; a limit too near to them is dropped."""
-        s = self.base.sections[r.section]
-        rows, way = select_ramp_rows(s, self.base.period), np.sign(s.rate)
-        error = way * (self.com[rows] - self.x[:, rows])
-        fast = way * compute_speed(self.x, self.base.period)[:, rows] - abs(s.rate)
+        error, fast = _measure_ramp(self.x, self.com, self.base.sections[r.section], self.base.period)
         half = np.maximum.accumulate(np.r_[np.median(compute_half_range(error)), r.half_range[1:]])
         return r._replace(position=self.correct_width(error, r.position), speed=self.correct_width(fast, r.speed),
                           half_range=half)
@@ -398,12 +391,15 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
     tolerance = list_tolerance_sizes(model)
     names = list(dict.fromkeys([*tolerance, CLOGGING.parameter, FRICTION.parameter, DYNAMIC]))
     lanes = Lanes(model, names, steps, workers=1)
+    moving, resting = (round(seconds / model["controller.period"]) for seconds in (0.5, 0.3))
+    t = np.arange(moving) / moving
+    lead_in = np.r_[1e-3 * np.sin(2 * np.pi * t) * t, np.zeros(resting)]  # m: what a unit did before its test
     out = np.empty((count, len(com)))
 
     def simulate_block(first: int) -> None:
         members = slice(first, min(first + NARROW, count))
         rng = np.random.default_rng([seed, first])
-        before = make_lead_in(com, model["controller.period"]) if com[0] != 0.0 or first // NARROW % 2 else com[:0]
+        before = com[0] + lead_in if com[0] != 0.0 or first // NARROW % 2 else com[:0]
         noise = sample_sensor_noise(rng, model, len(before) + len(com))
         units = _sample_parameters(rng, model, tolerance, names, kind)[:members.stop - first]
         asked, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
@@ -414,17 +410,6 @@ def simulate_units(model: Model, com: Floats, load: Floats, kind: UnitKind, coun
         for done, _ in enumerate(pool.map(simulate_block, starts)):
             progress(f"simulating units, {kind.name}", (done + 1) / len(starts))
     return out
-
-
-def make_lead_in(com: Floats, period: float, moving: float = 0.5, resting: float = 0.3, stroke: float = 1e-3) -> Floats:
-    """Command, m, of what a unit did before its test: a growing sine of `stroke` m for `moving` s, then rest.
-
-    It rests for `resting` s at the first demand of the test's command `com` (n,) m.
-    """
-    rows = round(moving / period)
-    t = np.arange(rows) / rows
-    asked: Floats = np.r_[com[0] + stroke * np.sin(2 * np.pi * t) * t, np.full(round(resting / period), com[0])]
-    return asked
 
 
 def sample_sensor_noise(rng: np.random.Generator, model: Model, cycles: int, most_colour: float = 0.85,
