@@ -23,6 +23,7 @@ class Variant:
         self.bus = send
         self.command, self.feedback = Command(0.0, 0, 0), Feedback(0.0, 0.0)
         self.answers = 0  # drive frames so far
+        self.last: Drive | None = None  # the sound answer before
         self.firmware = Firmware(self._transmit, model=model)
 
     def receive(self, frame: Frame) -> None:
@@ -51,7 +52,9 @@ class Variant:
     def _transmit(self, cob_id: int, data: bytes) -> None:
         if cob_id == codec.DRIVE:
             self.answers += 1
-            said = self.answer(codec.unpack_drive(data))
+            drive = codec.unpack_drive(data)
+            said = self.answer(drive)
+            self.last = drive
             if said is not None:
                 self.bus(cob_id, codec.pack_drive(*said))
         elif not self.swallows(cob_id, data):
@@ -66,91 +69,62 @@ class Sound(Variant):
     pass
 
 
-class CycleLate(Variant):
-    """The answer to a cycle comes in the next one, with its own cycle number."""
-
-    _kept: Drive | None = None
-
-    def answer(self, drive: Drive) -> Drive | None:
-        said, self._kept = self._kept, drive
-        return said
+def vary(answer: Callable[[Variant, Drive], Drive | None]) -> type[Variant]:
+    """A controller that says this in place of a sound answer."""
+    return type("Varied", (Variant,), {"answer": answer})
 
 
-class OldCurrent(Variant):
-    """The current is that of the cycle before; status word and cycle number are right."""
-
-    _current = 0.0
-
-    def answer(self, drive: Drive) -> Drive:
-        said, self._current = drive._replace(current=self._current if drive.current else 0.0), drive.current
-        return said
+def is_active(drive: Drive) -> bool:
+    """Whether the status word says that the loop is closed."""
+    return drive.status & 7 == 7
 
 
-class StaleNumber(Variant):
-    """The cycle number is that of the cycle before, all else is right."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(cycle=(drive.cycle - 1) & 0xFFFF)
+def limit(current: float) -> float:
+    """A current within its limit."""
+    return max(-CURRENT_LIMIT, min(CURRENT_LIMIT, current))
 
 
-class StuckNumber(Variant):
-    """From some time on the cycle number stands still for two cycles in a hundred."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(cycle=drive.cycle // 50 * 50) if drive.cycle % 50 == 1 else drive
+# The answer to a cycle comes in the next one, with its own cycle number.
+CycleLate = vary(lambda self, drive: self.last)
+# The current is that of the cycle before; status word and cycle number are right.
+OldCurrent = vary(lambda self, drive: drive._replace(current=self.last.current if self.last and drive.current else 0.0))
+# The cycle number is that of the cycle before, all else is right.
+StaleNumber = vary(lambda self, drive: drive._replace(cycle=(drive.cycle - 1) & 0xFFFF))
+# From some time on the cycle number stands still for two cycles in a hundred.
+StuckNumber = vary(lambda self, drive: drive._replace(cycle=drive.cycle - (drive.cycle % 50 == 1)))
+NoOutput = vary(lambda self, drive: drive._replace(current=0.0))
+WrongSign = vary(lambda self, drive: drive._replace(current=-drive.current))
+GainLow = vary(lambda self, drive: drive._replace(current=limit(0.7 * drive.current)))
+GainHigh = vary(lambda self, drive: drive._replace(current=limit(1.3 * drive.current)))
+# One drive frame in fifty is not sent.
+OneOfFifty = vary(lambda self, drive: drive if self.answers % 50 else None)
+# The status word says ACTIVE in any case, or never READY.
+AlwaysActive = vary(lambda self, drive: drive._replace(status=0xF))
+NeverReady = vary(lambda self, drive: drive._replace(status=drive.status & 7))
+# NaN becomes the smallest INT32 when a C program casts it; here from cycle 120 on.
+NotANumber = vary(lambda self, drive: drive._replace(current=-2.0**31 * codec.CURRENT) if drive.cycle >= 120 else drive)
+# While the control word is ACTIVE, the current is at its limit, or is not limited.
+Saturated = vary(lambda self, drive: drive._replace(current=CURRENT_LIMIT) if is_active(drive) else drive)
+BeyondLimit = vary(lambda self, drive: drive._replace(current=3.8 * (self.command.position - self.feedback.position))
+                   if is_active(drive) else drive)
 
 
 class Frozen(Variant):
     """The whole answer but its cycle number stands still from cycle 120 on."""
 
-    _last: Drive | None = None
+    _kept: Drive | None = None
 
     def answer(self, drive: Drive) -> Drive:
-        if drive.cycle < 120 or self._last is None:
-            self._last = drive
-        return self._last._replace(cycle=drive.cycle)
+        if drive.cycle < 120 or self._kept is None:
+            self._kept = drive
+        return self._kept._replace(cycle=drive.cycle)
 
 
 class FrozenCurrent(Frozen):
     """The current stands still from cycle 120 on, while the control word is ACTIVE."""
 
     def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=super().answer(drive).current) if drive.status & 7 == 7 else drive
-
-
-class NoOutput(Variant):
-    """Never any current."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=0.0)
-
-
-class WrongSign(Variant):
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=-drive.current)
-
-
-class _Gain(Variant):
-    factor = 1.0
-
-    def answer(self, drive: Drive) -> Drive:
-        wanted = self.factor * drive.current
-        return drive._replace(current=max(-CURRENT_LIMIT, min(CURRENT_LIMIT, wanted)))
-
-
-class GainLow(_Gain):
-    factor = 0.7
-
-
-class GainHigh(_Gain):
-    factor = 1.3
-
-
-class OneOfFifty(Variant):
-    """One drive frame in fifty is not sent."""
-
-    def answer(self, drive: Drive) -> Drive | None:
-        return None if self.answers % 50 == 0 else drive
+        return drive._replace(current=super().answer(drive).current) if is_active(drive) else drive
 
 
 class IgnoresControl(Variant):
@@ -176,20 +150,6 @@ class IgnoresSwitchOff(IgnoresControl):
 
     def reset(self) -> None:
         self._was_active = False
-
-
-class AlwaysActive(Variant):
-    """The status word says ACTIVE in any case."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(status=0xF)
-
-
-class NeverReady(Variant):
-    """The status word never says READY."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(status=drive.status & 7)
 
 
 class SlowStatus(Variant):
@@ -221,35 +181,13 @@ class HalfTheHeartbeats(Variant):
         return cob_id == _HEARTBEAT and data != b"\0" and self._count % 2 == 0
 
 
-class NotANumber(Variant):
-    """NaN becomes the smallest INT32 when a C program casts it; here from cycle 120 on."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=-2.0**31 * codec.CURRENT) if drive.cycle >= 120 else drive
-
-
-class Saturated(Variant):
-    """The current is at its limit while the control word is ACTIVE."""
-
-    def answer(self, drive: Drive) -> Drive:
-        return drive._replace(current=CURRENT_LIMIT) if drive.status & 7 == 7 else drive
-
-
-class BeyondLimit(Variant):
-    """The current is not limited."""
-
-    def answer(self, drive: Drive) -> Drive:
-        wanted = 3.8 * (self.command.position - self.feedback.position)
-        return drive._replace(current=wanted) if drive.status & 7 == 7 else drive
-
-
 class Leaks(Variant):
     """An integral part that neither a reset nor the control word clears."""
 
     _integral = 0.0
 
     def answer(self, drive: Drive) -> Drive:
-        if drive.status & 7 != 7:
+        if not is_active(drive):
             return drive
         self._integral += 1e-3 * drive.current
         return drive._replace(current=drive.current + self._integral)
@@ -263,6 +201,3 @@ class StrangeEmcy(Variant):
             self.bus(0x082, bytes.fromhex("0060010000000000"))
             self.bus(0x082, bytes.fromhex("0000000000000000"))
         return drive
-
-
-Make = Callable[..., Variant]
