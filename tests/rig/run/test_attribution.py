@@ -1,7 +1,7 @@
 """First causes: scripted records of runs in which the rig, the plant or the controller was late, stopped or died."""
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -52,16 +52,28 @@ class Script:
     def report(self, cycle: float, node: int, code: int, kind: str = "emcy", text: str = "") -> None:
         self.troubles.append(Trouble(round(cycle * MS), node, kind, code, text or f"node {node} 0x{code:04X}"))
 
+    def late(self, cycle: int, seconds: float) -> None:
+        self.lateness[cycle] = seconds
+
+    def feed(self, cycle: int, seconds: float) -> None:
+        self.feedback[cycle] = seconds
+
+    def stall(self, cycle: int, seconds: float) -> None:
+        self.delay[cycle] = seconds
+
+    def inject(self, first: int, last: int) -> None:
+        self.injected[2, first:last] = True
+
+    def spoil(self, steps: list[tuple[Any, ...]]) -> Script:
+        for name, *arguments in steps:
+            getattr(self, name)(*arguments)
+        return self
+
     def attribute(self, gone: Mapping[int, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
         due = np.arange(N, dtype=np.int64) * MS
         records = CycleRecords(due, self.lateness, self.feedback, self.valve, self.response, self.flags,
                                Injected(*self.injected), self.delay)
         return attribute(records, self.troubles, policy, gone)
-
-
-def source_and_kind(found: Attribution) -> tuple[int, str]:
-    assert found.cause is not None
-    return found.cause.source, found.cause.kind
 
 
 @pytest.mark.parametrize(("controller", "plant", "blamed"), [
@@ -90,64 +102,107 @@ def test_a_run_without_trouble() -> None:
     assert set(found.invalid.values()) == {0} and found.overruns.sum() == 0
 
 
-@pytest.mark.parametrize(("node", "code", "at"), [
-    (CONTROLLER, 0x8100, 300.6),  # a stack that calls SYNC lost 1.5 periods after the last, before the late one comes
-    (CONTROLLER, 0x8100, 302.0), (PLANT, 0x8100, 300.9),
-    (PLANT, 0x8250, 303.2),  # nodes that stood still with the rig
+KILLED = "its process was ended by SIGKILL"
+LATE_SYNC = ("late", 300, 1.9e-3)
+MISSED = ("report", 604.0, PLANT, 0x8250)
+GUARD = ("report", 650.0, 0, 0, "guard", "guard 'too far' was passed by xj")
+CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, int], str]] = {
+    # what was wrong, who is gone; who is the first cause, of which kind, in which cycle, and words of the text
+    "a stack calls SYNC lost 1.5 periods after the last, before the late one comes": (
+        [LATE_SYNC, ("report", 300.6, CONTROLLER, 0x8100)], {}, (RIG, "late", 300), "the rig sent SYNC 1.9 ms late"),
+    "a late SYNC is lost for the controller": (
+        [LATE_SYNC, ("report", 302.0, CONTROLLER, 0x8100)], {}, (RIG, "late", 300), ""),
+    "a late SYNC is lost for the plant": ([LATE_SYNC, ("report", 300.9, PLANT, 0x8100)], {}, (RIG, "late", 300), ""),
+    "nodes stood still with the rig": (
+        [LATE_SYNC, ("lose_drive", 300, 303), ("report", 303.2, PLANT, 0x8250)], {}, (RIG, "late", 300), ""),
+    "overcurrent is not about communication": (
+        [LATE_SYNC, ("report", 301.5, CONTROLLER, 0x2310)], {}, (CONTROLLER, "emcy", 301), ""),
+    "neither is a reset": ([LATE_SYNC, ("report", 301.5, CONTROLLER, 0, "nmt")], {}, (CONTROLLER, "nmt", 301), ""),
+    "long after a late SYNC": (
+        [LATE_SYNC, ("report", 400.0, CONTROLLER, 0x8100)], {}, (CONTROLLER, "emcy", 400), ""),
+    "a stalled plant is behind what the controller reports": (
+        [("lose_feedback", 500, 510), ("report", 503.2, CONTROLLER, 0x8250), ("report", 511.1, PLANT, 0x8250)], {},
+        (PLANT, "late", 500), "no feedback for 10 cycles"),
+    "the plant's own record shows a stall": (
+        [("stall", 500, 3e-3), ("lose_drive", 499, 503), ("report", 503.0, PLANT, 0x8250)], {}, (PLANT, "late", 500),
+        "by its own record the plant sent feedback 3.0 ms after SYNC"),
+    "a dead controller, and not the plant that misses it": (
+        [("lose_drive", 600), MISSED], {CONTROLLER: KILLED}, (CONTROLLER, "stopped", 600),
+        f"no drive frame since cycle 600; {KILLED}"),
+    "although a SYNC was late just before": (
+        [("late", 598, 0.7e-3), ("lose_drive", 600), MISSED], {CONTROLLER: "no heartbeat any more"},
+        (CONTROLLER, "stopped", 600), ""),
+    "a controller killed while the plant was late, for lateness ends no process": (
+        [("feed", 597, 4e-3), ("feed", 598, 4e-3), ("report", 598.0, CONTROLLER, 0x8250), ("lose_drive", 600), MISSED],
+        {CONTROLLER: KILLED}, (CONTROLLER, "stopped", 600), ""),
+    "a plant that was late long before": (
+        [("feed", 300, 4e-3), ("feed", 301, 4e-3), ("report", 301.0, CONTROLLER, 0x8250), ("lose_drive", 600), MISSED],
+        {CONTROLLER: KILLED}, (PLANT, "late", 300), ""),
+    "a dead plant, and not the controller that misses it": (
+        [("lose_feedback", 600), ("report", 603.5, CONTROLLER, 0x8250), ("report", 620.0, PLANT, 0, "process")],
+        {PLANT: KILLED}, (PLANT, "stopped", 600), ""),
+    "a controller that stalls alone": (
+        [("lose_drive", 600, 612), MISSED], {}, (CONTROLLER, "stopped", 600),
+        "did not answer in time: no drive frame for 12 cycles from 600"),
+    "missing feedback that came": ([("report", 604.0, CONTROLLER, 0x8250)], {}, (CONTROLLER, "emcy", 604), ""),
+    "a plant that leaves OPERATIONAL, known by its next heartbeat": (
+        [("lose_feedback", 600, 720), ("report", 603.5, CONTROLLER, 0x8250), ("report", 690.0, PLANT, 127, "nmt")], {},
+        (PLANT, "stopped", 600), ""),
+    "a plant that boots": (
+        [("lose_feedback", 600, 720), ("report", 603.5, CONTROLLER, 0x8250), ("report", 690.0, PLANT, 0, "nmt")], {},
+        (PLANT, "stopped", 600), ""),
+    "a plant that has an error of its own": (
+        [("lose_feedback", 600, 720), ("report", 603.5, CONTROLLER, 0x8250), ("report", 600.4, PLANT, 0x6000)], {},
+        (PLANT, "emcy", 600), ""),
+    "a fault of the sequence": (
+        [("inject", 600, 607), ("lose_drive", 600, 603), MISSED], {}, (0, "injected", 600), ""),
+    "a guard passed because frames were late": ([("lose_feedback", 600, 605), GUARD], {}, (PLANT, "late", 600), ""),
+    "a guard": ([GUARD], {}, (0, "guard", 650), ""),
+    "only a heartbeat is missing": (
+        [("report", 600.0, CONTROLLER, 0, "heartbeat")], {}, (CONTROLLER, "heartbeat", 600), ""),
+    "the first of several: that the bench is late afterwards changes nothing": (
+        [("report", 400.0, CONTROLLER, 0x2310), ("late", 700, 8e-3), ("report", 702.0, PLANT, 0x8100)], {},
+        (CONTROLLER, "emcy", 400), ""),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_cause(case: str) -> None:
+    steps, gone, expected, words = CASES[case]
+    script = Script().spoil(steps)
+    found = script.attribute(gone)
+    assert found.cause is not None and (found.cause.source, found.cause.kind, found.cause.cycle) == expected
+    assert words in found.cause.text and found.cause.is_gone is (found.cause.source in gone)
+    own = sum(trouble.text == found.cause.text for trouble in script.troubles)
+    assert len(found.consequences) == len(script.troubles) - own
+    assert found.by_bench >= found.cause.is_lateness
+    if (found.cause.source, found.cause.kind) == (CONTROLLER, "stopped"):
+        assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
+
+
+@pytest.mark.parametrize(("steps", "unjudged", "affected", "invalid", "overruns"), [
+    ([LATE_SYNC], range(299, 304), (), {"sync_late": 1}, {300: 1}),
+    ([("late", 300, 5.3e-3)], range(299, 308), (), {"sync_late": 1}, {300: 5}),  # it changes no signal
+    ([("lose_feedback", 500, 510)], range(500, 521), range(500, 610), {"feedback_late": 10},
+     dict.fromkeys(range(500, 510), 1)),
+    ([("feed", 500, 0.6e-3), ("lose_drive", 500, 501)], range(500, 503), range(500, 601), {"feedback_late": 1},
+     {500: 1}),
+    ([("feed", 500, 0.4e-3), ("late", 300, 0.3e-3)], (), (), {}, {}),  # within the limits
 ])
-def test_a_late_sync_is_the_cause_of_what_follows(node: int, code: int, at: float) -> None:
-    """Seen once: one SYNC 1.9 ms late, and the run ended as ABORTED "node 2 controller 0x8100"."""
-    script = Script()
-    script.lateness[300] = 1.9e-3
-    if code == 0x8250:
-        script.lose_drive(300, 303)
-    script.report(at, node, code)
-    found = script.attribute()
-    assert source_and_kind(found) == (RIG, "late") and found.cause is not None and found.cause.cycle == 300
-    assert found.cause.text == "the rig sent SYNC 1.9 ms late"
-    assert [trouble.code for trouble in found.consequences] == [code] and found.by_bench == 1
-    assert not found.judged[299:303].any() and found.judged[:299].all() and found.judged[310:].all()
+def test_what_lateness_spoils(steps: list[tuple[Any, ...]], unjudged: Collection[int], affected: Collection[int],
+                              invalid: dict[str, int], overruns: dict[int, int]) -> None:
+    found = Script().spoil(steps).attribute()
+    assert set(np.flatnonzero(~found.judged)) == set(unjudged)
+    assert set(np.flatnonzero(found.affected)) == set(affected)
+    assert invalid.items() <= found.invalid.items()
+    assert {int(k): int(found.overruns[k]) for k in np.flatnonzero(found.overruns)} == overruns
 
 
-def test_the_controller_answers_for_its_own_errors_beside_a_late_sync() -> None:
-    """Overcurrent is not about communication; a reset neither; and long after the late SYNC it is another story."""
-    for cycle, kind, code in ((301.5, "emcy", 0x2310), (301.5, "nmt", 0), (400.0, "emcy", 0x8100)):
-        script = Script()
-        script.lateness[300] = 1.9e-3
-        script.report(cycle, CONTROLLER, code, kind)
-        found = script.attribute()
-        assert source_and_kind(found) == (CONTROLLER, kind) and found.by_bench == 0
-
-
-def test_a_stalled_plant_is_the_cause_of_what_the_controller_reports() -> None:
-    """Seen once as "node 2 controller 0x8250"."""
-    script = Script()
-    script.lose_feedback(500, 510)
-    script.report(503.2, CONTROLLER, 0x8250)
-    script.report(511.1, PLANT, 0x8250)
-    found = script.attribute()
-    assert source_and_kind(found) == (PLANT, "late") and found.cause is not None and found.cause.cycle == 500
-    assert "no feedback for 10 cycles" in found.cause.text and len(found.consequences) == 2
-    assert not found.judged[500:520].any() and found.affected[500:600].all() and found.judged[600:].all()
-
-
-@pytest.mark.parametrize("late", [0.6e-3, 0.99e-3])
-def test_late_feedback_is_not_held_against_the_controller(late: float) -> None:
-    script = Script()
-    script.feedback[500] = late
-    script.lose_drive(500, 501)
-    found = script.attribute()
-    assert not found.judged[500] and found.invalid["feedback_late"] == 1 and found.overruns.sum() == 1
-
-
-def test_the_plants_own_record_shows_a_stall() -> None:
-    script = Script()
-    script.delay[500] = 3e-3
-    script.lose_drive(499, 503)
-    script.report(503.0, PLANT, 0x8250)
-    found = script.attribute()
-    assert source_and_kind(found) == (PLANT, "late") and found.cause is not None
-    assert "by its own record the plant sent feedback 3.0 ms after SYNC" in found.cause.text
+def test_the_limits_are_those_of_the_sequence_and_a_plant_that_is_dead_is_not_late() -> None:
+    strict = Script().spoil([("late", 300, 0.3e-3), ("feed", 400, 0.4e-3)]).attribute(
+        policy=TimingPolicy(sync=0.2e-3, feedback=0.2e-3))
+    assert strict.invalid["sync_late"] == strict.invalid["feedback_late"] == 1
+    assert Script().spoil([("lose_feedback", 600)]).attribute({PLANT: KILLED}).overruns.sum() == 0
 
 
 def test_the_plants_record_is_matched_by_cycle() -> None:
@@ -157,133 +212,12 @@ def test_the_plants_record_is_matched_by_cycle() -> None:
     assert select_plant_delays(None, 5).tolist() == [0.0] * 5
 
 
-def test_a_dead_controller_is_named_and_not_the_plant_that_misses_it() -> None:
-    """Seen five of five times as "node 3 plant 0x8250"."""
-    script = Script()
-    script.lose_drive(600)
-    script.report(604.0, PLANT, 0x8250)
-    found = script.attribute({CONTROLLER: "its process was ended by SIGKILL"})
-    assert source_and_kind(found) == (CONTROLLER, "stopped") and found.cause is not None and found.cause.cycle == 600
-    assert found.cause.text.endswith("no drive frame since cycle 600; its process was ended by SIGKILL")
-    assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
-    assert [trouble.node for trouble in found.consequences] == [PLANT] and found.by_bench == 0
-    assert found.judged[:N - 1].all() and found.cause.is_gone
-
-
-def test_a_dead_controller_is_named_although_a_sync_was_late_just_before() -> None:
-    script = Script()
-    script.lateness[598] = 0.7e-3
-    script.lose_drive(600)
-    script.report(604.0, PLANT, 0x8250)
-    assert source_and_kind(script.attribute({CONTROLLER: "no heartbeat any more"})) == (CONTROLLER, "stopped")
-
-
-def test_a_controller_killed_while_the_plant_was_late_is_named() -> None:
-    """Lateness ends no process. Long before the kill it is the first cause."""
-    for late, expected in ((597, (CONTROLLER, "stopped")), (300, (PLANT, "late"))):
-        script = Script()
-        script.feedback[late:late + 2] = 4e-3
-        script.report(late + 1, CONTROLLER, 0x8250)
-        script.lose_drive(600)
-        script.report(604.0, PLANT, 0x8250)
-        found = script.attribute({CONTROLLER: "its process was ended by SIGKILL"})
-        assert source_and_kind(found) == expected and len(found.consequences) == 2
-
-
-def test_a_dead_plant_is_named_and_not_the_controller_that_misses_it() -> None:
-    """Seen five of five times as "node 2 controller"."""
-    script = Script()
-    script.lose_feedback(600)
-    script.report(603.5, CONTROLLER, 0x8250)
-    script.report(620.0, PLANT, 0, "process", "node 3 plant: its process was ended by SIGKILL")
-    found = script.attribute({PLANT: "its process was ended by SIGKILL"})
-    assert source_and_kind(found) == (PLANT, "stopped") and found.cause is not None and found.cause.cycle == 600
-    assert found.overruns.sum() == 0  # it did not come late: it did not come any more
-
-
-def test_a_controller_that_stalls_alone() -> None:
-    script = Script()
-    script.lose_drive(600, 612)
-    script.report(604.0, PLANT, 0x8250)
-    found = script.attribute()
-    assert source_and_kind(found) == (CONTROLLER, "stopped") and found.cause is not None
-    assert "did not answer in time: no drive frame for 12 cycles from 600" in found.cause.text
-
-
-def test_a_controller_that_reports_missing_feedback_which_came() -> None:
-    script = Script()
-    script.report(604.0, CONTROLLER, 0x8250)
-    assert source_and_kind(script.attribute()) == (CONTROLLER, "emcy")
-
-
-@pytest.mark.parametrize(("kind", "code"), [("nmt", 127), ("nmt", 0), ("emcy", 0x6000)])
-def test_a_plant_that_stops_by_itself_was_not_late(kind: str, code: int) -> None:
-    """The controller notices first; the plant's own message, or its next heartbeat, says what was."""
-    script = Script()
-    script.lose_feedback(600, 720)
-    script.report(603.5, CONTROLLER, 0x8250)
-    script.report(690.0 if kind == "nmt" else 600.4, PLANT, code, kind)
-    found = script.attribute()
-    assert found.cause is not None and found.cause.source == PLANT and not found.cause.is_lateness
-
-
-def test_faults_of_the_sequence_are_the_sequences() -> None:
-    script = Script()
-    script.injected[2, 600:607] = True
-    script.lose_drive(600, 603)
-    script.report(604.0, PLANT, 0x8250)
-    found = script.attribute()
-    assert found.cause is not None and (found.cause.kind, found.cause.cycle) == ("injected", 600)
-
-
-def test_a_guard_passed_because_frames_were_late_is_the_benchs() -> None:
-    script = Script()
-    script.lose_feedback(600, 605)
-    script.report(650.0, 0, 0, "guard", "guard 'too far' was passed by xj")
-    assert source_and_kind(script.attribute()) == (PLANT, "late")
-    script = Script()
-    script.report(650.0, 0, 0, "guard", "guard 'too far' was passed by xj")
-    assert source_and_kind(script.attribute()) == (0, "guard")
-
-
-def test_only_a_heartbeat_is_missing() -> None:
-    script = Script()
-    script.report(600.0, CONTROLLER, 0, "heartbeat", "node 2 controller is silent")
-    found = script.attribute()
-    assert source_and_kind(found) == (CONTROLLER, "heartbeat") and found.consequences == ()
-
-
-def test_a_late_sync_alone_changes_no_signal() -> None:
-    script = Script()
-    script.lateness[300] = 5.3e-3
-    found = script.attribute()
-    assert not found.affected.any() and found.overruns[300] == 5 and found.invalid["sync_late"] == 1
-
-
-def test_the_limits_are_those_of_the_sequence() -> None:
-    script = Script()
-    script.lateness[300], script.feedback[400] = 0.3e-3, 0.4e-3
-    assert script.attribute().judged.all()
-    strict = script.attribute(policy=TimingPolicy(sync=0.2e-3, feedback=0.2e-3))
-    assert strict.invalid["sync_late"] == strict.invalid["feedback_late"] == 1
-
-
 def test_a_run_without_cycles() -> None:
     empty, mask = np.zeros(0), np.zeros(0, dtype=bool)
     records = CycleRecords(np.zeros(0, dtype=np.int64), empty, empty, empty, empty, np.zeros(0, dtype=np.int64),
                            Injected(mask, mask, mask), empty)
     found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, {PLANT: "gone"})
-    assert source_and_kind(found) == (CONTROLLER, "bring_up") and len(found.judged) == 0
-
-
-def test_the_first_of_several_causes() -> None:
-    """The controller fails at 400; that the bench is late at 700 changes nothing."""
-    script = Script()
-    script.report(400.0, CONTROLLER, 0x2310)
-    script.lateness[700] = 8e-3
-    script.report(702.0, PLANT, 0x8100)
-    found = script.attribute()
-    assert source_and_kind(found) == (CONTROLLER, "emcy") and found.by_bench == 1
+    assert found.cause is not None and found.cause.source == CONTROLLER and len(found.judged) == 0
 
 
 @pytest.mark.parametrize(("values", "most"), [([], 0), ([0, 0], 0), ([1, 1, 0, 1], 2), ([0, 7, 0], 7), ([2, 1], 3)])
