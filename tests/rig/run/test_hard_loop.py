@@ -141,6 +141,10 @@ class Bench:
         self.wire.link.send(*marker)
         self.nodes.wait_for(*marker)
 
+    def logged(self, cob_id: int) -> list[bytes]:
+        """The data of all frames with that COB-ID in the log."""
+        return [frame.data for frame in self.frames if frame.cob_id == cob_id]
+
     def demands(self) -> list[int]:
         return [round(row.com * 1e7) for row in self.rows]
 
@@ -172,10 +176,18 @@ paces = pytest.mark.parametrize("realtime", [False, True], ids=["lockstep", "rea
 
 @raw_kinds
 @paces
-def test_a_row_holds_what_belongs_together(bus_kind: str, realtime: bool) -> None:
-    """Valve state and drive carry the number of their cycle. Feedback does not: a late one is the next cycle's."""
-    with bench(bus_kind, realtime) as one:
-        one.play(*range(30))
+def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
+    """Valve state and drive carry the number of their cycle. Feedback does not: a late one is the next cycle's.
+
+    Every frame reaches the log once and in order: those of the cycle, and those that the services send and receive on
+    their own socket. Nothing is compiled once the loop is made.
+    """
+    with bench(bus_kind, realtime) as one, list_compilations() as entries:
+        other = Link(open_can(one.where), time.monotonic_ns)
+        one.master._beat.configure(1, one.wire.clock.now())
+        for k in range(30):
+            one.play(k)
+            other.send(0x123, bytes([k]))
 
         def whole() -> list[Signals]:
             """Rows with all three answers, and feedback of their own SYNC."""
@@ -184,11 +196,16 @@ def test_a_row_holds_what_belongs_together(bus_kind: str, realtime: bool) -> Non
 
         if realtime:
             assert one.loop.wait_until_played(lambda: False)
-            one.play_until(lambda: bool(whole()))
+            one.play_until(lambda: bool(whole()) and one.logged(codec.DRIVE)[29:] != [])
         one.loop.finish()
+        other.close()
+        one.wire.poll(0.0)
+        one.loop.close()
+        one.settle()
+        assert entries == []
         one.check_demands(list(range(30)), idle=[29])
-        assert all(later - earlier == PERIOD for earlier, later in pairwise(one.times)) or realtime
-        assert len(whole()) == 30 or realtime
+        assert realtime or all(later - earlier == PERIOD for earlier, later in pairwise(one.times))
+        assert realtime or len(whole()) == len(one.logged(codec.DRIVE)) == 30
         for row in one.rows:
             k = row.cycle
             assert isnan(row.xs) or row.xs == pytest.approx(k * 1e-9)
@@ -201,50 +218,12 @@ def test_a_row_holds_what_belongs_together(bus_kind: str, realtime: bool) -> Non
         assert all(timing.execution > 0 for timing in one.timings)
         for timing in (one.timings[row.cycle] for row in whole()):
             assert 0 < timing.feedback_response <= timing.valve_response <= timing.response <= timing.work
-
-
-@raw_kinds
-@paces
-def test_every_frame_reaches_the_log_once_and_in_order(bus_kind: str, realtime: bool) -> None:
-    """Those of the cycle, and those that the services send and receive on their own socket."""
-    with bench(bus_kind, realtime) as one:
-        other = Link(open_can(one.where), time.monotonic_ns)
-        one.master._beat.configure(1, one.wire.clock.now())
-        for k in range(30):
-            one.play(k)
-            other.send(0x123, bytes([k]))
-
-        def drives() -> list[bytes]:
-            return [frame.data for frame in one.frames if frame.cob_id == codec.DRIVE]
-
-        if realtime:
-            assert one.loop.wait_until_played(lambda: False)
-            one.play_until(lambda: len(drives()) >= 30)
-        one.loop.finish()
-        other.close()
-        one.wire.poll(0.0)
-        one.loop.close()
-        one.settle()
         assert all(earlier.t_ns <= later.t_ns for earlier, later in pairwise(one.frames))
-        logged = [(frame.cob_id, frame.data) for frame in one.frames]
-        assert [data[0] for cob_id, data in logged if cob_id == 0x123] == list(range(30))
-        heard = [(frame.cob_id, frame.data) for frame in one.nodes.heard]
+        assert [data[0] for data in one.logged(0x123)] == list(range(30))
         for cob_id in (codec.COMMAND, codec.SYNC, 0x701):
-            mine = [data for each, data in logged if each == cob_id]
-            assert mine == [data for each, data in heard if each == cob_id] and mine
-        assert drives() == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives()))]
-        assert len(drives()) == 30 or (realtime and len(drives()) > 30)
-
-
-@raw_kinds
-@paces
-def test_nothing_is_compiled_once_the_loop_is_made(bus_kind: str, realtime: bool) -> None:
-    with bench(bus_kind, realtime) as one, list_compilations() as entries:
-        one.play(*range(10))
-        one.loop.hold(2)
-        one.play(*range(10))
-        one.loop.finish()
-        assert entries == []
+            assert one.logged(cob_id) == [frame.data for frame in one.nodes.heard if frame.cob_id == cob_id] != []
+        drives = one.logged(codec.DRIVE)
+        assert drives == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives))]
         compile_cycle.cache_clear()
         compile_cycle(realtime)
         assert entries  # the listener hears
@@ -370,38 +349,27 @@ def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
 
 
 @raw_kinds
-def test_hold_discards_what_is_queued(bus_kind: str) -> None:
-    """An abort: nothing of the rest is sent, and clean-up begins where the demand was."""
+def test_the_control_word_is_overridden_and_hold_discards_what_is_queued(bus_kind: str) -> None:
+    """An abort: no current from the next cycle on, and clean-up begins where the demand was."""
     with bench(bus_kind, True, ahead=500) as one:
         one.play(*range(400))
-        one.play_until(lambda: one.loop.k >= 5)
-        demand = round(one.loop.hold(2) * 1e7)
-        held = one.loop.k
-        assert 4 <= demand < 400
-        one.play(1000, phase=2)
-        one.loop.finish()
-        one.check_demands([*range(demand + 1), 1000], idle=[demand])
-        assert {row.phase for row in one.rows[:demand]} == {1} and {row.phase for row in one.rows[held:]} == {2}
-        one.settle()
-        assert [round(command.position * 1e7) for command in one.nodes.commands()] == one.demands()
-
-
-@raw_kinds
-def test_the_control_word_is_overridden_in_the_next_cycle(bus_kind: str) -> None:
-    with bench(bus_kind, True, ahead=100) as one:
-        one.play(*range(60))
         one.play_until(lambda: one.loop.k >= 5)
         before = one.loop.k
         one.loop.override_control(0)
         after = one.loop.k
-        one.play(60, 61, control=3)
+        one.play_until(lambda: one.loop.k >= after + 3)
+        demand = round(one.loop.hold(2) * 1e7)
+        held = one.loop.k
+        assert 4 <= demand < 400
+        one.play(1000, phase=2, control=3)
         one.loop.finish()
-        one.check_demands(list(range(62)))
+        one.check_demands([*range(demand + 1), 1000], idle=[demand])
+        assert {row.phase for row in one.rows[:demand]} == {1} and {row.phase for row in one.rows[held:]} == {2}
         words = [row.control for row in one.rows]
-        assert [word for word, _ in groupby(words)] == [7, 0, 3]
-        assert before <= words.index(0) <= after + 1
-        assert one.demands()[words.index(3)] == 60
+        assert [word for word, _ in groupby(words)] == [7, 0, 3] and before <= words.index(0) <= after + 1
+        assert one.demands()[words.index(3)] == 1000
         one.settle()
+        assert [round(command.position * 1e7) for command in one.nodes.commands()] == one.demands()
         assert [command.control for command in one.nodes.commands()] == words
 
 
@@ -425,18 +393,6 @@ def test_a_late_cycle_drops_due_times_and_counts_them(bus_kind: str) -> None:
         one.check_demands(list(range(20)))
         sent = [frame.t_ns for frame in one.frames if frame.cob_id == codec.SYNC]
         assert len(sent) == len(one.rows)
-
-
-@raw_kinds
-@paces
-def test_what_does_not_come_is_missing(bus_kind: str, realtime: bool) -> None:
-    with bench(bus_kind, realtime) as one:
-        one.nodes.mute = True
-        one.play(0, 1)
-        one.loop.finish()
-        for row, timing in zip(one.rows, one.timings, strict=True):
-            assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
-            assert all(map(isnan, (timing.feedback_response, timing.valve_response)))
 
 
 @raw_kinds
@@ -471,7 +427,9 @@ def test_frames_of_another_cycle_or_length_are_no_answers(bus_kind: str, realtim
             one.play(k)
         one.loop.finish()
         stranger.close()
-        assert all(isnan(row.xj) and isnan(row.xs) and isnan(row.cor) for row in one.rows)
+        for row, timing in zip(one.rows, one.timings, strict=True):
+            assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
+            assert all(map(isnan, (timing.feedback_response, timing.valve_response)))
 
 
 @raw_kinds

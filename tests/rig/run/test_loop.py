@@ -92,58 +92,33 @@ def run(one: CycleLoop, cycles: int) -> None:
 
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_row_holds_what_belongs_together(realtime: bool) -> None:
+    """Command before SYNC in every cycle. In lockstep nothing is late, however long the machine stands still."""
     bench = Bench()
+    bench.stalls = {} if realtime else {1: 5_300_000}
     one, book = loop(bench, realtime=realtime)
     run(one, 4)
-    assert [row.cycle for row in book.rows] == [0, 1, 2, 3]
-    assert [row.com for row in book.rows] == [0.0, 1e-4, 2e-4, 3e-4]
+    assert [(row.cycle, row.com) for row in book.rows] == [(k, pytest.approx(1e-4 * k)) for k in range(4)]
     assert {(row.xj, row.p12, row.xs, row.cor, row.status) for row in book.rows} == {(1e-3, 1e5, 1e-6, 2e-3, 15)}
     assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
-
-
-def test_command_before_sync_every_cycle() -> None:
-    bench = Bench()
-    run(loop(bench)[0], 3)
-    assert [cob_id for _, cob_id, _ in bench.sent] == [codec.COMMAND, codec.SYNC] * 3
-
-
-def test_due_times_are_a_fixed_grid() -> None:
-    """Being late by less than a period does not shift what follows."""
-    bench = Bench()
-    bench.stalls = {2: 1_700_000, 5: 1_200_000}
-    one, book = loop(bench)
-    run(one, 8)
-    assert bench.syncs() == pytest.approx([1, 2, 3, 4.7, 5, 6, 7.2, 8])
-    assert [round(t.lateness * 1e6) for t in book.timings] == [0, 0, 0, 700, 0, 0, 200, 0]
-    assert one.overruns == 1 and [t.overrun for t in book.timings] == [k == 3 for k in range(8)]  # above half a cycle
-
-
-def test_overruns_are_dropped_and_counted_not_piled_up() -> None:
-    bench = Bench()
-    bench.stalls = {1: 5_300_000}
-    one, book = loop(bench)
-    run(one, 5)
-    assert bench.syncs() == pytest.approx([1, 2, 7.3, 8, 9])  # back on the grid, no burst
-    assert one.overruns == 4 and [t.overrun for t in book.timings] == [False, False, True, False, False]
-    assert [row.cycle for row in book.rows] == [0, 1, 2, 3, 4]
-
-
-def test_in_lockstep_nothing_is_late() -> None:
-    bench = Bench()
-    bench.stalls = {1: 5_300_000}
-    one, book = loop(bench, realtime=False)
-    run(one, 4)
+    assert [cob_id for _, cob_id, _ in bench.sent] == [codec.COMMAND, codec.SYNC] * 4
     assert one.overruns == 0 and {t.lateness for t in book.timings} == {0.0}
-    assert book.times == [MS, 2 * MS, 3 * MS, 4 * MS]
 
 
-def test_what_does_not_come_is_missing() -> None:
+@pytest.mark.parametrize(("stalls", "syncs", "lateness", "overruns", "late"), [
+    ({2: 1_700_000, 5: 1_200_000}, [1, 2, 3, 4.7, 5, 6, 7.2, 8], [0, 0, 0, 700, 0, 0, 200, 0], 1, 3),
+    ({1: 5_300_000}, [1, 2, 7.3, 8, 9], [0, 0, 4300, 0, 0], 4, 2),  # no burst
+])
+def test_due_times_are_a_fixed_grid(stalls: dict[int, int], syncs: list[float], lateness: list[int], overruns: int,
+                                    late: int) -> None:
+    """Being late does not shift what follows; lost due times are counted, as is a cycle late by more than half."""
     bench = Bench()
+    bench.stalls = stalls
     one, book = loop(bench)
-    bench.mute = True
-    run(one, 2)
-    for row, timing in zip(book.rows, book.timings, strict=True):
-        assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
+    run(one, len(syncs))
+    assert bench.syncs() == pytest.approx(syncs)
+    assert [round(t.lateness * 1e6) for t in book.timings] == lateness
+    assert one.overruns == overruns and [t.overrun for t in book.timings] == [k == late for k in range(len(syncs))]
+    assert [row.cycle for row in book.rows] == list(range(len(syncs)))
 
 
 def test_an_answer_after_the_next_sync_is_not_that_cycles() -> None:
@@ -163,16 +138,17 @@ def test_of_two_drives_the_last_counts_as_in_the_plant() -> None:
     assert book.rows[0].cor == 4e-3
 
 
-@pytest.mark.parametrize("cob_id", [codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE])
-def test_frames_of_another_length_are_nothing(cob_id: int) -> None:
+def test_what_does_not_come_or_has_another_length_is_missing() -> None:
     bench = Bench()
     one, book = loop(bench)
     bench.mute = True
     one.cycle(CycleInput(1, 0.0, 0.0, 7))
-    for length in (0, 1, 4, 7):
-        bench.receive(Frame(0, cob_id, bytes(length)))
+    for cob_id in (codec.FEEDBACK, codec.VALVE_STATE, codec.DRIVE):
+        for length in (0, 1, 4, 7):
+            bench.receive(Frame(0, cob_id, bytes(length)))
     one.finish()
-    assert isnan(book.rows[0].xj) and isnan(book.rows[0].cor) and isnan(book.rows[0].xs)
+    row, timing = book.rows[0], book.timings[0]
+    assert all(map(isnan, (row.xj, row.p12, row.xs, row.cor, timing.response, timing.work)))
 
 
 @pytest.mark.parametrize("realtime", [False, True])

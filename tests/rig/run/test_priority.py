@@ -87,9 +87,12 @@ def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
 
 
 def test_memory_is_locked_and_unlocked() -> None:
+    """Meanwhile the kernel does not collect pages into huge ones: a loop that touches them waits for milliseconds."""
+    library = ctypes.CDLL(None)
+    before = library.prctl(42, 0, 0, 0, 0)  # PR_GET_THP_DISABLE
     with lock_memory() as is_locked:
-        assert (read_locked_kilobytes() > 0) == is_locked
-    assert read_locked_kilobytes() == 0
+        assert (read_locked_kilobytes() > 0) == is_locked and library.prctl(42, 0, 0, 0, 0) == 1
+    assert read_locked_kilobytes() == 0 and library.prctl(42, 0, 0, 0, 0) == before == 0
 
 
 def read_locked_kilobytes() -> int:
@@ -117,12 +120,3 @@ def test_collection_comes_back_as_it_was(collecting: bool) -> None:
         assert gc.isenabled() == collecting and sys.getswitchinterval() == before
     finally:
         gc.enable()
-
-
-def test_the_kernel_does_not_move_pages_while_memory_is_locked() -> None:
-    """It would collect them into huge ones, and a loop that touches them waits for milliseconds."""
-    library = ctypes.CDLL(None)
-    before = library.prctl(42, 0, 0, 0, 0)  # PR_GET_THP_DISABLE
-    with lock_memory():
-        assert library.prctl(42, 0, 0, 0, 0) == 1
-    assert library.prctl(42, 0, 0, 0, 0) == before == 0

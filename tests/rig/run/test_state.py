@@ -58,15 +58,6 @@ def test_an_event_of_a_queued_cycle_waits_for_it_and_is_dropped_with_it() -> Non
     assert len(parts.journal.events) == 1
 
 
-def test_events_stand_in_the_order_of_their_times() -> None:
-    parts = Parts(k=60, queued=60)
-    for k in (60, 40, 50):
-        parts.loop.k = parts.loop.queued = k
-        parts.journal.announce("INFO", "x", str(k))
-    assert [event.text for event in parts.journal.events] == ["40", "50", "60"]
-    assert [event.t for event in parts.journal.events] == pytest.approx([-0.010, 0.0, 0.010])
-
-
 @pytest.mark.parametrize(("kind", "tests_safe_state", "ends"), [
     ("emcy", False, True), ("emcy", True, False), ("process", True, True), ("late", True, True)])
 def test_trouble_takes_the_current_away_and_ends_main_unless_that_is_tested(
@@ -81,17 +72,3 @@ def test_trouble_takes_the_current_away_and_ends_main_unless_that_is_tested(
     assert parts.safety.is_cut_short is (kind == "late")
     parts.safety.handle(kind, "again", 3)
     assert parts.loop.words == [0] and parts.safety.aborted in ("", "what")
-
-
-def test_before_and_after_the_run_a_report_of_a_node_ends_nothing() -> None:
-    parts = Parts()
-    parts.safety.handle("emcy", "what", 2)
-    assert not parts.safety.is_safe and parts.safety.aborted == "" and parts.safety.troubles == []
-    assert parts.recorder.records == [(60_000_000, "what (before the run)")]
-
-
-def test_what_the_operator_stops_is_interrupted_and_not_in_trouble() -> None:
-    parts = Parts()
-    parts.safety.stop()
-    assert parts.safety.interrupted and parts.safety.aborted == "stopped by the operator"
-    assert not parts.safety.is_safe and parts.safety.troubles == []
