@@ -5,6 +5,7 @@ import json
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from short_sequences import SHORT, job, kinds, play, stop_after
 from fdi.progress import ignore_progress
 from fdi.report.report import Line, Table
 from fdi.report.run_report import build_run_report, write_run_page
+from fdi.trace.mcap_log import open_log
 from fdi.trace.trace import CLEANUP, MAIN, SETUP, Trace
 from plant import Actuator, InputError, RigError
 from rig.network.clock import VirtualClock, WallClock
@@ -24,6 +26,7 @@ from rig.nodes.emulator import Emulator
 from rig.nodes.firmware import Firmware
 from rig.recorder import RecorderError
 from rig.run import participants, runner
+from rig.run.job import Job
 from rig.run.participants import NodeProcesses, Participants
 from rig.run.session import Session
 from rig.sequences.sequence import parse_sequence
@@ -52,20 +55,12 @@ def test_three_phases_in_order(tmp_path: Path) -> None:
         "cleanup: ramp_1", "end"]
     times = {text: event.t for event in outcome.events for text in [event.text]}
     assert (times["main"], times["main: step"], times["cleanup"]) == pytest.approx((0.0, 0.05, 0.35))
-    assert outcome.counters == dict.fromkeys(outcome.counters, 0)
-
-
-def test_the_drive_is_enabled_step_by_step(tmp_path: Path) -> None:
-    outcome = play(job(), tmp_path)
-    session_rows = outcome.timing["cycles"]
-    assert session_rows == 450
-    words = control_words(tmp_path)
+    assert outcome.counters == dict.fromkeys(outcome.counters, 0) and outcome.timing["cycles"] == 450
+    words = control_words(tmp_path)  # the drive is enabled step by step
     assert words[:4] == [1, 3, 7, 7] and set(words[2:]) == {7}
 
 
 def control_words(folder: Path) -> list[int]:
-    from fdi.trace.mcap_log import open_log
-
     return [message.control for _, _, message in open_log(folder / "trace.mcap").read_messages("/signals")]
 
 
@@ -162,32 +157,33 @@ def test_a_plant_without_numbers_ends_the_run(tmp_path: Path, monkeypatch: pytes
     assert phases(tmp_path)[2] == 50 and set(control_words(tmp_path)[-50:]) == {0}
 
 
-class Intruder:
-    """A stranger on the bus who at some time sends something."""
+def play_in_parts(one: Job, folder: Path, wire: EmbeddedWire, processes: NodeProcesses,
+                  between: Callable[[Session], object] = lambda session: None) -> Session:
+    """Bring a session up, let something happen, and play its phases."""
+    with runner.open_recorder(one, folder) as recorder:
+        session = Session(one, Participants(wire, processes), recorder, ignore_progress, lambda: False)
+        session.bring_up()
+        between(session)
+        session.run_phases()
+    return session
 
-    def __init__(self, at_ms: int, *frames: tuple[int, bytes]) -> None:
-        self.at_ns, self.frames = at_ms * 1_000_000, list(frames)
+
+class Intruder:
+    """A stranger on the bus who at 0.25 s sends something."""
+
+    def __init__(self, send: Send, frames: list[tuple[int, bytes]]) -> None:
+        self.send, self.frames = send, list(frames)
 
     def receive(self, frame: Frame) -> None: ...
 
     def tick(self, t_ns: int) -> None:
-        if t_ns >= self.at_ns:
-            for cob_id, data in self.frames:
-                self.send(cob_id, data)
-            self.frames = []
+        while t_ns >= 250_000_000 and self.frames:
+            self.send(*self.frames.pop(0))
 
 
-def play_with(intruder: Intruder, tmp_path: Path) -> Session:
-    def join(send: object) -> Intruder:
-        intruder.send = send  # type: ignore[attr-defined]
-        return intruder
-
-    wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, join])  # type: ignore[list-item]
-    with runner.open_recorder(job(), tmp_path) as recorder:
-        session = Session(job(), Participants(wire, NodeProcesses()), recorder, ignore_progress, lambda: False)
-        session.bring_up()
-        session.run_phases()
-    return session
+def play_with_intruder(folder: Path, frames: list[tuple[int, bytes]]) -> Session:
+    wire = EmbeddedWire(VirtualClock(), [Emulator, Firmware, partial(Intruder, frames=frames)])
+    return play_in_parts(job(), folder, wire, NodeProcesses())
 
 
 class KilledPlant(Emulator):
@@ -234,22 +230,20 @@ def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tm
 
     The rest of clean-up is then 0.1 s without current. Of 30 looks one is made without a cycle.
     """
-    no_probe = job("protocol = { probe = false }\n" + SHORT)
-    wire = EmbeddedWire(VirtualClock(), [KilledPlant, Firmware])
-    with runner.open_recorder(no_probe, tmp_path) as recorder:
-        processes = SlowEnd(10**9)
-        session = Session(no_probe, Participants(wire, processes), recorder, ignore_progress, lambda: False)
-        session.bring_up()
+    processes = SlowEnd(10**9)
+
+    def note_cleanup(session: Session) -> None:
         choose, chosen = session._choose_cleanup, []
 
         def begin_cleanup() -> object:
             chosen.append(choose())
-            if len(chosen) == 1:
-                processes.looks = after
+            processes.looks = after if len(chosen) == 1 else processes.looks
             return chosen[-1]
 
         session._choose_cleanup = begin_cleanup  # type: ignore[method-assign, assignment]
-        session.run_phases()
+
+    wire = EmbeddedWire(VirtualClock(), [KilledPlant, Firmware])
+    session = play_in_parts(job("protocol = { probe = false }\n" + SHORT), tmp_path, wire, processes, note_cleanup)
     assert session.safety.aborted.startswith("node 2 controller 0x8250")
     assert session.nodes.gone[3] == "its process was ended by SIGKILL"
     assert [trouble.text for trouble in session.safety.troubles if trouble.kind == "process"] == [
@@ -266,7 +260,7 @@ def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tm
     ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330"),
 ])
 def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
-    session = play_with(Intruder(250, *frames), tmp_path)
+    session = play_with_intruder(tmp_path, frames)
     assert session.safety.aborted.startswith(why) and phases(tmp_path)[2] == 50
 
 
@@ -274,7 +268,7 @@ def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
     """Foreign nodes, short frames, unknown identifiers: logged as frames, else ignored."""
     noise = [(cob_id, bytes(length)) for cob_id in (0x084, 0x184, 0x284, 0x584, 0x604, 0x704, 0x7E5, 0x082, 0x083,
                                                     0x583, 0x603) for length in (0, 3)]
-    session = play_with(Intruder(250, *noise), tmp_path)
+    session = play_with_intruder(tmp_path, noise)
     assert session.safety.aborted == "" and phases(tmp_path) == [50, 350, 50]
 
 
@@ -354,35 +348,33 @@ def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: 
     assert (tmp_path / "p.html").stat().st_size < 2_000_000
 
 
-class Reluctant(Firmware):
-    """A firmware that becomes OPERATIONAL only some time after it was told to."""
+def make_reluctant(make: Callable[..., Any], node: int, delay_ns: int) -> Callable[..., Any]:
+    """A node that becomes OPERATIONAL only some time after it was told to."""
+    def build(send: Send, **more: Any) -> Any:
+        one, waiting = make(send, **more), list[tuple[int, Frame]]()
+        receive, tick = one.receive, one.tick
 
-    delay_ns = 0
+        def delay(frame: Frame) -> None:
+            if (frame.cob_id, frame.data) == (0, bytes((1, node))):
+                waiting.append((frame.t_ns + delay_ns, frame))
+            else:
+                receive(frame)
 
-    def __init__(self, send: Send) -> None:
-        super().__init__(send)
-        self._waiting: list[tuple[int, Frame]] = []
-        self._now = 0
-        self.receive, self.tick = self._receive, self._tick  # type: ignore[method-assign]
+        def wait(t_ns: int) -> None:
+            while waiting and waiting[0][0] <= t_ns:
+                receive(waiting.pop(0)[1])
+            tick(t_ns)
 
-    def _receive(self, frame: Frame) -> None:
-        if frame.cob_id == 0 and frame.data == b"\x01\x02":
-            self._waiting.append((self._now + self.delay_ns, frame))
-        else:
-            self.device.receive(frame)
+        one.receive, one.tick = delay, wait
+        return one
 
-    def _tick(self, t_ns: int) -> None:
-        self._now = t_ns
-        while self._waiting and self._waiting[0][0] <= t_ns:
-            self.device.receive(self._waiting.pop(0)[1])
-        self.device.tick(t_ns)
+    return build
 
 
 @pytest.mark.parametrize(("delay", "verdict"), [(0.03, "PASS"), (0.3, "PASS"), (1.5, "ABORTED"), (9.0, "ABORTED")])
 def test_bring_up_waits_until_the_nodes_are_operational(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, delay: float,
                                                         verdict: str) -> None:
-    monkeypatch.setattr(Reluctant, "delay_ns", round(delay * 1e9))
-    monkeypatch.setattr("rig.run.participants.Firmware", lambda send, model: Reluctant(send))
+    monkeypatch.setattr(participants, "Firmware", make_reluctant(Firmware, 2, round(delay * 1e9)))
     outcome = play(job(), tmp_path)
     assert outcome.verdict == verdict, outcome.why
     if delay < 3:  # three times the limit
@@ -396,70 +388,37 @@ def test_a_bench_that_is_late_in_bring_up_is_not_the_controllers_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both nodes come late: the machine stood still, or the bus did."""
-
-    class ReluctantPlant(Emulator):
-        def __init__(self, send: Send) -> None:
-            super().__init__(send)
-            self.waiting: list[tuple[int, Frame]] = []
-            self.take, self.work = self.receive, self.tick
-            self.receive, self.tick = self.delay, self.wait  # type: ignore[method-assign]
-
-        def delay(self, frame: Frame) -> None:
-            if frame.cob_id == 0 and frame.data == b"\x01\x03":
-                self.waiting.append((frame.t_ns + 1_400_000_000, frame))
-            else:
-                self.take(frame)
-
-        def wait(self, t_ns: int) -> None:
-            while self.waiting and self.waiting[0][0] <= t_ns:
-                self.take(self.waiting.pop(0)[1])
-            self.work(t_ns)
-
-    monkeypatch.setattr(Reluctant, "delay_ns", 1_500_000_000)
-    monkeypatch.setattr("rig.run.participants.Firmware", lambda send, model: Reluctant(send))
-    monkeypatch.setattr("rig.run.participants.Emulator", ReluctantPlant)
+    monkeypatch.setattr(participants, "Firmware", make_reluctant(Firmware, 2, 1_500_000_000))
+    monkeypatch.setattr(participants, "Emulator", make_reluctant(Emulator, 3, 1_400_000_000))
     outcome = play(job(), tmp_path)
     assert (outcome.verdict, outcome.status) == ("INVALID_TIMING", 3)
     assert "the bench was late in bring-up: both nodes must be OPERATIONAL" in outcome.why
     assert outcome.to_json()["cause"]["source"] == "bench" and set(control_words(tmp_path)) == {0}
 
 
-def frames_sent(folder: Path) -> list[tuple[int, bytes]]:
-    from fdi.trace.mcap_log import open_log
-
-    return [(message.cob_id, message.data) for _, _, message in open_log(folder / "trace.mcap").read_messages("/can")]
-
-
 def test_bring_up_begins_with_the_rigs_boot_up_and_addresses_its_own_nodes(tmp_path: Path) -> None:
     play(job(), tmp_path)
-    frames = frames_sent(tmp_path)
+    frames = [(m.cob_id, m.data) for _, _, m in open_log(tmp_path / "trace.mcap").read_messages("/can")]
     assert frames[0] == (0x701, b"\0") and (0x701, b"\0") not in frames[1:]
     assert {data[1] for cob_id, data in frames if cob_id == 0} == {2, 3}
 
 
 def test_what_the_run_changed_in_the_nodes_is_set_back(tmp_path: Path) -> None:
     """Otherwise a node that stays would go on watching a rig that has left."""
-    nodes: dict[int, Emulator | Firmware] = {}
+    nodes: list[Emulator | Firmware] = []
 
-    def keep(make: type[Emulator] | type[Firmware], node: int) -> Callable[[Send], Emulator | Firmware]:
-        def build(send: Send) -> Emulator | Firmware:
-            nodes[node] = make(send)
-            return nodes[node]
+    def keep(make: type[Emulator] | type[Firmware], send: Send) -> Emulator | Firmware:
+        nodes.append(make(send))
+        return nodes[-1]
 
-        return build
+    def read() -> tuple[object, ...]:
+        return tuple([node.device.read(index, sub) for node in nodes] for index, sub in ((0x1006, 0), (0x1016, 1)))
 
-    def read(index: int, sub: int) -> list[object]:
-        return [node.device.read(index, sub) for node in nodes.values()]
-
-    wire = EmbeddedWire(WallClock(), [keep(Emulator, 3), keep(Firmware, 2)])
-    one = job(pace="realtime")
-    before = read(0x1006, 0), read(0x1016, 1)
-    with runner.open_recorder(job(), tmp_path) as recorder:
-        session = Session(one, Participants(wire, NodeProcesses()), recorder, ignore_progress, lambda: False)
-        session.bring_up()
-        assert (read(0x1006, 0), read(0x1016, 1)) == ([8000, 8000], [1 << 16 | 300] * 2)
-        session.run_phases()
-    assert (read(0x1006, 0), read(0x1016, 1)) == before != ([8000, 8000], [1 << 16 | 300] * 2)
+    written = [8000, 8000], [1 << 16 | 300] * 2
+    wire = EmbeddedWire(WallClock(), [partial(keep, Emulator), partial(keep, Firmware)])
+    before, seen = read(), list[object]()
+    play_in_parts(job(pace="realtime"), tmp_path, wire, NodeProcesses(), lambda session: seen.append(read()))
+    assert seen == [written] and read() == before != written
 
 
 def test_who_the_nodes_are(tmp_path: Path) -> None:
