@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from node_bench import MS, Desk, PlantDesk
+from node_bench import MS, PlantDesk
 
 from plant import Actuator, Model
 from rig.device import Abort, NmtState
 from rig.network import codec
 from rig.network.codec import Flags
 from rig.network.node_objects import COUNTERS
-from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.scenario import Scenario
 from rig.sequences.faults import (
     BusOff,
@@ -70,31 +69,20 @@ def test_a_drive_before_its_sync_does_not_act_at_once() -> None:
     assert a.cycle() != b.cycle()
 
 
-def test_missing_and_late_drives_are_counted_and_the_current_stays() -> None:
+@pytest.mark.parametrize(("drives", "flags", "counted", "emergencies", "current"), [
+    (".-<..", [0, 0, 1, 2, 0], (1, 1), [], 2e-3),  # the current stays
+    (".---", [0, 0, 1, 1], (2, 0), [], 2e-3),
+    (".---.", [0, 0, 1, 1, 5], (3, 0), [0x8250], 0.0),  # three in a row cut it ..
+    (".---..", [0, 0, 1, 1, 5, 0], (3, 0), [0x8250, 0], 2e-3),  # .. and an answer brings it back
+    ("<<<<<", [0, 2, 2, 6, 6], (0, 4), [0x8250], 0.0),
+])
+def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[int, int], emergencies: list[int],
+                                 current: float) -> None:
+    """A drive after each SYNC: one that answers it, none (-), or one that answers another cycle (<)."""
     desk = PlantDesk(scenario())
-    desk.cycle(2e-3)
-    desk.cycle(None)
-    flags = [desk.cycle(2e-3, answers=1)[1].flags, desk.cycle(2e-3)[1].flags, desk.cycle(2e-3)[1].flags]
-    assert flags == [Flags.DRIVE_MISSING, Flags.DRIVE_LATE, 0]
-    assert counters(desk) == (1, 1) and desk.node._current == 2e-3 and desk.emergencies() == []
-
-
-def test_three_in_a_row_cut_the_current_and_an_answer_brings_it_back() -> None:
-    desk = PlantDesk(scenario())
-    desk.cycle(2e-3)
-    flags = [desk.cycle(None if k < MISSED_LIMIT else 1e-3)[1].flags for k in range(MISSED_LIMIT + 1)]
-    assert flags == [0, 1, 1, Flags.DRIVE_MISSING | Flags.CURRENT_ZEROED]
-    assert desk.emergencies() == [0x8250] and desk.node._current == 0.0
-    assert desk.cycle(1e-3)[1].flags == 0
-    assert desk.emergencies() == [0x8250, 0] and desk.node._current == 1e-3
-    assert counters(desk) == (3, 0)
-
-
-def test_an_answer_to_another_cycle_for_good_is_three_in_a_row_too() -> None:
-    desk = PlantDesk(scenario())
-    for _ in range(5):
-        desk.cycle(1e-3, answers=60_000)
-    assert counters(desk) == (0, 4) and desk.emergencies() == [0x8250]
+    assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
+            for drive in drives] == flags
+    assert (counters(desk), desk.emergencies(), desk.node._current) == (counted, emergencies, current)
 
 
 def test_the_cycle_number_wraps_without_a_miss() -> None:
@@ -107,13 +95,12 @@ def test_the_cycle_number_wraps_without_a_miss() -> None:
 
 
 def test_lost_and_late_drive_as_the_plan_says() -> None:
-    lost = PlantDesk(scenario(Lost(frame="drive", start=0.003, count=1)))
-    late = PlantDesk(scenario(Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3)))
-    soon = PlantDesk(scenario(Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3)))
-    expected = ((lost, [1, 0], (1, 0)), (late, [1, 2], (1, 1)), (soon, [0, 0], (0, 0)))  # what comes last counts
-    for desk, two, counted in expected:
-        flags = [desk.cycle(1e-3)[1].flags for _ in range(8)]
-        assert flags == [0, 0, 0, 0, *two, 0, 0]
+    for fault, two, counted in (
+            (Lost(frame="drive", start=0.003, count=1), [1, 0], (1, 0)),
+            (Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3), [1, 2], (1, 1)),
+            (Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3), [0, 0], (0, 0))):  # what comes last counts
+        desk = PlantDesk(scenario(fault))
+        assert [desk.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
         assert counters(desk) == counted
 
 
@@ -173,13 +160,7 @@ def test_a_parameter_ramps_cycle_by_cycle_and_returns_when_main_ends() -> None:
 def test_a_sensors_parameter_changes_in_the_sample_of_its_cycle() -> None:
     fault = Parameter(parameter="sensors.pressure_noise", value=1e6, start=0.005, end=0.010)
     desk = PlantDesk(Scenario(QUIET_MODEL, Plan(faults=(fault,), stop=25)))
-    noisy = [abs(desk.cycle()[0].pressure) > 10.0 for _ in range(15)]
-    assert noisy == [5 <= k < 10 for k in range(15)]
-
-
-def test_a_node_starts_as_the_plant_it_was_told_to_be() -> None:
-    heavy = Desk(lambda send: Emulator(send, Scenario(QUIET_MODEL.replace({"jack.mass": 500.0}), Plan(stop=0))))
-    assert heavy.node._plant.model["jack.mass"] == 500.0  # type: ignore[union-attr]
+    assert [abs(desk.cycle()[0].pressure) > 10.0 for _ in range(15)] == [5 <= k < 10 for k in range(15)]
 
 
 def test_the_load_is_that_of_the_cycle() -> None:
