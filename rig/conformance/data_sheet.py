@@ -133,7 +133,7 @@ class Variable(NamedTuple):
         return self.default if isinstance(self.default, bytes) else self.encode(self.default)
 
 
-PDO_PARAMETERS = (*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING))
+PDO_PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
 
 
 class Pdo(NamedTuple):

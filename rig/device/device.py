@@ -7,7 +7,7 @@ from pathlib import Path
 from rig.device.dictionary import Dictionary, Value, check_consumer_entry, check_switchable, check_sync
 from rig.device.emcy import HISTORY, Emcy, EmcyCode, ErrorRegister
 from rig.device.nmt import Nmt
-from rig.device.pdo import Pdos
+from rig.device.pdo import PARAMETERS, Pdos
 from rig.device.sdo import Abort, SdoAbort, SdoServer
 from rig.device.sync import SyncConsumer
 from rig.network.frame import Frame, Send
@@ -168,16 +168,17 @@ class Device:
 
     def _check(self, index: int, sub: int, value: Value) -> None:
         """Refuse a value of a communication object that CiA 301 forbids. Raises SdoAbort."""
-        self.pdo.check(index, sub, value)
         if not isinstance(value, int):
             return
-        if index == 0x1005:
+        if index in PARAMETERS:
+            self.pdo.check(index, sub, value)
+        elif index == 0x1005:
             check_sync(value)
         elif index == 0x1014:
             check_switchable(self.od.read_number(0x1014, 0), value)
         elif index == 0x1016:
-            others = [other for other in self.od.list_subs(0x1016) if other != sub]
-            check_consumer_entry(value, [self.od.read_number(0x1016, other) for other in others])
+            check_consumer_entry(value, [self.od.read_number(0x1016, other) for other in self.od.list_subs(0x1016)
+                                         if other != sub])
 
     def _configure(self, index: int) -> None:
         """Pass a changed communication object to the service that uses it."""
@@ -190,7 +191,7 @@ class Device:
             self._gate()
         elif index == 0x1017:
             self.heartbeat.configure(self.od.read_number(0x1017, 0), self.t_ns)
-        elif 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        elif index in PARAMETERS:
             self.pdo.configure()
             self._gate()
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from enum import IntEnum, IntFlag
+from functools import reduce
+from operator import or_
 
 from rig.device.dictionary import INVALID, Dictionary
 
@@ -89,9 +91,7 @@ class Emcy:
             values[HISTORY, 0] = min(self._od.read_number(HISTORY, 0) + 1, len(subs))
 
     def _transmit(self, code: int, info: bytes) -> None:
-        register = 0
-        for bits in self._active.values():
-            register |= bits
+        register = reduce(or_, self._active.values(), 0)
         self._od.values[REGISTER, 0] = register
         cob_id = self._od.read_number(COB_ID, 0, INVALID)
         if self._permitted() and not cob_id & INVALID:

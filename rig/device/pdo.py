@@ -8,61 +8,71 @@ import struct
 from collections.abc import Callable
 
 from plant.errors import InputError
-from rig.device.dictionary import INVALID, Dictionary, Value, check_switchable
+from rig.device.dictionary import INVALID, Dictionary, check_switchable
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, SdoAbort
 from rig.network.frame import Frame, Send
 
-RPDO, TPDO = 0x1400, 0x1800  # communication parameters; the mapping is 0x200 further on
+RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
+PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = (254, 255)
 
 
-class Mapping:
+def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], struct.Struct]:
     """What lies in a PDO, in order: the keys of the objects and the struct that packs them.
 
     Raises InputError if the dictionary maps what is not there, not mappable, of another length, or beyond 8 bytes, or
     lets a master change the mapping.
     """
-
-    def __init__(self, od: Dictionary, index: int) -> None:
-        writable = [sub for sub in (0, *od.list_subs(index)) if (index, sub) in od and od.entries[index, sub].writable]
-        if writable:
-            where = f"{index:04X}sub{writable[0]:X}.AccessType"
-            raise InputError(od.path, where, "const: the mapping cannot be changed")
-        self.keys: list[tuple[int, int]] = []
-        codes = "<"
-        for sub in range(1, od.read_number(index, 0) + 1):
-            word = od.read_number(index, sub)
-            key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
-            entry = od.entries.get(key)
-            if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
-                field = f"{index:04X}sub{sub:X}"
-                raise InputError(od.path, field, f"a mappable object and its length, not 0x{word:08X}")
-            self.keys.append(key)
-            codes += entry.code
-        self.struct = struct.Struct(codes)
-        self.size = self.struct.size
-        if self.size > 8:
-            raise InputError(od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {self.size}")
+    for sub in (0, *od.list_subs(index)):
+        if (index, sub) in od and od.entries[index, sub].writable:
+            raise InputError(od.path, f"{index:04X}sub{sub:X}.AccessType", "const: the mapping cannot be changed")
+    keys, codes = [], "<"
+    for sub in range(1, od.read_number(index, 0) + 1):
+        word = od.read_number(index, sub)
+        key, bits = (word >> 16, word >> 8 & 0xFF), word & 0xFF
+        entry = od.entries.get(key)
+        if entry is None or not entry.mappable or not entry.code or struct.calcsize(entry.code) * 8 != bits:
+            field = f"{index:04X}sub{sub:X}"
+            raise InputError(od.path, field, f"a mappable object and its length, not 0x{word:08X}")
+        keys.append(key)
+        codes += entry.code
+    packer = struct.Struct(codes)
+    if packer.size > 8:
+        raise InputError(od.path, f"{index:04X}", f"at most 8 bytes in a PDO, not {packer.size}")
+    return keys, packer
 
 
-class Rpdo:
-    """A received PDO: put into the dictionary on arrival, or kept until the next SYNC if it is synchronous."""
+class Pdo:
+    """What both kinds of PDO have: communication parameters and mapping, as the dictionary at `base` has them."""
 
-    def __init__(self, n: int, od: Dictionary, emcy: Emcy, arrived: Callable[[int], None]) -> None:
-        self.n = n
-        self.fresh = False  # synchronous: a new frame was latched at this SYNC
-        self._od, self._emcy, self._arrived = od, emcy, arrived
-        self._mapping = Mapping(od, RPDO + 0x200 + n - 1)
-        self._size, self._unpack = self._mapping.size, self._mapping.struct.unpack_from
-        self._waiting: bytes | None = None
-        self._faulty = False
+    def __init__(self, n: int, od: Dictionary, base: int) -> None:
+        self.n, self._od, self._index = n, od, base + n - 1
+        self._keys, self._struct = read_mapping(od, self._index + MAPPING)
         self.configure()
 
     def configure(self) -> None:
-        self.cob_id = _cob_id(self._od, RPDO, self.n)
-        self.synchronous = self._od.read_number(RPDO + self.n - 1, 2) <= _LAST_SYNCHRONOUS
+        """Read the communication parameters again. The COB-ID is None while the PDO is switched off (bit 31)."""
+        word = self._od.read_number(self._index, 1)
+        self.cob_id = None if word & INVALID else word & 0x7FF
+        self._type = self._od.read_number(self._index, 2)
+        self.synchronous = self._type <= _LAST_SYNCHRONOUS
+
+
+class Rpdo(Pdo):
+    """A received PDO: put into the dictionary on arrival, or kept until the next SYNC if it is synchronous."""
+
+    def __init__(self, n: int, od: Dictionary, emcy: Emcy, arrived: Callable[[int], None]) -> None:
+        self.fresh = False  # synchronous: a new frame was latched at this SYNC
+        self._emcy, self._arrived = emcy, arrived
+        self._waiting: bytes | None = None
+        self._faulty = False
+        super().__init__(n, od, RPDO)
+        self._size, self._unpack = self._struct.size, self._struct.unpack_from
+
+    def configure(self) -> None:
+        super().configure()
         if self.cob_id is None:
             self.forget()
 
@@ -77,7 +87,7 @@ class Rpdo:
         if self.synchronous:
             self._waiting = data
         else:
-            self._od.values.update(zip(self._mapping.keys, self._unpack(data), strict=True))
+            self._od.values.update(zip(self._keys, self._unpack(data), strict=True))
             self._arrived(self.n)
 
     def latch(self) -> None:
@@ -86,14 +96,14 @@ class Rpdo:
         self.fresh = data is not None
         if data is not None:
             self._waiting = None
-            self._od.values.update(zip(self._mapping.keys, self._unpack(data), strict=True))
+            self._od.values.update(zip(self._keys, self._unpack(data), strict=True))
 
     def _judge(self, length: int) -> bool:
         """Whether a frame of that length is used: too short no (EMCY 0x8210), too long its first bytes (0x8220)."""
         info = bytes((self.n,))
-        codes = {EmcyCode.PDO_TOO_SHORT: length < self._size, EmcyCode.PDO_TOO_LONG: length > self._size}
-        for code, wrong in codes.items():
-            if wrong:
+        for code, is_wrong in ((EmcyCode.PDO_TOO_SHORT, length < self._size),
+                               (EmcyCode.PDO_TOO_LONG, length > self._size)):
+            if is_wrong:
                 self._emcy.raise_error(code, ErrorRegister.COMMUNICATION, info)
             else:
                 self._emcy.clear(code, info)
@@ -101,20 +111,16 @@ class Rpdo:
         return length >= self._size
 
 
-class Tpdo:
+class Tpdo(Pdo):
     """A transmitted PDO: every n-th SYNC (types 1..240), the first SYNC after `transmit` (0), or at once (254, 255)."""
 
     def __init__(self, n: int, od: Dictionary, send: Send) -> None:
-        self.n = n
-        self._od, self._send = od, send
-        mapping = Mapping(od, TPDO + 0x200 + n - 1)
-        self._keys, self._pack = mapping.keys, mapping.struct.pack
-        self.configure()
+        self._send = send
+        super().__init__(n, od, TPDO)
+        self._pack = self._struct.pack
 
     def configure(self) -> None:
-        self.cob_id = _cob_id(self._od, TPDO, self.n)
-        self._type = self._od.read_number(TPDO + self.n - 1, 2)
-        self.synchronous = self._type <= _LAST_SYNCHRONOUS
+        super().configure()
         self.forget()
 
     def forget(self) -> None:
@@ -149,43 +155,32 @@ class Pdos:
     """All PDOs of a device, by number from 1, and the ones a SYNC concerns."""
 
     def __init__(self, od: Dictionary, emcy: Emcy, send: Send, arrived: Callable[[int], None]) -> None:
+        def numbers(base: int) -> list[int]:
+            return [n for n in range(1, MAPPING + 1) if (base + n - 1, 1) in od]
+
         self._od = od
-        self.rpdos = {n: Rpdo(n, od, emcy, arrived) for n in _numbers(od, RPDO)}
-        self.tpdos = {n: Tpdo(n, od, send) for n in _numbers(od, TPDO)}
+        self.rpdos = {n: Rpdo(n, od, emcy, arrived) for n in numbers(RPDO)}
+        self.tpdos = {n: Tpdo(n, od, send) for n in numbers(TPDO)}
+        self._all: list[Rpdo | Tpdo] = [*self.rpdos.values(), *self.tpdos.values()]
         self.configure()
 
     def configure(self) -> None:
         """Read the communication parameters again."""
-        for pdo in self._all():
+        for pdo in self._all:
             pdo.configure()
         self.latched = [pdo for pdo in self.rpdos.values() if pdo.synchronous]
         self.cyclic = [pdo for pdo in self.tpdos.values() if pdo.synchronous]
 
     def forget(self) -> None:
         """The device left OPERATIONAL."""
-        for pdo in self._all():
+        for pdo in self._all:
             pdo.forget()
 
-    def _all(self) -> list[Rpdo | Tpdo]:
-        return [*self.rpdos.values(), *self.tpdos.values()]
-
-    def check(self, index: int, sub: int, value: Value) -> None:
+    def check(self, index: int, sub: int, value: int) -> None:
         """Refuse a communication parameter that CiA 301 forbids. Raises SdoAbort."""
-        if not isinstance(value, int) or not (RPDO <= index < RPDO + 0x200 or TPDO <= index < TPDO + 0x200):
-            return
         if sub == 1:
             check_switchable(self._od.read_number(index, 1), value)
             if not value & INVALID and value & 0x7FF == self._od.read_number(0x1005, 0, 0x80) & 0x7FF:
                 raise SdoAbort(Abort.VALUE)  # the device consumes SYNC under that identifier
         if sub == 2 and _LAST_SYNCHRONOUS < value < _EVENT_DRIVEN[0]:  # reserved, or by remote frame
             raise SdoAbort(Abort.VALUE)
-
-
-def _numbers(od: Dictionary, base: int) -> list[int]:
-    return [n for n in range(1, 0x201) if (base + n - 1, 1) in od]
-
-
-def _cob_id(od: Dictionary, base: int, n: int) -> int | None:
-    """COB-ID in use, None while the PDO is switched off (bit 31)."""
-    word = od.read_number(base + n - 1, 1)
-    return None if word & INVALID else word & 0x7FF

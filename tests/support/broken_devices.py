@@ -74,25 +74,6 @@ def list_cases(outcome: Outcome, verdict: Verdict = Verdict.FAIL) -> list[str]:
     return [result.case.number for result in outcome.results if result.verdict is verdict]
 
 
-def change_sheet(folder: Path, *changes: tuple[str, str, str], more: str = "") -> Path:
-    """The EDS of node 3 with words of some sections replaced, (section, old, new) each, and more sections."""
-    text = EDS[3].read_text()
-    for section, old, new in changes:
-        head, found, tail = text.partition(f"[{section}]\n")
-        body, gap, rest = tail.partition("\n[")
-        assert found and old in body, (section, old)
-        text = head + found + body.replace(old, new, 1) + gap + rest
-    path = folder / "changed.eds"
-    path.write_text(text + more)
-    return path
-
-
-def describe_variable(section: str, data_type: str) -> str:
-    """The section of an EDS for a number that can be written."""
-    return (f"\n[{section}]\nParameterName=number\nObjectType=0x7\nDataType={data_type}\nAccessType=rw\n"
-            "DefaultValue=0\nPDOMapping=0\n")
-
-
 def nothing(device: Any) -> None:
     """No defect."""
 

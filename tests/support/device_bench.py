@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from c_device import CDevice
@@ -63,3 +64,31 @@ class Rack:
             if self.t_ns >= end:
                 return self.take()
             self.t_ns = min(self.t_ns + MS, end)
+
+    def download(self, index: int, sub: int, data: bytes) -> str:
+        """Expedited SDO download; "ok", or the abort code in hexadecimal."""
+        head = bytes((0x23 | (4 - len(data)) << 2,)) + index.to_bytes(2, "little") + bytes((sub,))
+        answer = self.send(0x600 + self.node, head + data.ljust(4, b"\0"))[0][1]
+        return "ok" if answer[0] == 0x60 else f"{int.from_bytes(answer[4:], 'little'):08X}"
+
+    def play(self, script: str) -> None:
+        """Do what each line says, and compare with what it expects:
+
+            182 01000000 -> 083 *       a frame, and the frames that answer it: COB-ID and data, with wildcards
+            wait 12 -> 703 05           so many ms, and what is sent meanwhile
+            write 1800:2 01 -> ok       an expedited download, little-endian, and "ok" or the abort code
+            2205:0 = 1                  the value of an object
+        """
+        for line in script.strip().splitlines():
+            action, _, expected = (part.strip() for part in line.partition("->" if "->" in line else "="))
+            first, *rest = action.split()
+            index, _, sub = (rest if first == "write" else [first])[0].partition(":")
+            if first == "write":
+                found = self.download(int(index, 16), int(sub, 16), bytes.fromhex(rest[1]))
+            elif sub:
+                found = str(self.device.read(int(index, 16), int(sub, 16)))
+            else:
+                heard = (self.wait(float(rest[0])) if first == "wait" else
+                         self.send(int(first, 16), bytes.fromhex("".join(rest))))
+                found = ", ".join(f"{cob_id:03X} {data.hex()}" for cob_id, data in heard)
+            assert fnmatchcase(found, expected), (line, found)

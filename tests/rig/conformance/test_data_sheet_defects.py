@@ -4,7 +4,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from broken_devices import change_sheet, examine, list_cases, nothing
+from broken_devices import examine, list_cases, nothing
+from changed_sheets import change_sheet
 
 from dbc import EDS
 from plant.errors import InputError

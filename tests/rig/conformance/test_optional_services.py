@@ -5,17 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from broken_devices import (
-    Break,
-    change_sheet,
-    describe_variable,
-    examine,
-    list_cases,
-    nothing,
-    send_instead,
-    skip_checks,
-    wrap,
-)
+from broken_devices import Break, examine, list_cases, nothing, send_instead, skip_checks, wrap
+from changed_sheets import change_sheet, describe_variable
 
 from dbc import EDS
 from rig.conformance.conformance_case import Verdict

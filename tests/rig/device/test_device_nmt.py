@@ -4,9 +4,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from changed_sheets import change_sheet, describe_variable
 from device_bench import Rack
 
-from dbc import EDS
 from rig.device import EmcyCode, NmtCommand, NmtState
 
 PRE, OPERATIONAL, STOPPED = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
@@ -15,7 +15,6 @@ RESETS = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 COMMAND_TO = {OPERATIONAL: START, STOPPED: STOP, PRE: ENTER_PRE}
 states = pytest.mark.parametrize("state", COMMAND_TO, ids=lambda state: state.name.lower())
 BOOT_UP = (0x703, b"\0")
-READ_REGISTER = bytes.fromhex("4001100000000000")
 
 
 def rack_in(state: NmtState, node: int = 3) -> Rack:
@@ -77,31 +76,31 @@ def test_reset_node_restores_all_objects_reset_communication_only_its_own() -> N
 
 
 @states
-def test_sdo_in_pre_operational_and_operational(state: NmtState) -> None:
-    assert bool(rack_in(state).send(0x603, READ_REGISTER)) is (state is not STOPPED)
+@pytest.mark.parametrize(("request_", "permitted", "answer"), [
+    ("603 40 011000 00000000", (PRE, OPERATIONAL), "583 *"),
+    ("wait 250", COMMAND_TO, "703 {state:02x}, 703 {state:02x}"),
+], ids=["sdo", "heartbeat"])
+def test_services_by_state(state: NmtState, request_: str, permitted: tuple[NmtState, ...], answer: str) -> None:
+    rack_in(state).play(f"{request_} -> {answer.format(state=state) if state in permitted else ''}")
 
 
 @states
 def test_synchronous_pdos_only_in_operational(state: NmtState) -> None:
     rack, cycles = rack_in(state), []
     rack.device.on_sync = lambda: cycles.append(1)
-    rack.send(0x182, bytes.fromhex("0100000002000300"))
-    sent = [cob_id for cob_id, _ in rack.sync()]
     running = state is OPERATIONAL
-    assert sent == ([0x183, 0x283] if running else [])
-    assert cycles == ([1] if running else [])
-    assert rack.device.read(0x2205) == running
+    rack.play(f"182 0100000002000300 ->\n080 -> {'183 *, 283 *' if running else ''}\n2205:0 = {int(running)}")
+    assert cycles == [1] * running
 
 
 @states
 def test_asynchronous_pdos_only_in_operational(state: NmtState) -> None:
     rack, arrived = rack_in(state, node=2), []
     rack.device.on_rpdo = arrived.append
-    rack.send(0x183, bytes(8))
+    rack.play("183 0000000000000000 ->")
     rack.device.transmit(1)
-    running = state is OPERATIONAL
-    assert arrived == ([2] if running else [])
-    assert [cob_id for cob_id, _ in rack.wait(0)] == ([0x182] if running else [])
+    rack.play(f"wait 0 -> {'182 *' if state is OPERATIONAL else ''}")
+    assert arrived == [2] * (state is OPERATIONAL)
 
 
 @states
@@ -110,11 +109,6 @@ def test_emcy_in_pre_operational_and_operational(state: NmtState) -> None:
     rack.device.emcy.raise_error(EmcyCode.RPDO_TIMEOUT, 0x10)
     assert [cob_id for cob_id, _ in rack.wait(0)] == ([] if state is STOPPED else [0x083])
     assert rack.device.read(0x1001) == 0x11  # the register knows in any state
-
-
-@states
-def test_heartbeat_in_every_state(state: NmtState) -> None:
-    assert rack_in(state).wait(250) == [(0x703, bytes((state,)))] * 2
 
 
 def test_frame_of_the_last_cycle_before_a_stop_is_forgotten() -> None:
@@ -144,17 +138,11 @@ def test_heartbeat_of_the_master_lost_and_back() -> None:
     """EMCY 0x8130 naming the node, PRE-OPERATIONAL (0x1029 = 0), error reset when it is back."""
     rack, lost = rack_in(OPERATIONAL), []
     rack.device.on_heartbeat_lost = lost.append
-    rack.wait(1000)
-    assert lost == []  # never heard: not watched yet
-    rack.send(0x701, b"\5")
-    rack.wait(250)
-    assert lost == []
-    assert rack.device.state is OPERATIONAL
-    assert (0x083, bytes.fromhex("3081110100000000")) in rack.wait(1)
-    assert lost == [1]
-    assert rack.device.state is PRE
-    assert rack.send(0x701, b"\5") == [(0x083, bytes(8))]
-    assert rack.device.read(0x1001) == 0
+    rack.play("write 1017:0 0000 -> ok\nwait 1000 ->\n701 05 ->\nwait 250 ->")  # never heard: not watched yet
+    assert (lost, rack.device.state) == ([], OPERATIONAL)
+    rack.play("wait 1 -> 083 3081110100000000")
+    assert (lost, rack.device.state) == ([1], PRE)
+    rack.play("701 05 -> 083 0000000000000000\n1001:0 = 0")
     assert rack.device.state is PRE  # coming back is for the master to command
 
 
@@ -167,64 +155,46 @@ def test_watching_begins_anew_after_a_reset() -> None:
     assert lost == []
 
 
-@pytest.mark.parametrize(("behaviour", "state"), [(0, PRE), (1, OPERATIONAL), (2, STOPPED)])
-def test_error_behaviour(behaviour: int, state: NmtState) -> None:
-    rack = rack_in(OPERATIONAL)
+@pytest.mark.parametrize(("before", "behaviour", "after"), [
+    (OPERATIONAL, 0, PRE), (OPERATIONAL, 1, OPERATIONAL), (OPERATIONAL, 2, STOPPED), (PRE, 2, PRE)])
+def test_error_behaviour(before: NmtState, behaviour: int, after: NmtState) -> None:
+    """Only a device that is OPERATIONAL reacts."""
+    rack = rack_in(before)
     rack.device.write(0x1029, 1, behaviour)
     rack.send(0x701, b"\5")
     rack.wait(300)
-    assert rack.device.state is state
+    assert rack.device.state is after
 
 
-def test_error_behaviour_leaves_a_device_that_is_not_operational_alone() -> None:
-    rack = Rack()
-    rack.device.write(0x1029, 1, 2)
-    rack.send(0x701, b"\5")
-    rack.wait(300)
-    assert rack.device.state is PRE
+# Entries of 0x1016: reserved bits and nodes beyond 127 are refused. EMCY 0x8130 names node 2, lost after 50 ms.
+CONSUMER = {
+    **{f"{entry} is refused": f"write 1016:1 {entry} -> 06090030\n1016:1 = {0x000100FA}"
+       for entry in ("fa008001", "fa008000", "0100ff00", "fa000101", "00000180")},
+    **{f"{entry} is accepted": f"write 1016:1 {entry} -> ok"
+       for entry in ("fa007f00", "00000100", "00000000", "fa000000", "00008000")},
+    "times by SDO": """
+        write 1016:1 32000200 -> ok
+        write 1017:0 0000 -> ok
+        702 7f ->
+        wait 51 -> 083 3081110200000000
+        wait 500 ->
+        write 1017:0 0a00 -> ok
+        wait 20 -> 703 7f, 703 7f""",
+}
 
 
-def test_consumer_and_producer_times_by_sdo() -> None:
-    rack = Rack()
-    rack.send(0x603, bytes.fromhex("2316100132000200"))  # node 2 within 50 ms
-    rack.send(0x702, b"\x7f")
-    assert (0x083, bytes.fromhex("3081110200000000")) in rack.wait(51)
-    rack.send(0x603, bytes.fromhex("2b17100000000000"))  # heartbeat off
-    assert rack.wait(500) == []
-    rack.send(0x603, bytes.fromhex("2b1710000a000000"))
-    assert len(rack.wait(20)) == 2
-
-
-def write_entry(rack: Rack, sub: int, entry: int) -> str:
-    """Download to 0x1016; the answer in hexadecimal."""
-    return rack.send(0x603, bytes.fromhex(f"231610{sub:02x}") + entry.to_bytes(4, "little"))[0][1].hex()
-
-
-@pytest.mark.parametrize("entry", [0x018000FA, 0x008000FA, 0x00FF0001, 0x010100FA, 0x80010000])
-def test_consumer_entry_with_reserved_bits_or_a_node_beyond_127_is_refused(entry: int) -> None:
-    rack = Rack()
-    assert write_entry(rack, 1, entry) == "8016100130000906"
-    assert rack.device.read(0x1016, 1) == 0x000100FA
-
-
-@pytest.mark.parametrize("entry", [0x007F00FA, 0x00010000, 0x00000000, 0x000000FA, 0x00800000])
-def test_consumer_entry_within_the_rules_is_accepted(entry: int) -> None:
-    assert write_entry(Rack(), 1, entry).startswith("60")
+@pytest.mark.parametrize("script", CONSUMER.values(), ids=CONSUMER)
+def test_consumer_entry(script: str) -> None:
+    Rack().play(script)
 
 
 def test_two_consumer_entries_for_one_node_are_refused(tmp_path: Path) -> None:
     """CiA 301, 7.5.2.19: abort 0x06040043."""
-    text = EDS[3].read_text()
-    head, section, tail = text.partition("[1016sub1]\n")
-    body = tail[:tail.index("[")]
-    text = head + section + body + "[1016sub2]\n" + body.replace("0x000100FA", "0x00000000") + tail[len(body):]
-    text = text.replace("ParameterName=Consumer heartbeat time\nObjectType=0x8\nSubNumber=0x2",
-                        "ParameterName=Consumer heartbeat time\nObjectType=0x8\nSubNumber=0x3")
-    path = tmp_path / "two.eds"
-    path.write_text(text)
-    rack = Rack(eds=path)
-    assert write_entry(rack, 2, 0x00010064) == "8016100243000406"
-    assert write_entry(rack, 2, 0x00010000).startswith("60")  # switched off
-    assert write_entry(rack, 2, 0x00020064).startswith("60")
-    assert write_entry(rack, 1, 0x00010064).startswith("60")  # its own node again, another time
-    assert write_entry(rack, 1, 0x00020064) == "8016100143000406"
+    eds = change_sheet(tmp_path, ("1016", "SubNumber=0x2", "SubNumber=0x3"),
+                       more=describe_variable("1016sub2", "0x0007"))
+    Rack(eds=eds).play("""
+        write 1016:2 64000100 -> 06040043
+        write 1016:2 00000100 -> ok
+        write 1016:2 64000200 -> ok
+        write 1016:1 64000100 -> ok
+        write 1016:1 64000200 -> 06040043""")

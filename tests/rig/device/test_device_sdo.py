@@ -6,68 +6,108 @@ import random
 import pytest
 from device_bench import Rack
 
-from rig.device import Abort, NmtCommand, SdoAbort
+from rig.device import Abort, SdoAbort
+
+TOGGLE, COMMAND, STATE = "00000305", "01000405", "22000008"  # abort codes, as an abort carries them
+TOO_LONG, TOO_SHORT, MEMORY = "12000706", "13000706", "05000405"
 
 
-def ask(rack: Rack, request: str) -> str:
-    """One request in hex, spaces allowed; the answer in hex, empty if there is none."""
-    answers = rack.send(0x600 + rack.node, bytes.fromhex(request))
-    assert all(cob_id == 0x580 + rack.node for cob_id, _ in answers)
-    assert len(answers) <= 1
-    return answers[0][1].hex() if answers else ""
+def abort(node: int, multiplexer: str, code: int) -> str:
+    """The frame of an abort."""
+    return f"58{node} 80{multiplexer}{code.to_bytes(4, 'little').hex()}"
 
 
-def abort(multiplexer: str, code: Abort) -> str:
-    return "80" + multiplexer + code.to_bytes(4, "little").hex()
+# Requests and answers, each script for a node. 2110:1 is a REAL64, 2210 a DOMAIN.
+SCRIPTS = {
+    "expedited upload of each size": (2, """
+        602 40 001000 00000000 -> 582 4300100098010000
+        602 40 171000 00000000 -> 582 4b17100064000000
+        602 40 011000 00000000 -> 582 4f01100000000000"""),
+    "segmented upload: the device name in 7 and 7 bytes": (2, f"""
+        602 40 081000 00000000 -> 582 410810000e000000
+        602 60 00000000000000 -> 582 00{b"EHA con".hex()}
+        602 70 00000000000000 -> 582 11{b"troller".hex()}
+        602 60 00000000000000 -> 582 80081000{COMMAND}"""),
+    "segmented download of a REAL64": (2, """
+        602 21 102101 08000000 -> 582 6010210100000000
+        602 00 00000000000004 -> 582 2000000000000000
+        602 1d 40000000000000 -> 582 3000000000000000
+        2110:1 = 2.5"""),
+    "segment without a transfer": (3, f"""
+        603 00 00000000000000 -> 583 80000000{COMMAND}
+        603 60 00000000000000 -> 583 80000000{COMMAND}"""),
+    "the toggle bit must alternate": (3, f"""
+        603 21 102200 10000000 -> 583 60*
+        603 10 01020304050607 -> 583 80102200{TOGGLE}
+        603 00 01020304050607 -> 583 80102200{COMMAND}
+        603 40 081000 00000000 -> 583 41*
+        603 70 00000000000000 -> 583 80081000{TOGGLE}"""),
+    "more bytes than announced": (3, f"""
+        603 21 102200 03000000 -> 583 60*
+        603 01 01020304050607 -> 583 80102200{TOO_LONG}
+        2210:0 = b''"""),
+    "fewer bytes than announced": (3, f"""
+        603 21 102200 09000000 -> 583 60*
+        603 01 01020304050607 -> 583 80102200{TOO_SHORT}
+        2210:0 = b''"""),
+    "an unannounced download is bounded by the object": (2, f"""
+        602 20 102101 00000000 -> 582 60*
+        602 00 01020304050607 -> 582 20*
+        602 1a 08090000000000 -> 582 80102101{TOO_LONG}
+        602 1d 08000000000000 -> 582 80102101{COMMAND}"""),
+    "a client abort ends a transfer silently": (3, f"""
+        603 21 102200 10000000 -> 583 60*
+        603 80 102200 00000008 ->
+        603 00 01020304050607 -> 583 80102200{COMMAND}"""),
+    "a new request ends a transfer silently": (3, f"""
+        603 21 102200 10000000 -> 583 60*
+        603 40 011000 00000000 -> 583 4f01100000000000
+        603 00 01020304050607 -> 583 80011000{COMMAND}"""),
+    "STOPPED ends a transfer": (3, f"""
+        603 21 102200 10000000 -> 583 60*
+        000 02 03 ->
+        603 00 01020304050607 ->
+        000 80 03 ->
+        603 00 01020304050607 -> 583 80102200{COMMAND}"""),
+    "a silent client times out after 5 s": (3, """
+        write 1017:0 0000 -> ok
+        603 21 102200 10000000 -> 583 60*
+        wait 4900 ->
+        wait 101 -> 583 8010220000000405
+        wait 3000 ->"""),
+    "what is not 8 bytes is no SDO": (3, "603 ->\n603 40 ->\n603 40081000000000 ->"),
+}
 
 
-def download(rack: Rack, multiplexer: str, data: bytes, announce: bool = True) -> str:
-    """Segmented download; the last answer."""
-    size = len(data).to_bytes(4, "little").hex() if announce else "00000000"
-    answer = ask(rack, ("21" if announce else "20") + multiplexer + size)
-    toggle = 0
-    for at in range(0, len(data), 7):
-        if not answer.startswith(("60", "20", "30")):
+@pytest.mark.parametrize(("node", "script"), SCRIPTS.values(), ids=SCRIPTS)
+def test_script(node: int, script: str) -> None:
+    Rack(node).play(script)
+
+
+def download(rack: Rack, data: bytes, announce: bool = True) -> str:
+    """Segmented download to 0x2210; the last answer in hexadecimal."""
+    def ask(request: bytes) -> str:
+        return rack.send(0x603, request)[0][1].hex()
+
+    answer = ask(b"\x21\x10\x22\0" + len(data).to_bytes(4, "little") if announce else b"\x20\x10\x22" + bytes(5))
+    for number, at in enumerate(range(0, len(data), 7)):
+        if answer.startswith("80"):
             break
         part = data[at : at + 7]
-        command = toggle | (7 - len(part)) << 1 | (at + 7 >= len(data))
-        answer = ask(rack, f"{command:02x}" + part.ljust(7, b"\0").hex())
-        toggle ^= 0x10
+        command = number % 2 << 4 | (7 - len(part)) << 1 | (at + 7 >= len(data))
+        answer = ask(bytes((command,)) + part.ljust(7, b"\0"))
     return answer
-
-
-def test_expedited_upload_of_each_size() -> None:
-    rack = Rack(2)
-    assert ask(rack, "40 001000 00000000") == "4300100098010000"  # UNSIGNED32: device type, CiA 408
-    assert ask(rack, "40 171000 00000000") == "4b17100064000000"  # UNSIGNED16
-    assert ask(rack, "40 011000 00000000") == "4f01100000000000"  # UNSIGNED8
-    rack.device.write(0x2102, 0, -2)
-    assert ask(rack, "40 022100 00000000") == "43022100feffffff"  # INTEGER32
-
-
-def test_segmented_upload() -> None:
-    """The device name: 14 bytes, announced, then seven and seven."""
-    rack = Rack(2)
-    assert ask(rack, "40 081000 00000000") == "410810000e000000"
-    assert ask(rack, "60 00000000000000") == "00" + b"EHA con".hex()
-    assert ask(rack, "70 00000000000000") == "11" + b"troller".hex()
-    assert ask(rack, "60 00000000000000") == abort("081000", Abort.COMMAND)  # nothing left
 
 
 def test_expedited_download() -> None:
     rack, seen = Rack(3), []
     rack.device.on_write = lambda index, sub, data: seen.append((index, sub, data))
-    assert ask(rack, "2b 171000 0a000000") == "6017100000000000"
-    assert rack.device.read(0x1017) == 10
-    assert ask(rack, "22 171000 0b00ffff") == "6017100000000000"  # size not said: the object's own
-    assert rack.device.read(0x1017) == 11
+    rack.play("""
+        603 2b 171000 0a000000 -> 583 6017100000000000
+        1017:0 = 10
+        603 22 171000 0b00ffff -> 583 6017100000000000
+        1017:0 = 11""")  # size not said: the object's own
     assert seen == [(0x1017, 0, b"\x0a\0"), (0x1017, 0, b"\x0b\0")]
-
-
-def test_segmented_download_of_a_real64() -> None:
-    rack = Rack(2)
-    assert download(rack, "102101", bytes.fromhex("0000000000000440")).startswith("30")
-    assert rack.device.read(0x2110, 1) == 2.5
 
 
 @pytest.mark.parametrize("size", [1, 4, 6, 7, 8, 13, 14, 15, 6000])
@@ -76,73 +116,31 @@ def test_domain_of_any_size(size: int, announce: bool) -> None:
     rack, seen = Rack(3), []
     rack.device.on_write = lambda index, sub, data: seen.append(data)
     data = random.Random(size).randbytes(size)
-    assert download(rack, "102200", data, announce)[:2] in ("20", "30")
-    assert seen == [data]
-    assert rack.device.read(0x2210) == data
+    assert download(rack, data, announce)[:2] in ("20", "30")
+    assert seen == [data] and rack.device.read(0x2210) == data
 
 
-ABORTS = {
-    "no object": ("40 342100 00000000", Abort.NO_OBJECT),
-    "no object to write": ("2f 342100 01000000", Abort.NO_OBJECT),
-    "no sub-index": ("40 181009 00000000", Abort.NO_SUBINDEX),
-    "sub-index of a variable": ("40 171001 00000000", Abort.NO_SUBINDEX),
-    "write-only": ("40 102200 00000000", Abort.WRITE_ONLY),
-    "const": ("23 001000 00000000", Abort.READ_ONLY),
-    "read-only": ("23 002200 00000000", Abort.READ_ONLY),
-    "read-only, before any segment": ("21 002200 08000000", Abort.READ_ONLY),
-    "mapping is fixed": ("2f 001a00 00000000", Abort.READ_ONLY),
-    "too long": ("23 171000 00000000", Abort.TOO_LONG),
-    "too short": ("2f 171000 00000000", Abort.TOO_SHORT),
-    "announced too long": ("21 171000 08000000", Abort.TOO_LONG),
-    "announced too short": ("21 171000 01000000", Abort.TOO_SHORT),
-    "announced beyond memory": ("21 102200 00000010", Abort.MEMORY),
-    "too high": ("2f 291001 03000000", Abort.TOO_HIGH),
-    "no error recorded": ("40 031001 00000000", Abort.NO_DATA),
-    "block download": ("c2 102200 08000000", Abort.COMMAND),
-    "block upload": ("a0 081000 04000000", Abort.COMMAND),
-    "unknown specifier": ("e0 081000 00000000", Abort.COMMAND),
-}
-
-
-@pytest.mark.parametrize(("request_", "code"), ABORTS.values(), ids=ABORTS)
+@pytest.mark.parametrize(("request_", "code"), [
+    ("40 342100 00000000", Abort.NO_OBJECT), ("2f 342100 01000000", Abort.NO_OBJECT),
+    ("40 181009 00000000", Abort.NO_SUBINDEX), ("40 171001 00000000", Abort.NO_SUBINDEX),  # of a variable
+    ("40 102200 00000000", Abort.WRITE_ONLY),
+    ("23 001000 00000000", Abort.READ_ONLY), ("23 002200 00000000", Abort.READ_ONLY),  # const, ro
+    ("21 002200 08000000", Abort.READ_ONLY),  # before any segment
+    ("2f 001a00 00000000", Abort.READ_ONLY),  # the mapping is fixed
+    ("23 171000 00000000", Abort.TOO_LONG), ("2f 171000 00000000", Abort.TOO_SHORT),
+    ("21 171000 08000000", Abort.TOO_LONG), ("21 171000 01000000", Abort.TOO_SHORT),  # announced
+    ("21 102200 00000010", Abort.MEMORY),
+    ("2f 291001 03000000", Abort.TOO_HIGH),
+    ("40 031001 00000000", Abort.NO_DATA),  # no error recorded
+    ("c2 102200 08000000", Abort.COMMAND), ("a0 081000 04000000", Abort.COMMAND),  # block transfer
+    ("e0 081000 00000000", Abort.COMMAND),
+])  # fmt: skip
 def test_aborts(request_: str, code: Abort) -> None:
-    assert ask(Rack(3), request_) == abort(request_[3:9], code)
-
-
-def test_segment_without_a_transfer() -> None:
-    for command in ("00", "60"):
-        assert ask(Rack(3), command + " 00000000000000") == abort("000000", Abort.COMMAND)
-
-
-def test_toggle_bit_must_alternate() -> None:
-    rack = Rack(3)
-    ask(rack, "21 102200 10000000")
-    assert ask(rack, "10 01020304050607") == abort("102200", Abort.TOGGLE)
-    assert ask(rack, "00 01020304050607") == abort("102200", Abort.COMMAND)  # the transfer is over
-    ask(rack, "40 081000 00000000")
-    assert ask(rack, "70 00000000000000") == abort("081000", Abort.TOGGLE)
-
-
-@pytest.mark.parametrize(("announced", "code"), [(3, Abort.TOO_LONG), (9, Abort.TOO_SHORT)])
-def test_bytes_sent_must_be_bytes_announced(announced: int, code: Abort) -> None:
-    rack = Rack(3)
-    ask(rack, f"21 102200 {announced:02x}000000")
-    assert ask(rack, "01 01020304050607") == abort("102200", code)
-    assert rack.device.read(0x2210) == b""
+    Rack(3).play(f"603 {request_} -> {abort(3, request_[3:9], code)}")
 
 
 def test_unannounced_download_is_bounded() -> None:
-    rack = Rack(3)
-    assert download(rack, "102200", bytes((1 << 20) + 7), announce=False) == abort("102200", Abort.MEMORY)
-
-
-def test_unannounced_download_is_bounded_by_the_object() -> None:
-    """The byte after the last one of a REAL64 ends the transfer, not the last segment."""
-    rack = Rack(2)
-    ask(rack, "20 102101 00000000")
-    assert ask(rack, "00 01020304050607").startswith("20")
-    assert ask(rack, "1a 08090000000000") == abort("102101", Abort.TOO_LONG)
-    assert ask(rack, "1d 08000000000000") == abort("102101", Abort.COMMAND)
+    assert download(Rack(3), bytes((1 << 20) + 7), announce=False) == f"80102200{MEMORY}"
 
 
 def test_application_may_refuse() -> None:
@@ -152,40 +150,5 @@ def test_application_may_refuse() -> None:
         raise SdoAbort(Abort.STATE)
 
     rack.device.on_write = refuse
-    assert download(rack, "102200", bytes(20)) == abort("102200", Abort.STATE)
-    assert rack.device.read(0x2210) == b""
-    assert ask(rack, "2b 171000 0a000000") == abort("171000", Abort.STATE)
-    assert rack.device.read(0x1017) == 100
-
-
-def test_silent_client_times_out() -> None:
-    rack = Rack(3)
-    ask(rack, "21 102200 10000000")
-    assert all(cob_id == 0x703 for cob_id, _ in rack.wait(4900))  # a client that stood still may go on
-    answers = rack.wait(101)
-    assert (0x583, bytes.fromhex(abort("102200", Abort.TIMEOUT))) in answers
-    assert all(cob_id == 0x703 for cob_id, _ in rack.wait(3000))
-
-
-def test_client_abort_and_new_request_end_a_transfer_silently() -> None:
-    rack = Rack(3)
-    ask(rack, "21 102200 10000000")
-    assert ask(rack, "80 102200 00000008") == ""
-    assert ask(rack, "00 01020304050607") == abort("102200", Abort.COMMAND)
-    ask(rack, "21 102200 10000000")
-    assert ask(rack, "40 011000 00000000") == "4f01100000000000"
-    assert ask(rack, "00 01020304050607") == abort("011000", Abort.COMMAND)
-
-
-def test_stop_ends_a_transfer() -> None:
-    rack = Rack(3)
-    ask(rack, "21 102200 10000000")
-    rack.nmt(NmtCommand.STOP)
-    assert ask(rack, "00 01020304050607") == ""
-    rack.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
-    assert ask(rack, "00 01020304050607") == abort("102200", Abort.COMMAND)
-
-
-@pytest.mark.parametrize("request_", ["", "40", "40081000000000"])
-def test_what_is_not_8_bytes_is_no_sdo(request_: str) -> None:
-    assert ask(Rack(3), request_) == ""
+    assert download(rack, bytes(20)) == f"80102200{STATE}"
+    rack.play("2210:0 = b''\nwrite 1017:0 0a00 -> 08000022\n1017:0 = 100")
