@@ -20,7 +20,6 @@ from fdi.estimation.unidentifiable import (
     LogFree,
     LogFrictionRatio,
     LogProblem,
-    compute_values,
     descend_valley,
     find_flat_directions,
     guess_covariance,
@@ -65,17 +64,11 @@ def sample_starts(free: Sequence[Free], begin: Floats, known: frozenset[str], se
     Those that are `known` from regressions are scattered by a tenth, tolerances not at all, the rest by 0.4 of what
     is known of them.
     """
-    spread = np.array([_choose_spread(f, f.name in known) for f in free])
+    spread = np.array([(0.1 / f.scale if f.name in known else 0.4) * is_wide(f) for f in free])
     rng = np.random.default_rng(seed)
     scattered = begin + spread * rng.standard_normal((count, len(free)))
     low, high = scaled_bounds(free)
     return np.clip(np.vstack([begin, np.zeros(len(free)), scattered]), low, high)
-
-
-def _choose_spread(f: Free, is_known: bool) -> float:
-    if not is_wide(f):
-        return 0.0
-    return 0.1 / f.scale if is_known else 0.4
 
 
 def is_wide(f: Free, tolerance: float = 0.04) -> bool:
@@ -193,8 +186,7 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
 
 def find_flat(problem: LogProblem, free: Sequence[Free], x: Floats) -> Floats:
     """Directions (p, k) of scaled unknowns at `x` (p,) along which no signal changes."""
-    names = [f.name for f in free]
-    v = {**problem.model.values, **dict(zip(names, compute_values(free, x).tolist(), strict=True))}
+    v = {**problem.model.values, **problem.list_values(free, x)}
     if problem.model.plant != "eha":
         return np.empty((len(free), 0))
     leaking = {"valve.pressure_gain": 1.0}

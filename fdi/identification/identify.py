@@ -51,7 +51,7 @@ from fdi.thresholds import (
     RESIDUAL_WORST,
 )
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Trace, rms
+from fdi.trace.trace import Trace, rms, shift_rows
 from plant.model import Model
 from plant.threads import count_threads
 
@@ -155,7 +155,8 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
         progress: called with each stage and the share done, 0 to 1.
         workers: threads; default one a core.
     """
-    runs, notes = (*fitted, *held_out), _collect_notes([*fitted, *held_out], sources)
+    runs = (*fitted, *held_out)
+    notes = [f"{source.file}: {note}" for trace, source in zip(runs, sources, strict=True) for note in trace.notes]
     floor = {s: float(np.median([f[s].value for f in (sensor_floors(t, model) for t in fitted)]))
              for s in fitted[0].outputs}
     if not any(_moves(t) for t in fitted):
@@ -167,7 +168,8 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     names = frozenset(f.name for f in free)
     begun = estimate_by_regressions(fitted, model, frozenset(model.values) - names)
     begun = {name: value for name, value in begun.items() if name in names}
-    parts, remarks = cut_long_runs(fitted, sources, _replace_values(model, begun), floor)
+    first = replace(model, values=limit_friction_values({**model.values, **begun}))
+    parts, remarks = cut_long_runs(fitted, sources, first, floor)
     problem = make_problem(model, parts, floor, workers or count_threads())
     notes += remarks
     starts = sample_starts(free, scale_values(free, {**model.values, **begun}), frozenset(begun), seed)
@@ -209,10 +211,6 @@ def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model
     return tuple(parts), remarks
 
 
-def _replace_values(model: Model, values: Mapping[str, float]) -> Model:
-    return replace(model, values=limit_friction_values({**model.values, **values}))
-
-
 def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> LogProblem:
     """The runs to fit with white noise of the floor's size."""
     noise = tuple(noises.white_noise(floor[s]) for s in fitted[0].outputs)
@@ -232,15 +230,15 @@ def find_hidden(problem: LogProblem, fit: Fit, ranges: Mapping[str, Range]
     for k, _ in places:
         f = fit.free[k]
         low, high = ((end - f.centre) / f.scale for end in (f.low, f.high))
-        inside = IDENTIFIABLE_SHARE * 0.5 * (high - low)
-        trials.append(_put(fit.x, k, low if fit.x[k] - low > 1e-3 * (high - low) else low + inside))
-        trials.append(_put(fit.x, k, high if high - fit.x[k] > 1e-3 * (high - low) else high - inside))
+        near, inside = 1e-3 * (high - low), IDENTIFIABLE_SHARE * 0.5 * (high - low)
+        trials.append(_put(fit.x, k, low if fit.x[k] - low > near else low + inside))
+        trials.append(_put(fit.x, k, high if high - fit.x[k] > near else high - inside))
     costs = compute_misfit(problem.compute_white_residuals(fit.free, np.array(trials)))
+    is_open = (np.abs(costs[1:] - costs[0]) < OPEN_MISFIT).reshape(-1, 2)
     found = {}
-    for i, (k, r) in enumerate(places):
-        f = fit.free[k]
-        below, above = (abs(costs[1 + 2 * i + side] - costs[0]) < OPEN_MISFIT for side in (0, 1))
+    for (k, r), (below, above) in zip(places, is_open.tolist(), strict=True):
         if below or above:
+            f = fit.free[k]
             low = r.low if below else _find_edge(problem, fit, k, f.low)
             high = r.high if above else _find_edge(problem, fit, k, f.high)
             found[f.name] = (min(max(r.centre, low), high), low, high)
@@ -280,13 +278,10 @@ def hold_parameters(problem: LogProblem, fit: Fit, held: Mapping[str, float]) ->
     """The problem and the fit without some unknowns, which keep the values in `held`."""
     if not held:
         return problem, fit
-    values = {**problem.model.values, **held}
     kept = [k for k, f in enumerate(fit.free) if f.name not in held]
-    x = fit.x[kept]
-    free = tuple(fit.free[k] for k in kept)
-    none = np.empty((0, 0))
-    fixed = replace(problem, model=replace(problem.model, values=limit_friction_values(values)), _lanes={})
-    return fixed, Fit(free, x, np.inf, np.inf, fit.covariance[np.ix_(kept, kept)], none, none, none)
+    values = limit_friction_values({**problem.model.values, **held})
+    fixed = replace(problem, model=replace(problem.model, values=values), _lanes={})
+    return fixed, start_fit([fit.free[k] for k in kept], fit.x[kept])
 
 
 def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress: Progress = ignore_progress
@@ -310,23 +305,19 @@ def finish(problem: LogProblem, fit: Fit, begin: Floats, seed: int = 0, progress
     return fine, fit
 
 
-def build_model(model: Model, problem: Problem, fit: Fit, gains: ControllerGains | None) -> Model:
+def build_model(model: Model, problem: LogProblem, fit: Fit, gains: ControllerGains | None) -> Model:
     """The model whose nominal values are those that were found."""
-    names = [f.name for f in fit.free]
-    values = dict(zip(names, compute_values(fit.free, fit.x).tolist(), strict=True))
+    values = problem.list_values(fit.free, fit.x)
     held = {n: v for n, v in problem.model.values.items() if v != model.values.get(n) and not n.startswith("sensors.")
             and n not in values}
-    noise = {}
-    for s, n in zip(problem.trace.outputs, problem.noise, strict=True):
-        noise[SIGNALS[s].noise] = n.level
+    noise = {SIGNALS[s].noise: n.level for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
     read = {} if gains is None else gains.values
     found = {n: float(f"{v:.6g}") for n, v in {**held, **values, **read, **noise}.items() if n in model.values}
-    base = {n for n in found if n.partition(".")[0] in model.kind.groups}
     complete = limit_friction_values({**model.values, **found})
-    own = {**{n: model.values[n] for n in model.kind.nominal if n in model.values
-              and model.values[n] != model.kind.nominal[n]}, **{n: complete[n] for n in base}}
-    design = {n: own[n] for n in model.list_names() if n in own}
-    return replace(model, values=complete, design=design)
+    nominal = model.kind.nominal
+    own = {n for n in nominal if n in model.values and model.values[n] != nominal[n]}
+    own |= {n for n in found if n.partition(".")[0] in model.kind.groups}
+    return replace(model, values=complete, design={n: complete[n] for n in model.list_names() if n in own})
 
 
 def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
@@ -378,24 +369,21 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
     """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI."""
     errors, residuals = [], []
     for number, (trace, source) in enumerate(zip(runs, sources, strict=True)):
-        left = [_make_judging_problem(m, trace).compute_residuals((), np.empty((1, 0)))[0] for m in (before, after)]
-        first, last = ({s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left)
+        noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
+        first, last = (Problem(silence_readings(model), trace, noise, steps=LAST_STEPS) for model in (before, after))
+        left = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
+        sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left]
         typical = dict(zip(trace.outputs, compute_typical_rms(left[1]).tolist(), strict=True))
         own = {s: floor[s] for s in trace.outputs}
-        decided, share = last, 0.0
+        decided, share = sizes[1], 0.0
         if number >= fitted and _moves(trace) and not is_long(trace):  # nine replays of a long one take too much memory
-            undecided = find_undecided_rows(_make_judging_problem(after, trace), start_fit((), np.empty(0)), own)
+            undecided = find_undecided_rows(last, start_fit((), np.empty(0)), own)
             share = float(undecided.mean())
             if 0.0 < share < 1.0:
                 decided = {s: rms(r[~undecided]) for s, r in zip(trace.outputs, left[1], strict=True)}
-        errors.append(RunError(source, number >= fitted, first, last, typical, own, decided, share))
+        errors.append(RunError(source, number >= fitted, sizes[0], sizes[1], typical, own, decided, share))
         residuals.append((left[0], left[1]))
     return tuple(errors), tuple(residuals)
-
-
-def _make_judging_problem(model: Model, trace: Trace) -> Problem:
-    noise = tuple(noises.white_noise(1.0) for _ in trace.outputs)
-    return Problem(silence_readings(model), trace, noise, steps=LAST_STEPS)
 
 
 def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) -> tuple[str, str]:
@@ -422,10 +410,6 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
 
 def _moves(trace: Trace) -> bool:
     return float(np.nanmax(trace.xj) - np.nanmin(trace.xj)) >= MOVING_RAM
-
-
-def _collect_notes(runs: Sequence[Trace], sources: Sequence[Source]) -> list[str]:
-    return [f"{source.file}: {note}" for trace, source in zip(runs, sources, strict=True) for note in trace.notes]
 
 
 def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
@@ -487,9 +471,6 @@ def _mark_unseen(text: str, unseen: Mapping[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-GAIN, LIMIT = "controller.proportional_gain", "controller.current_limit"
-
-
 class ControllerGains(NamedTuple):
     """The proportional law, answer = gain * error up to a limit, and how well it holds."""
 
@@ -505,9 +486,8 @@ class ControllerGains(NamedTuple):
     @property
     def values(self) -> Mapping[str, float]:
         """Parameters of the model, SI; none if this is not the law."""
-        if not self.is_proportional:
-            return {}
-        return {GAIN: self.gain} | ({} if self.limit is None else {LIMIT: self.limit})
+        found = {"controller.proportional_gain": self.gain, "controller.current_limit": self.limit}
+        return {name: value for name, value in found.items() if value is not None and self.is_proportional}
 
 
 def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows: int = 20) -> ControllerGains | None:
@@ -526,18 +506,14 @@ def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows:
     inside = (np.abs(answer) < 0.99 * largest) & (np.abs(error) > 0.0) & (np.abs(answer) > 0.0)
     if not inside.any():
         return None
-    ratio = answer[inside] / error[inside]
-    weight = np.abs(error[inside])
+    ratio, weight = answer[inside] / error[inside], np.abs(error[inside])
     order = np.argsort(ratio)
-    middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-    gain = float(ratio[order][middle])
+    gain = float(ratio[order][np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())])  # weighted median
     left = np.abs(answer - np.clip(gain * error, -largest, largest))
     at_limit = int((np.abs(answer) > (1.0 - 1e-9) * largest).sum())
     return ControllerGains(gain, largest if at_limit >= fewest_rows else None,
                            float((left <= tolerance * largest).mean()))
 
-
-Flags = NDArray[np.bool_]
 
 SMOOTHED = 25  # rows of the parabola that gives speed and acceleration
 MOVING = 1e-3  # m/s, above which the ram's friction is the dynamic one
@@ -554,7 +530,7 @@ def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozense
         known: parameters that are not free, so that others make up for them.
     """
     found: dict[str, float] = {}
-    stroke = _estimate_stroke(runs)
+    stroke = _find_limit(np.concatenate([t.xj for t in runs]))  # half of it, m, as far as the ram went
     if stroke > 0.98 * model["jack.travel"] or _dwells(np.concatenate([t.xj for t in runs]), stroke):
         found["jack.travel"] = stroke
     if all("p12" in t.outputs for t in runs):
@@ -567,14 +543,12 @@ def estimate_by_regressions(runs: Sequence[Trace], model: Model, known: frozense
     p = {**model.values, **found}
     if all({"xs", "p12"} <= set(t.outputs) for t in runs):
         found |= _estimate_jack(runs, p, "jack.area" not in known)
-    elif all("xs" in t.outputs for t in runs):
-        gain = _regress([_smooth_speed(t) for t in runs], [[t.mask_unusable("xs")] for t in runs])
-        if gain is not None and gain[0] > 0.0:
-            found["valve.flow_gain"] = gain[0] * p["jack.area"]
     else:
-        gain = _regress([_smooth_speed(t) for t in runs], [[_delay(t.cor, 4)] for t in runs], largest=0.5)
+        has_spool = all("xs" in t.outputs for t in runs)
+        drive = [t.mask_unusable("xs") if has_spool else shift_rows(t.cor, 4) for t in runs]
+        opening = 1.0 if has_spool else p["torque_motor.gain"] / p["feedback_spring.stiffness"]
+        gain = _regress([_smooth_speed(t) for t in runs], [[d] for d in drive], 1.0 if has_spool else 0.5)
         if gain is not None and gain[0] > 0.0:
-            opening = p["torque_motor.gain"] / p["feedback_spring.stiffness"]
             found["valve.flow_gain"] = gain[0] * p["jack.area"] / opening
     return {name: value for name, value in found.items() if np.isfinite(value) and value > 0.0}
 
@@ -586,22 +560,20 @@ def _estimate_spool(runs: Sequence[Trace], model: Model) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     size = 61
-    every = np.concatenate([t.mask_unusable("xs") for t in runs])
-    free = 0.6 * _find_limit(every)
-    level = [_average(t.mask_unusable("xs"), size) for t in runs]
-    level = [np.where(_average((np.abs(t.xs) > free).astype(float), size) > 0.0, np.nan, x)
-             for t, x in zip(runs, level, strict=True)]
-    drive = [_average(t.cor, size) for t in runs]
-    gain = _regress(level, [[d] for d in drive])
+    spool = [t.mask_unusable("xs") for t in runs]
+    every = np.concatenate(spool)
+    limit = _find_limit(every)
+    level = [np.where(_average((np.abs(t.xs) > 0.6 * limit).astype(float), size) > 0.0, np.nan, _average(x, size))
+             for t, x in zip(runs, spool, strict=True)]
+    gain = _regress(level, [[_average(t.cor, size)] for t in runs])
     if gain is None or gain[0] <= 0.0:
         return found
     ratio = model["feedback_spring.stiffness"] / model["torque_motor.gain"] * gain[0]  # KSF/GM of the model over own
     found["feedback_spring.stiffness"] = model["feedback_spring.stiffness"] / np.sqrt(ratio)
     found["torque_motor.gain"] = model["torque_motor.gain"] * np.sqrt(ratio)
-    largest = max(float(np.nanmax(np.abs(t.mask_unusable("xs")))) for t in runs)
-    if largest > 0.98 * model["spool.travel"] or _dwells(every, _find_limit(every)):
-        found["spool.travel"] = _find_limit(every)
-    speeds = [np.abs(differentiate(_fill(t.mask_unusable("xs")), 5, 1)) / t.period for t in runs]
+    if float(np.nanmax(np.abs(every))) > 0.98 * model["spool.travel"] or _dwells(every, limit):
+        found["spool.travel"] = limit
+    speeds = [np.abs(differentiate(_fill(x), 5, 1)) / t.period for t, x in zip(runs, spool, strict=True)]
     highest = _find_limit(np.concatenate(speeds))
     found["pilot.flow_gain"] = highest * model["spool.end_area"] / model["flapper.travel"]
     return found
@@ -642,11 +614,6 @@ def _estimate_jack(runs: Sequence[Trace], p: Mapping[str, float], is_area_free: 
     return found
 
 
-def _estimate_stroke(runs: Sequence[Trace]) -> float:
-    """Half the stroke, m, as far as the ram went: the level at which it stayed, not a single noisy sample."""
-    return _find_limit(np.concatenate([t.xj for t in runs]))
-
-
 def _find_limit(x: Floats) -> float:
     """The largest magnitude that some samples reach, so that noise does not set it."""
     size = np.sort(np.abs(x[~np.isnan(x)]))
@@ -671,10 +638,6 @@ def _fill(x: Floats) -> Floats:
 def _average(x: Floats, size: int) -> Floats:
     mean: Floats = np.convolve(np.pad(_fill(x), size // 2, "edge"), np.full(size, 1.0 / size), "valid")
     return mean
-
-
-def _delay(x: Floats, rows: int) -> Floats:
-    return np.concatenate([np.full(rows, x[0]), x[:-rows]])
 
 
 def _regress(y: Sequence[Floats], columns: Sequence[Sequence[Floats]], largest: float = 1.0, rounds: int = 6
