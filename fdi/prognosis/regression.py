@@ -96,8 +96,9 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
     """
     common, factor = NOISES[noise]
     sigma = factor * np.maximum(data.sigma, narrowest)
-    jumps = _make_step_columns(data)
-    own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
+    n = len(sigma)
+    jumps = np.array([np.arange(n) >= row for row in data.steps], dtype=float).reshape(-1, n)  # 1 from the step on
+    own = np.where(np.isin(np.arange(n), data.bounded), 1.0, 1.0 - common)
     out: Floats = (np.diag(own * sigma ** 2) + OFFSET_PRIOR_SD ** 2
                    + STEP_PRIOR_SD ** 2 * jumps.T @ jumps + compute_wander_covariance(wander, data.u, data.u))
     out[data.loose, data.loose] += loose ** 2
@@ -113,11 +114,6 @@ def compute_shape_log_priors(noise: int, wander: int) -> Floats:
     with np.errstate(divide="ignore"):
         out: Floats = np.log(chance * prior * NOISE_PRIOR[noise])
     return out
-
-
-def _make_step_columns(data: Scaled) -> Floats:
-    """A row for each step, (steps, n): 1 from the step on."""
-    return np.array([np.arange(len(data.u)) >= row for row in data.steps], dtype=float).reshape(-1, len(data.u))
 
 
 def compute_wander_covariance(wander: int, a: Floats, b: Floats) -> Floats:
@@ -143,7 +139,8 @@ def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     evidence = (compute_shape_log_priors(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
                 + compute_rise_evidence(rise, deviation, usual))
     own = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
-    spread = own + _compute_end_prior(kind, strength) - s.T @ s
+    wandered = np.array([[1.0, 1.5], [1.5, 3.0]]) if kind == "integrated" else np.diag([1.0, 0.0])
+    spread = own + strength ** 2 * wandered - s.T @ s
     return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, spread)
 
 
@@ -161,13 +158,6 @@ def compute_end_covariance(data: Scaled, u: Floats, wander: int) -> Floats:
     if kind == "integrated":
         return np.array([level + 3 * strength ** 2 * (u ** 2 / 2 - u ** 3 / 6), 3 * strength ** 2 * u ** 2 / 2])
     return np.array([level + strength ** 2 * u, np.zeros_like(u)])
-
-
-def _compute_end_prior(kind: str, strength: float) -> Floats:
-    """Prior covariance of the wander and its slope at u = 1."""
-    if kind == "integrated":
-        return strength ** 2 * np.array([[1.0, 1.5], [1.5, 3.0]])
-    return strength ** 2 * np.array([[1.0, 0.0], [0.0, 0.0]])
 
 
 def estimate_level(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
@@ -221,17 +211,12 @@ def list_shapes() -> tuple[tuple[Shape, ...], Floats]:
              "power": [Shape("power", onset, p) for onset in (*before, *within) for p in exponents],
              "runaway": [Shape("runaway", onset, end) for onset in within for end in ends]}
     flat = tuple(shape for law in LAWS for shape in table[law])
-    weights = []
+    weights: list[float] = []
     for law in LAWS:
         early = sum(shape.onset <= 0.0 for shape in table[law])
         late = len(table[law]) - early
-        for shape in table[law]:
-            if late == 0:
-                weights.append(1.0 / early)
-            elif shape.onset <= 0.0:
-                weights.append(0.5 / early)
-            else:
-                weights.append(0.5 / late)
+        share = 0.5 if late else 1.0
+        weights += [share / early if shape.onset <= 0.0 else 0.5 / late for shape in table[law]]
     every = tuple(shape._replace(rise=rise) for rise in rises for shape in flat)
     return every, np.tile(weights, len(rises)) / len(LAWS) / len(rises)
 

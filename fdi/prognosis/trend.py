@@ -3,12 +3,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import log_ndtr
 
 from fdi.diagnosis.faults import Estimate, Fault, Level, classify_size, judge_size
 from fdi.prognosis import remaining_life
@@ -18,6 +18,7 @@ from fdi.prognosis.regression import (
     Posterior,
     Scaled,
     compute_covariance,
+    compute_rise_evidence,
     compute_shape_log_priors,
     estimate_level,
     evaluate_shapes,
@@ -39,8 +40,6 @@ from fdi.thresholds import (
 )
 
 Floats = NDArray[np.float64]
-
-LIMITS = {"maintenance": "middle", "non_nominal": "most"}  # level that begins there: field of Fault
 
 
 class Remaining(NamedTuple):
@@ -104,8 +103,10 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
     span = float(t[-1] - t[found.first])
     posterior = fit_growth(found.data)
     paths, laws = _sample_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
-    remaining = {level: _summarise_remaining(getattr(fault, field), fault, unit, paths, span)
-                 for level, field in LIMITS.items()}
+    remaining = {}
+    for reached, limit in (("maintenance", fault.middle), ("non_nominal", fault.most)):
+        draws = remaining_life.find_first_passage(paths, (limit - fault.healthy) / unit) * span
+        remaining[reached] = Remaining(limit, *_summarise_draws(draws), draws)
     middle = np.linspace(0.0, 1.0, 60)
     level = fault.healthy + unit * estimate_level(found.data, posterior, middle)
     past = Curve(t[found.first] + span * middle, *level)
@@ -154,13 +155,6 @@ def _sample_paths(found: Cleaned, posterior: Posterior, own: remaining_life.Unit
 def _summarise_draws(draws: Floats) -> Estimate:
     low, value, high = np.quantile(draws, [0.025, 0.5, 0.975], method="nearest")
     return Estimate(float(value), float(low), float(high))
-
-
-def _summarise_remaining(limit: float, fault: Fault, unit: float, paths: remaining_life.Paths, span: float
-                         ) -> Remaining:
-    draws = remaining_life.find_first_passage(paths, (limit - fault.healthy) / unit) * span
-    value, low, high = _summarise_draws(draws)
-    return Remaining(limit, value, low, high, draws)
 
 
 def _make_forecast(fault: Fault, unit: float, paths: remaining_life.Paths, start: float, span: float) -> Curve:
@@ -239,16 +233,15 @@ def _compute_gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
     g = evaluate_shapes(every, data.u)
     usual = np.array([shape.rise for shape in every])
     plain, with_it, factors = [], [], []
-    for i in range(len(NOISES)):
-        for j in range(len(WANDERS)):
-            factor = np.linalg.cholesky(compute_covariance(data, i, j))
-            white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
-            chance = compute_shape_log_priors(i, j) - np.log(np.diag(factor)).sum() - 0.5 * white[:, 0] @ white[:, 0]
-            y, rises, columns = white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):]
-            alone, both, size = _compute_evidence(y, rises, columns, usual)
-            plain.append(chance + alone)
-            with_it.append(chance[:, None] + both)
-            factors.append(size)
+    for i, j in product(range(len(NOISES)), range(len(WANDERS))):
+        factor = np.linalg.cholesky(compute_covariance(data, i, j))
+        white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
+        y, rises, columns = white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):]
+        chance = compute_shape_log_priors(i, j) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
+        alone, both, size = _compute_evidence(y, rises, columns, usual)
+        plain.append(chance + alone)
+        with_it.append(chance[:, None] + both)
+        factors.append(size)
     base = np.logaddexp.reduce(plain, axis=None)
     stack = np.concatenate(with_it)
     best = stack.argmax(axis=0)
@@ -259,10 +252,10 @@ def _compute_evidence(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[F
     """Log evidence that the rise, (k,), and rise and a column's factor, (k, m), add; and that factor, (k, m)."""
     gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP_PRIOR_SD ** -2, g.T @ v
     gy, vy = g.T @ y, v.T @ y
-    alone = 0.5 * gy ** 2 / gg - 0.5 * np.log(gg * usual ** 2) + log_ndtr(gy / np.sqrt(gg))
+    alone = compute_rise_evidence(gy / gg, gg ** -0.5, usual)
     left = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
     rest = gy[:, None] - gv * (vy / vv)
-    both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP_PRIOR_SD ** 2) + 0.5 * rest ** 2 / left
-            - 0.5 * np.log(left * usual[:, None] ** 2) + log_ndtr(rest / np.sqrt(left)))
+    both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP_PRIOR_SD ** 2)
+            + compute_rise_evidence(rest / left, left ** -0.5, usual[:, None]))
     rise = np.maximum(rest / left, 0.0)
     return alone, both, (vy - gv * rise) / vv

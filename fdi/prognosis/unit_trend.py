@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.diagnosis.faults import FAULTS, Estimate, Level
+from fdi.output import write_text
 from fdi.prognosis.trend import Trend, fit_trend
 from fdi.progress import Progress
 from fdi.sources import hash_sources
@@ -94,44 +95,45 @@ class Gathered(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Options(NamedTuple):
-    """How to gather."""
-
-    axis: str | None = None  # default: the first on which all traces have a place
-    table: Path | None = None  # default: dates.csv in the folder, if there is one
-    again: bool = False  # diagnose again what has been diagnosed before
-
-
-def gather_sizes(folder: Path, model: Model, options: Options, progress: Progress) -> Gathered:
+def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | None = None, table: Path | None = None,
+                 again: bool = False) -> Gathered:
     """Diagnose all traces of a folder and below.
+
+    Args:
+        folder: of one unit.
+        model: the unit as delivered.
+        progress: called with each stage and the share done, 0 to 1.
+        axis: of time; default the first on which all traces have a place.
+        table: of dates; default dates.csv in the folder, if there is one.
+        again: diagnose again what has been diagnosed before.
 
     Raises:
         InputError: no folder, no traces, no axis on which all of them have a place, or none that can be judged.
     """
-    place = options.table or folder / TABLE
-    table = read_dates_table(place) if options.table or place.is_file() else {}
+    place = table or folder / TABLE
+    dates = read_dates_table(place) if table or place.is_file() else {}
     notes: list[str] = []
     rows: dict[Path, Row] = {}
-    for file in list_traces(folder):
-        name = file.relative_to(folder).as_posix()
+    names = {file: file.relative_to(folder).as_posix() for file in list_traces(folder)}
+    for file, name in names.items():
         try:
-            rows[file] = _date_trace(folder, name, read_start_time(file, model, options.again), find_row(table, name))
+            rows[file] = _date_trace(folder, name, read_start_time(file, model, again), find_row(dates, name))
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
-    axis = _choose_axis(folder, rows, options.axis)  # before the work: a trace without a date is refused at once
-    notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in table.items()
-              if row not in [find_row(table, file.relative_to(folder).as_posix()) for file in rows]]
+    axis = _choose_axis(folder, rows, axis)  # before the work: a trace without a date is refused at once
+    listed = [find_row(dates, names[file]) for file in rows]
+    notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in dates.items()
+              if row not in listed]
     points = []
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
-        name = file.relative_to(folder).as_posix()
         try:
-            answer = diagnose_once(file, model, options.again)
+            answer = diagnose_once(file, model, again)
         except InputError as error:
-            notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
+            notes.append(f"{names[file]} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
         sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in FAULTS}
-        points.append(Point(name, row[list(AXES).index(axis)], sizes, answer["note"]))
+        points.append(Point(names[file], row[list(AXES).index(axis)], sizes, answer["note"]))
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
@@ -168,11 +170,12 @@ def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> 
     for axis in (wanted,) if wanted else AXES:
         if not without[axis]:
             return axis
-    missing = without[wanted or "date"][0]
-    if (wanted or "date") == "date":
-        raise InputError(missing, "date", "a start time in the log, an ISO date in the name of file or folder "
-                                          f"(2026-01-31), or a line in {folder / TABLE} (file,date)")
-    raise InputError(missing, str(wanted), f"a line in {folder / TABLE} with a column {wanted}")
+    missing = wanted or "date"
+    expected = f"a line in {folder / TABLE} with a column {missing}"
+    if missing == "date":
+        expected = ("a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
+                    f"{folder / TABLE} (file,date)")
+    raise InputError(without[missing][0], missing, expected)
 
 
 def read_start_time(file: Path, model: Model, again: bool = False) -> str:
@@ -181,10 +184,8 @@ def read_start_time(file: Path, model: Model, again: bool = False) -> str:
     Raises:
         InputError: a file that is not a trace.
     """
-    place = _find_answer_file(file, model)
-    if place.is_file() and not again:
-        return str(json.loads(place.read_text(encoding="utf-8"))["started"])
-    return Trace.read(file).provenance.get("started", "")
+    found = _read_answer(_find_answer_file(file, model), again)
+    return str(found["started"]) if found else Trace.read(file).provenance.get("started", "")
 
 
 def diagnose_once(file: Path, model: Model, again: bool = False) -> dict[str, Any]:
@@ -194,20 +195,25 @@ def diagnose_once(file: Path, model: Model, again: bool = False) -> dict[str, An
         InputError: a trace that cannot be judged; this answer is not stored.
     """
     place = _find_answer_file(file, model)
-    if place.is_file() and not again:
-        found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
-        return found
-    from fdi.diagnosis.diagnosis import diagnose
+    found = _read_answer(place, again)
+    if found is None:
+        from fdi.diagnosis.diagnosis import diagnose
 
-    trace = Trace.read(file)
-    d = diagnose(trace, model, source=str(file))
-    note = "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""
-    found = {"started": trace.provenance.get("started", ""), "sizes": {f.name: list(d.sizes[f.name]) for f in FAULTS},
-             "note": note}
-    place.parent.mkdir(parents=True, exist_ok=True)
-    half = place.with_suffix(f".{hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:8]}")
-    half.write_text(json.dumps(found), encoding="utf-8")
-    half.replace(place)  # whole or not at all
+        trace = Trace.read(file)
+        d = diagnose(trace, model, source=str(file))
+        found = {"started": trace.provenance.get("started", ""),
+                 "sizes": {name: list(size) for name, size in d.sizes.items()},
+                 "note": "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""}
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_text(place, json.dumps(found), "the cache of answers")
+    return found
+
+
+def _read_answer(place: Path, again: bool) -> dict[str, Any] | None:
+    """The answer stored there; None if there is none, or it is not wanted again."""
+    if again or not place.is_file():
+        return None
+    found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
     return found
 
 

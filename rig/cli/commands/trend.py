@@ -46,7 +46,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def follow_traces(args: argparse.Namespace) -> UnitTrend:
     """The trends of the traces in a folder, or of the points in the JSON file of an earlier answer."""
-    from fdi.prognosis.unit_trend import Options, follow_unit, gather_sizes, read_points
+    from fdi.prognosis.unit_trend import follow_unit, gather_sizes, read_points
     from rig.cli.progress_bar import show_progress
 
     model, source = options.load_chosen_model(args), Path(args.folder)
@@ -54,7 +54,7 @@ def follow_traces(args: argparse.Namespace) -> UnitTrend:
         if source.suffix == ".json" and not source.is_dir():
             return follow_unit(read_points(source))
         table = None if args.dates is None else Path(args.dates)
-        return follow_unit(gather_sizes(source, model, Options(args.axis, table, args.again), progress))
+        return follow_unit(gather_sizes(source, model, progress, args.axis, table, args.again))
 
 
 def write_file(unit: UnitTrend, report: Report, out: Path) -> None:
