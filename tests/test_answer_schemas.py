@@ -17,7 +17,7 @@ from places import ROOT
 from rig_command import rig
 from short_runs import HIDDEN, list_trace_arguments, write_measured_runs
 
-from rig.cli.command_list import HELP_OF_COMMAND
+from rig.cli.command_list import COMMANDS
 
 PAGE = (ROOT / "docs" / "json.md").read_text()
 SCHEMAS = load_schemas()
@@ -58,7 +58,7 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
 
 
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
-    words = [[command] for command in HELP_OF_COMMAND] + [["bench", kind] for kind in KINDS_OF_BENCH]
+    words = [[command] for command in COMMANDS] + [["bench", kind] for kind in KINDS_OF_BENCH]
     more = {"common.json", "fdi_learn_bands.json", "suite.json"}
     assert {name_schema(each) for each in words} | more == set(SCHEMAS)
     assert name_schema(["bench", "--json"]) == "bench.json"

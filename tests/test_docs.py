@@ -22,7 +22,7 @@ from plant.parameters import GROUPS
 from plant.quantity import list_quantities
 from plant.state import Input, Ports, State
 from rig.cli import main
-from rig.cli.command_list import HELP_OF_COMMAND
+from rig.cli.command_list import COMMANDS
 from rig.sequences import faults
 from rig.sequences.checks import KEYS, Guard
 from rig.sequences.python_parts import Step
@@ -102,7 +102,7 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
 
 def test_the_readme_names_only_commands_that_exist_and_all_of_them() -> None:
     typed = re.findall(r"\brig ([a-z]+)\b", "\n".join(indented_blocks(README)))
-    assert {*typed, *re.findall(r"`rig ([a-z]+)", README)} == set(HELP_OF_COMMAND)
+    assert {*typed, *re.findall(r"`rig ([a-z]+)", README)} == set(COMMANDS)
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))

@@ -16,7 +16,7 @@ from reference_pages import write_reference
 
 from plant.model import list_offered_effects
 from plant.plants import list_plants
-from rig.cli.command_list import HELP_OF_COMMAND
+from rig.cli.command_list import COMMANDS
 from rig.conformance.run_cases import CASES
 from rig.sequences import faults
 from rig.sequences.checks import KINDS
@@ -48,7 +48,7 @@ def test_every_page_is_in_the_navigation(reference: Path) -> None:
     assert [part["title"] for part in NAVIGATION] == ["Tutorial", "How-to", "Reference", "Explanation"]
 
 
-@pytest.mark.parametrize("command", HELP_OF_COMMAND)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_the_page_of_a_command_has_what_its_help_has(
         command: str, reference: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from rig.cli.main import main

@@ -4,28 +4,27 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import Any
 
 from markdown_text import MADE, escape_markup, make_contents, make_table, name_anchor, quote_code
 
-from rig.cli.command_list import HELP_OF_COMMAND
-from rig.cli.main import build_parser
+from rig.cli.command_list import COMMANDS
+from rig.cli.main import build_command_parser
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "schema"
 
 
 def write_command_list() -> list[str]:
     """The page that lists the commands."""
-    rows = [(f"[rig {name}](commands/{name}.md)", escape_markup(text)) for name, text in HELP_OF_COMMAND.items()]
+    rows = [(f"[rig {name}](commands/{name}.md)", escape_markup(command.help)) for name, command in COMMANDS.items()]
     return ["# Options of the commands", "", MADE, *make_table(("command", "purpose"), rows),
             "Every command takes `--json`, `--out`, `--quiet` and `--help`. Examples are in "
             "[the commands, with examples](../docs/commands.md).", "",
-            *make_contents(f"commands/{name}" for name in HELP_OF_COMMAND)]
+            *make_contents(f"commands/{name}" for name in COMMANDS)]
 
 
 def write_command_page(name: str) -> list[str]:
     """The page of one command: usage, arguments and options, as its parser has them."""
-    parser = find_command_parser(name)
+    parser = build_command_parser(name)
     formatter = argparse.HelpFormatter(parser.prog, width=84)  # so wide are the pages
     formatter.add_usage(parser.usage, parser._actions, parser._mutually_exclusive_groups)
     usage = re.sub("^(usage: | {7})", "", formatter.format_help(), flags=re.MULTILINE)
@@ -42,15 +41,6 @@ def write_command_page(name: str) -> list[str]:
     links = ["[Examples](../../docs/commands.md)"]
     links += [f"[keys of {stem}.json](../json.md#{name_anchor('json', stem)})" for stem in stems]
     return [*lines, "", "See also: " + ", ".join(links) + "."]
-
-
-def find_command_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of one command, with its options."""
-    parser = build_parser()
-    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    command: Any = commands.choices[name]
-    command._load()  # otherwise done when a command line is parsed
-    return command  # type: ignore[no-any-return]
 
 
 def name_action(action: argparse.Action) -> str:

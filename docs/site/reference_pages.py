@@ -10,7 +10,7 @@ from json_page import write_json_page
 from python_page import write_python_page
 from sequence_page import write_sequence_page
 
-from rig.cli.command_list import HELP_OF_COMMAND
+from rig.cli.command_list import COMMANDS
 
 
 def write_reference(folder: Path) -> None:
@@ -19,6 +19,6 @@ def write_reference(folder: Path) -> None:
     pages = {"json": write_json_page(), "sequences": write_sequence_page(), "effects": write_effect_page(),
              "parameters": write_parameter_page(), "conformance": write_conformance_page(),
              "python": write_python_page(), "commands": write_command_list(),
-             **{f"commands/{name}": write_command_page(name) for name in HELP_OF_COMMAND}}
+             **{f"commands/{name}": write_command_page(name) for name in COMMANDS}}
     for name, lines in pages.items():
         (folder / f"{name}.md").write_text("\n".join(lines) + "\n")

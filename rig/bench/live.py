@@ -36,8 +36,7 @@ from rig.network.clock import WallClock
 from rig.network.raw_bus import can_open
 from rig.run.hard_loop import compile_cycle
 from rig.run.priority import list_cpus
-from rig.view.live_feeder import make_viewer_command
-from rig.view.viewer import find_free_port, is_listening, kill_viewer
+from rig.view.viewer import find_free_port, is_listening, kill_viewer, make_viewer_command
 
 Seconds = NDArray[np.float64]
 WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"

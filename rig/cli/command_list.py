@@ -1,37 +1,309 @@
-"""The commands of `rig` and their one-line helps: `rig --help` shows them without importing a command."""
+"""The commands of `rig` as data: help and options. Neither `rig --help` nor a completion imports what does the work.
+
+The module `rig.cli.commands.NAME` does the work of a command; its function `run_command` returns the exit status.
+"""
 from __future__ import annotations
 
-import importlib
+import argparse
 import keyword
-from types import ModuleType
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
 
-HELP_OF_COMMAND = {
-    "add": "add effects to a model, fit it, and show the error before and after",
-    "bench": "measure speed, real time, bus faults, long recordings, robustness, or how often rig explain is right",
-    "campaign": "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
-    "check": "dry run of a sequence: its command against travel, speed and current, checks on the predicted run",
-    "compare": "compare a model with a measured trace: how large the error is, where, when and in which block",
-    "conformance": "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
-    "diff": "compare two or more runs: signals, checks, timing, model, firmware",
-    "doctor": "report what this machine can do: CAN, vcan, real-time rights, viewer",
-    "effects": "list the catalogue of physical effects, or show one in detail",
-    "explain": "find the physical effects that a model lacks, and rank the candidates",
-    "export": "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
-    "fdi": "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
-    "identify": "find the parameters of your actuator from its runs, with intervals, and what the runs do not show",
-    "import": "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
-    "list": "list the names that other commands take: parameters, signals, sequences, effects, checks or models",
-    "node": "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",
-    "recover": "recover a log whose writer was killed: keep all up to the last intact chunk and rebuild the index",
-    "remove": "remove an effect from a model file; with a TRACE, refit and show how the error grows",
-    "report": "write one HTML file about a trace; it needs no network",
-    "run": "run a test sequence on the bench: log, checks, verdict",
-    "simulate": "run a model on a command and write a trace",
-    "trend": "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
-    "view": "open the rerun viewer on a trace, or save its recording or a picture of it",
+from rig.cli.options import (
+    ANY_TRACE,
+    FORCE,
+    JUNIT,
+    MEASURED_TRACE,
+    MODEL,
+    PLANT,
+    REPEAT,
+    RUNS,
+    SEED_IF_GIVEN,
+    SIGNALS,
+    Group,
+    Option,
+    offer_page,
+    option,
+    parse_count,
+    parse_whole_number,
+)
+from rig.run.choices import CONTROLLERS, PACES, PLANTS
+
+LIVE_ON_TERMINAL = "terminal"  # --live without a word
+
+
+class Command(NamedTuple):
+    """A command: its line in `rig --help`, what becomes of its results, and its options beside those of all."""
+
+    help: str
+    result: str
+    options: Sequence[Option | Group]
+
+
+def find_work(name: str) -> Callable[[Any], int]:
+    """Import the module of a command; give the function that does its work."""
+    module = import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")
+    work: Callable[[Any], int] = module.run_command
+    return work
+
+
+COMMANDS = {
+    "add": Command(
+        "add effects to a model, fit it, and show the error before and after",
+        "The model goes to --out (default: that of --model, else model.toml). Exit status 0 if the effects help.",
+        (option("words", nargs="+", metavar="EFFECT|TRACE",
+                help="effects to add, and the measured run to fit (default: the run that the model file was fitted "
+                     "to)"),
+         option("--trace", metavar="TRACE", help="same as the positional TRACE"), *RUNS, *MODEL)),
+    "bench": Command(
+        "measure the speed of the plant, the cycle in real time, the live screen, or the cost of long recordings",
+        "Without an argument: the speed of the plant, compared with C.",
+        (option("what", nargs="?", default="plant", choices=("plant", "realtime", "live", "recordings"),
+                help="plant: speed of the plant, compared with C (default); realtime: lateness and response of the "
+                     "cycle, compared with cyclictest and C; live: the same with and without rig run --live; "
+                     "recordings: CPU time and memory of compare, explain and fdi by length of the recording"),
+         option("--accuracy", action="store_true",
+                help="also the error of the default step size and of others, against 0.2 us (half a minute)"),
+         Group("rig bench realtime, rig bench live", (
+             option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+                    help="socketcan:vcan0 or udp_multicast:GROUP (default: a UDP group of its own)"),
+             option("--seconds", type=float, default=60.0, metavar="S",
+                    help="time of measurement for each row of the table (default: 60)"),
+             option("--blocks", type=int, default=6, metavar="N",
+                    help="alternating blocks into which this time is divided (default: 6)"))),
+         Group("rig bench recordings", (
+             option("--lengths", default="13.5,60,300,1800", metavar="S,S,..",
+                    help="lengths of the recordings, s (default: 13.5,60,300,1800)"),)))),
+    "campaign": Command(
+        "judge a matrix of simulated faults, or a folder of traces, on all cores or a cluster",
+        "results.parquet, summary.json and detection.svg go to the folder --out (default: campaigns/NAME).",
+        (option("what", nargs="?", metavar="MATRIX.toml|FOLDER",
+                help="a matrix file, a shipped matrix by name (statistics), a folder of traces, or the folder of a "
+                     "campaign to resume"),
+         option("--summary", action="store_true", help="run nothing; summarise the finished cases"),
+         option("--scheduler", metavar="ADDRESS", help="use the workers of the Dask cluster at tcp://HOST:PORT"),
+         option("--jobs", type=parse_count, metavar="N",
+                help="processes on this machine (default: one per core)"),
+         option("--most", type=parse_count, metavar="N", help="stop after the first N cases (a fair sample of all)"),
+         option("--again", action="store_true", help="judge failed cases once more"),
+         Group("the matrix", (
+             option("--fault", action="append", default=[], metavar="EFFECT=SIZE,..",
+                    help="cases: healthy; EFFECT=SIZE,SIZE,..; or two faults in one plant, EFFECT=SIZE/EFFECT=SIZE "
+                         "(repeatable)"),
+             option("--seeds", type=parse_whole_number, metavar="N", help="runs of each size (default 20)"),
+             option("--seed", type=parse_whole_number, metavar="N", help="seed of the first run (default 0)"),
+             option("--tolerance", metavar="X,..",
+                    help="standard deviation of the base parameters, relative (default 0.015)"),
+             option("--simulator", metavar="MODULE:FUNCTION",
+                    help="function that simulates a unit (rig.campaign.units.Unit) instead of the plant model"),
+             option("--signals", metavar="xj,p12,xs", help="what is measured (default: all three)"),
+             option("--model", metavar="FILE|NAME", help="the healthy plant (default eha)"),
+             option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
+                    help="change a parameter of this plant (repeatable)"),
+             option("--work", default="fdi", metavar="MODULE:FUNCTION",
+                    help="function that judges a case instead of rig fdi"))))),
+    "check": Command(
+        "dry run of a sequence: its command against travel, speed and current, checks on the predicted run",
+        "Nothing is opened and nothing moves. Exit status 1 if a limit is violated; --out FILE.html has a picture.",
+        (option("sequence", metavar="SEQUENCE", help="test sequence: a .toml file, or the name of a shipped one"),
+         *MODEL)),
+    "compare": Command(
+        "compare a model with a measured trace: how large the error is, where, when and in which block",
+        "Exit status 0 if the residual is noise, 1 otherwise.",
+        (option("trace", metavar="TRACE", help=MEASURED_TRACE), *MODEL, REPEAT, SIGNALS, offer_page("compare.html"))),
+    "conformance": Command(
+        "test a CANopen node against CiA 301 and its EDS: numbered tests, JUnit, HTML, JSON",
+        "Exit status 1 if a test failed, 3 if none failed and some times could not be measured.",
+        (option("node", metavar="NODE",
+                help="node-ID of a node on the bus, 1 to 127; or plant, controller or c (the controller in C): our "
+                     "own, started by this command"),
+         option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+                help="for example socketcan:can0 or udp_multicast; our own nodes also run on the embedded bus "
+                     "(default)"),
+         option("--eds", type=Path, metavar="FILE",
+                help="electronic data sheet of the node (our own nodes have theirs)"),
+         option("--chapter", action="append", default=[], metavar="N[.M]",
+                help="only this chapter or test (repeatable)"),
+         option("--write", action="store_true",
+                help="also change values of manufacturer and profile objects, and set them back (always for our own "
+                     "nodes)"),
+         option("--tolerance", type=float, default=20.0, metavar="MS",
+                help="added to each time limit, for the delay of this machine (default 20)"),
+         option("--timeout", type=float, default=1.0, metavar="S", help="longest wait for an SDO response (default 1)"),
+         JUNIT)),
+    "diff": Command(
+        "compare two or more runs: signals, checks, timing, model, firmware",
+        "Exit status 0 if noise explains all differences and no check changed, 1 otherwise.",
+        (option("trace", metavar="A", help=f"the reference: {ANY_TRACE}"),
+         option("others", metavar="B", nargs="+", help="a run to compare with the reference (repeatable)"),
+         offer_page("diff.html", "the first B"))),
+    "doctor": Command(
+        "report what this machine can do: CAN, vcan, real-time rights, viewer",
+        "Exit status 1 if the embedded bench cannot run here.",
+        (option("--seconds", type=float, default=1.0, metavar="S",
+                help="duration of each timer measurement; 0: no measurement (default 1)"),)),
+    "effects": Command(
+        "list the catalogue of physical effects, or show one in detail",
+        "An effect of --effects, or any with --test, is also tested: exit status 1 if it fails.",
+        (option("name", nargs="?", metavar="NAME", help="show this effect in detail (default: list all)"),
+         option("--model", metavar="FILE|NAME", default="eha", help="list the effects of this plant (default eha)"),
+         option("--effects", action="append", default=[], type=Path, metavar="FILE.py",
+                help="your own effects (repeatable); one that is shown is tested as well"),
+         option("--test", action="store_true",
+                help="test the effect, or all of them, on the preflight command; exit status 1 for a fault"))),
+    "explain": Command(
+        "find the physical effects that a model lacks, and rank the candidates",
+        "Exit status 0 if nothing is missing, 1 otherwise.",
+        (option("trace", metavar="TRACE", help=MEASURED_TRACE), *RUNS, *MODEL,
+         option("--write-effect", metavar="FILE.py",
+                help="write the law of the residual as an effect to add; where no law holds, its shape, to edit (with "
+                     "--out FILE.html a law that holds is written beside it, as FILE_law.py)"),
+         offer_page("explain.html"))),
+    "export": Command(
+        "write a trace in another format: .csv, .csv.gz (signals), .log, .blf, .asc, .trc (raw frames)",
+        "The suffix of --out chooses the format.",
+        (option("trace", metavar="TRACE", help=ANY_TRACE),
+         option("--all", action="store_true", help="also export the signals of set-up and clean-up"), FORCE)),
+    "fdi": Command(
+        "judge filter clogging and spool friction from a trace: levels, sizes with intervals, other deviations",
+        "Exit status 0 if both faults are acceptable, 1 otherwise. --learn-bands makes bands instead.",
+        (option("trace", metavar="TRACE", nargs="?", help=MEASURED_TRACE), *MODEL,
+         option("--bands", metavar="FILE",
+                help="bands to judge by (default: the shipped ones, for the preflight command)"),
+         option("--with-effects", action="store_true",
+                help="search the catalogue for what else is wrong, and size both faults beside it (half a minute of "
+                     "computing more, two minutes where the search is hard)"),
+         option("--learn-bands", nargs="*", metavar="TRACE",
+                help="make bands from healthy traces of a fleet and write them to --out FILE.toml; without traces, "
+                     "from simulated units"),
+         option("--command", dest="command_file", metavar="FILE",
+                help="command that --learn-bands simulates: CSV with t,com (default: the main phase of preflight)"))),
+    "identify": Command(
+        "find the parameters of your actuator from its runs, with intervals, and what the runs do not show",
+        "The model goes to --out (default: identified.toml). Exit status 0 if every free parameter is identified.",
+        (option("runs", nargs="+", metavar="RUN", help=f"runs to fit, of any commands: {MEASURED_TRACE}"),
+         option("--holdout", action="append", default=[], metavar="RUN",
+                help="a run that no fit sees: shows whether the model holds (repeatable)"),
+         option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that every run to fit has)"),
+         *MODEL)),
+    "import": Command(
+        "make a trace.mcap from a recording: CSV, MF4, MAT, Parquet, CAN log; --guess writes the map it needs",
+        "The log goes to --out (default: FILE with .mcap in place of its suffix).",
+        (option("file", metavar="FILE",
+                help="a recording: .csv or other text, .mf4, .mat, .parquet, .mcap, or a CAN log: .log (candump), "
+                     ".blf, .asc, .trc"),
+         option("--map", metavar="MAP.toml",
+                help="which column is which signal, in which unit (default: a CSV has our own columns, a CAN log our "
+                     "own frames)"),
+         option("--guess", action="store_true",
+                help="write a first map (FILE.map.toml, or --out), with its reasons"),
+         option("--force", action="store_true", help="let --guess replace a map that exists"),
+         option("--dbc", metavar="FILE", help="DBC that decodes the raw frames (default: the shipped eha.dbc)"))),
+    "list": Command(
+        "list the names that other commands take: parameters, signals, sequences, effects, checks or models",
+        "Names come with unit, range and default.",
+        (option("kind", choices=("parameters", "signals", "sequences", "effects", "checks", "models"), metavar="KIND",
+                help="one of: parameters, signals, sequences, effects, checks, models"),
+         option("word", nargs="?", default="", metavar="WORD", help="only names that contain this word"), *MODEL)),
+    "node": Command(
+        "run the plant emulator or the reference firmware alone on a CAN bus, opposite a rig or real hardware",
+        "It runs until Ctrl-C or SIGTERM ends it, then reports the frames that it lost.",
+        (option("node", choices=("plant", "controller"),
+                help="plant: the plant emulator, CANopen node 3; controller: the reference firmware of the "
+                     "controller, CANopen node 2"),
+         option("--bus", default="auto", metavar="INTERFACE:CHANNEL",
+                help="the bus to join: socketcan:can0 is a CAN interface, udp_multicast works between programs on "
+                     "this machine (needed, unless EHA_RIG_BUS names a bus)"),
+         option("--parent", type=int, default=0, help=argparse.SUPPRESS),  # the node ends when this process ends
+         Group("model", MODEL, "The emulator simulates it and the firmware takes its gains from it, until a rig on "
+                               "the bus loads another. The bench drives servovalves: ehs and servo are refused."))),
+    "recover": Command(
+        "recover a log whose writer was killed: keep all up to the last intact chunk and rebuild the index",
+        "The log goes to --out (default: FILE with .recovered before its suffix).",
+        (option("file", metavar="FILE", help="the trace.mcap whose writer died"),)),
+    "remove": Command(
+        "remove an effect from a model file; with a TRACE, refit and show how the error grows",
+        "The model goes to --out (default: the file of --model, in place).",
+        (option("words", nargs="+", metavar="EFFECT|TRACE",
+                help="the effect, and the measured run to fit the rest to"),
+         option("--trace", metavar="TRACE", help="same as the positional TRACE"), *RUNS, *MODEL)),
+    "report": Command(
+        "write one HTML file about a trace; it needs no network",
+        "The page goes to --out (default: report.html beside the trace).",
+        (option("trace", metavar="TRACE", help=ANY_TRACE),)),
+    "run": Command(
+        "run a test sequence on the bench: log, checks, verdict",
+        "Results go to the folder --out (default: a new one in runs/). Exit status 0 if no check failed.",
+        (option("sequence", nargs="*", metavar="SEQUENCE",
+                help="test sequence: a .toml file, or the name of a shipped one (default: preflight). Several, or a "
+                     "suite file, run on all cores and end in one report (docs/suite.md)"),
+         *PLANT, SEED_IF_GIVEN,
+         option("--bus", default="auto", metavar="auto|embedded|INTERFACE:CHANNEL",
+                help="auto: that of EHA_RIG_BUS, else the embedded one (default); embedded: in this process; or "
+                     "socketcan:can0, udp_multicast, ..."),
+         option("--pace", choices=PACES,
+                help="lockstep: virtual time, bit-reproducible (default); realtime: wall-clock time"),
+         option("--controller", choices=CONTROLLERS,
+                help="firmware of node 2: the reference firmware in Python (builtin, default) or in C (c: compiled "
+                     "and started here), or your own on the bus (external)"),
+         option("--plant", choices=PLANTS,
+                help="plant of node 3: auto uses the emulator that answers on the bus, else starts one (default)"),
+         option("--max-overruns", type=float, metavar="FRACTION",
+                help="largest share of overruns in a real-time run; more make its timing invalid (default: that of "
+                     "the sequence, 0.001)"),
+         option("--fdi", action="store_true",
+                help="also diagnose the servovalve like rig fdi, against a nominal unit"),
+         JUNIT,
+         option("--jobs", type=parse_count, metavar="N",
+                help="runs at a time of several sequences or a suite (default: all cores; 1 in real time or on a CAN "
+                     "bus)"),
+         option("--live", nargs="?", const=LIVE_ON_TERMINAL, metavar="rerun[:PORT|:FILE.rrd]",
+                help="show the run while it runs: nodes, command and position, checks, timing; without a terminal a "
+                     "line every 2 s. rerun: in the viewer's window, in an open viewer at a port of 127.0.0.1, or "
+                     "into a file"),
+         option("--from", dest="source", type=Path, metavar="trace.mcap",
+                help="repeat the run recorded in this log"))),
+    "simulate": Command(
+        "run a model on a command and write a trace",
+        "Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv).",
+        (*MODEL,
+         option("--command", dest="command_file", metavar="FILE",
+                help="CSV with t,com and optionally load (default: the main phase of preflight). Of rows at most 1 ms "
+                     "apart a cycle takes the latest; others are joined by straight lines"),
+         FORCE,
+         option("--samples", action="store_true",
+                help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv of "
+                     "another command, into the folder --out (default: here); the recorded unit has two effects that "
+                     "the nominal model lacks"),
+         option("--steps", type=parse_whole_number, metavar="N", help="steps of the plant per cycle (default 100)"))),
+    "trend": Command(
+        "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
+        "Exit status 0 if both faults are within MidBand at the last trace, 1 otherwise.",
+        (option("folder", nargs="?", metavar="FOLDER",
+                help="traces of one unit, dated by their logs, names or dates.csv; or the JSON file of an earlier "
+                     "answer"),
+         *MODEL,
+         option("--axis", choices=("date", "hours", "flights"),
+                help="time axis of the trend (default: the first of these that all traces have)"),
+         option("--dates", metavar="FILE.csv",
+                help="table file,date[,hours][,flights] (default: dates.csv in the folder)"),
+         option("--again", action="store_true", help="diagnose every trace again, even if its sizes are stored"))),
+    "view": Command(
+        "open the rerun viewer on a trace, or save its recording or a picture of it",
+        "The viewer listens on 127.0.0.1 only.",
+        (option("trace", metavar="TRACE", help=ANY_TRACE),
+         option("others", metavar="B", nargs="*",
+                help="runs to draw over it and to subtract it from, as rig diff does"),
+         option("--compare", action="store_true",
+                help="the trace beside the model's replay, with residual and noise floor, as rig compare does; if "
+                     "--model or --set adds effects or values, before and after that"),
+         Group("with --compare", (*PLANT, SEED_IF_GIVEN, REPEAT, SIGNALS)),
+         option("--save", metavar="FILE.rrd", help="write the recording of the viewer and do not open it"),
+         option("--theme", choices=("light", "dark"),
+                help="show it in a web browser in this theme until Ctrl-C (the viewer's window has a setting for it)"),
+         option("--headless", action="store_true", help="open no window (together with --screenshot)"),
+         option("--screenshot", metavar="FILE.png",
+                help="draw without a display, check that every view shows its lines, and save the picture"))),
 }
-
-
-def import_command(name: str) -> ModuleType:
-    """Import the module of a command: `add_arguments(parser)` and `run_command(args)`, which returns the status."""
-    return importlib.import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")

@@ -1,16 +1,17 @@
 """Completion in the shell by argcomplete: commands, options, and the names that options take.
 
-The shell calls `rig` with the line typed so far in its environment. Only the command on that line is imported. Without
-the package (extra "shell") nothing happens.
+The shell calls `rig` with the line typed so far in its environment. Without the package (extra "shell") nothing
+happens.
 """
 from __future__ import annotations
 
 import argparse
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
-from rig.cli.command_list import HELP_OF_COMMAND, import_command
+from rig.cli.main import build_parser
 
 
 def complete_line() -> None:
@@ -23,31 +24,17 @@ def complete_line() -> None:
 
 
 def build_completion_parser(line: str) -> argparse.ArgumentParser:
-    """The parser of the commands with the options of the one on the line."""
-    words = line.split()
-    chosen = words[1] if len(words) > 1 else ""
-    parser = argparse.ArgumentParser(prog="rig")
-    parser.add_argument("--version", action="store_true")
-    commands = parser.add_subparsers(dest="command")
-    for name, text in HELP_OF_COMMAND.items():
-        command = commands.add_parser(name, help=text)
-        if name == chosen:
-            import_command(name).add_arguments(command)
-            command.add_argument("--json", action="store_true")
-            command.add_argument("--out")
-            command.add_argument("--quiet", action="store_true")
-            _add_completers(command, name)
-    return parser
-
-
-def _add_completers(command: argparse.ArgumentParser, name: str) -> None:
-    """Tell argcomplete, by an attribute of each action, which names an option or argument takes."""
+    """The parser of `rig` with the options of the command on the line, and how argcomplete completes their values."""
+    name = [*line.split(), "", ""][1]
+    parser = build_parser(name)
+    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     own = {"set": complete_parameter, "model": complete_model, "sequence": complete_sequence}
-    for action in command._actions:
+    for action in commands.choices[name]._actions if name in commands.choices else ():
         if action.dest in own:
-            action.completer = own[action.dest]  # type: ignore[attr-defined]
+            action.completer = own[action.dest]
         elif name in ("add", "remove", "effects") and not action.option_strings:
-            action.completer = complete_effect  # type: ignore[attr-defined]
+            action.completer = complete_effect
+    return parser
 
 
 def complete_parameter(prefix: str, **_: Any) -> Iterable[str]:
@@ -69,12 +56,9 @@ def complete_model(prefix: str, **_: Any) -> Iterable[str]:
 
 def complete_sequence(prefix: str, **_: Any) -> Iterable[str]:
     """Shipped sequences and sequence files."""
-    from importlib.resources import files
-    from pathlib import Path
+    from rig.cli.inputs import list_shipped_sequences
 
-    entries = (entry.name for entry in files("rig.sequences").iterdir())
-    shipped = sorted(Path(name).stem for name in entries if name.endswith(".toml"))
-    return [name for name in shipped if name.startswith(prefix)] + _list_files(prefix, (".toml",))
+    return [name for name in list_shipped_sequences() if name.startswith(prefix)] + _list_files(prefix, (".toml",))
 
 
 def complete_effect(prefix: str, **_: Any) -> Iterable[str]:
@@ -87,8 +71,6 @@ def complete_effect(prefix: str, **_: Any) -> Iterable[str]:
 
 def _list_files(prefix: str, suffixes: tuple[str, ...]) -> list[str]:
     """Folders and files of these suffixes that begin with what was typed."""
-    from pathlib import Path
-
     folder = Path(prefix).parent if not prefix.endswith("/") else Path(prefix)
     if not folder.is_dir():
         return []

@@ -1,43 +1,39 @@
-"""The options that have the same meaning in every command, and the values they stand for."""
+"""Options as data: what every command has in common, options that several commands share, and types of values."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from plant.errors import InputError
-
-if TYPE_CHECKING:
-    from plant.model import Model
+from typing import Any, NamedTuple
 
 
-def add_model_options(parser: argparse._ActionsContainer) -> None:
-    """Add --model, --set, --effects and --seed, which choose the plant, to a parser or to a group of its options."""
-    add = parser.add_argument
-    add("--model", metavar="FILE|NAME",
-        help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)")
-    add("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
-        help="change a parameter of the model or of an effect, SI units (repeatable)")
-    add("--effects", action="append", default=[], type=Path, metavar="FILE.py", help="your own effects (repeatable)")
-    add_trust_option(parser)
-    add_seed_option(parser)
+class Option(NamedTuple):
+    """An option or argument: its names, and its settings as argparse takes them."""
+
+    names: tuple[str, ...]
+    settings: Mapping[str, Any]
 
 
-def add_trust_option(parser: argparse._ActionsContainer) -> None:
-    """Add --trust."""
-    parser.add_argument("--trust", action="store_true",
-                        help="run the code that a log or a model file brings along; it is listed first, with its hash")
+class Group(NamedTuple):
+    """Options with a heading of their own in the help."""
+
+    title: str
+    options: Sequence[Option]
+    description: str | None = None
 
 
-def add_seed_option(parser: argparse._ActionsContainer) -> None:
-    """Add --seed."""
-    parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
+def option(*names: str, **settings: Any) -> Option:
+    """Declare an option or argument."""
+    return Option(names, settings)
 
 
-def add_force_option(parser: argparse.ArgumentParser) -> None:
-    """Add --force."""
-    parser.add_argument("--force", action="store_true", help="replace the file of --out if there is one")
+def add_options(parser: argparse._ActionsContainer, options: Sequence[Option | Group]) -> None:
+    """Add options to a parser."""
+    for each in options:
+        if isinstance(each, Group):
+            add_options(parser.add_argument_group(each.title, each.description), each.options)
+        else:
+            parser.add_argument(*each.names, **each.settings)
 
 
 def parse_whole_number(text: str) -> int:
@@ -60,74 +56,34 @@ def _parse_integer(text: str, least: int) -> int:
     return value
 
 
-def parse_changes(pairs: list[str]) -> dict[str, str]:
-    """Parse the --set options: "GROUP.FIELD" to value.
-
-    Raises:
-        InputError: an option that is not GROUP.FIELD=VALUE.
-    """
-    table: dict[str, str] = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not (equals and value and "." in name):
-            raise InputError("--set", pair, "GROUP.FIELD=VALUE, such as spool.static_friction=35")
-        table[name.strip()] = value.strip()
-    return table
-
-
-def load_chosen_model(args: argparse.Namespace) -> Model:
-    """Load the model that --model, --set and --effects describe.
-
-    Raises:
-        InputError: a file, name or value that is invalid, or a model file with code that --trust does not allow.
-    """
-    from plant.model import load_model
-
-    load_chosen_effects(args, args.model)
-    return load_model(args.model or "eha").replace(parse_changes(args.set))
-
-
-def load_chosen_effects(args: argparse.Namespace, model: str | None) -> tuple[Path, ...]:
-    """Add the user's own effects to the catalogue: the files of --effects and, with --trust, those of a model file.
-
-    Returns:
-        All these files.
-
-    Raises:
-        InputError: an invalid file, code that --trust does not allow, or two files of one name.
-    """
-    load_user_effects(args.effects)
-    return (*args.effects, *load_effects_of_model(args, model))
+OF_EVERY_COMMAND = (
+    option("--json", action="store_true", help="print one JSON object on standard output, nothing else"),
+    option("--out", metavar="PATH", help="where to write the result"),
+    option("--quiet", action="store_true", help="print nothing but errors"))
+ANY_TRACE = "trace.mcap, the folder of a run, or a CSV"
+MEASURED_TRACE = f"{ANY_TRACE} with t,com,xj,cor[,p12,xs,load]"
+PLANT = (
+    option("--model", metavar="FILE|NAME",
+           help="model file, or a shipped model: eha (default), ehs (pump-driven servo), servo (the same, a real one)"),
+    option("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE",
+           help="change a parameter of the model or of an effect, SI units (repeatable)"),
+    option("--effects", action="append", default=[], type=Path, metavar="FILE.py",
+           help="your own effects (repeatable)"),
+    option("--trust", action="store_true",
+           help="run the code that a log or a model file brings along; it is listed first, with its hash"))
+SEED = option("--seed", type=parse_whole_number, default=0, metavar="N", help="seed of the noise (default 0)")
+SEED_IF_GIVEN = option("--seed", **{**SEED.settings, "default": None})  # so that one that is given is noticed
+MODEL = (*PLANT, SEED)
+REPEAT = option("--repeat", action="append", default=[], metavar="TRACE",
+                help="another run of the same command: measures the noise floor (repeatable)")
+SIGNALS = option("--signals", metavar="xj,p12,xs", help="signals to use (default: all that the trace has)")
+RUNS = (REPEAT, option("--holdout", metavar="TRACE", help="a run of another command that no fit sees: reveals "
+                                                          "overfitting"), SIGNALS)
+FORCE = option("--force", action="store_true", help="replace the file of --out if there is one")
+JUNIT = option("--junit", metavar="FILE.xml", help="also write the results as JUnit XML, for build servers")
 
 
-def load_effects_of_model(args: argparse.Namespace, model: str | None) -> tuple[Path, ...]:
-    """Add the effects of the files that a model file names to the catalogue, if --trust allows it.
-
-    Returns:
-        These files, without those that --effects replaces.
-
-    Raises:
-        InputError: an invalid file, code that --trust does not allow, or a file of the same name as another.
-    """
-    if model is None or not Path(model).is_file():
-        return ()
-    from fdi import foreign_code
-
-    files = foreign_code.load_effects_of_model(model, args.effects, is_trusted=args.trust)
-    foreign_code.require_different_names((*args.effects, *files))
-    return files
-
-
-def load_user_effects(files: Sequence[Path]) -> None:
-    """Add the effects of files that the user names to the catalogue.
-
-    Raises:
-        InputError: an invalid file, or two files of one name.
-    """
-    if files:
-        from fdi.foreign_code import require_different_names
-        from plant.effects import load_effects
-
-        require_different_names(files)
-        for file in files:
-            load_effects(file)
+def offer_page(name: str, place: str = "the trace") -> Option:
+    """Declare --report, which writes a page of this name."""
+    return option("--report", action="store_true", help=f"write a page with pictures, {name} beside {place}, or where "
+                                                        "--out FILE.html says")

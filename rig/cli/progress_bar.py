@@ -10,28 +10,25 @@ from fdi.progress import Progress, ignore_progress
 
 
 @contextlib.contextmanager
-def show_progress(*, is_silent: bool, is_realtime: bool = False, delay: float = 2.0) -> Iterator[Progress]:
+def show_progress(*, is_silent: bool, is_realtime: bool = False) -> Iterator[Progress]:
     """Give a `Progress` whose calls move a bar on standard error; the bar disappears at the end.
 
     Args:
         is_silent: show nothing.
         is_realtime: show a plain line without a refreshing thread, which would delay a real-time loop.
-        delay: s before the bar appears: shorter work needs none.
 
     Nothing is shown where standard error is no terminal.
     """
     if is_silent or not sys.stderr.isatty():
         yield ignore_progress
-    elif is_realtime:
-        with _show_line() as update:
-            yield update
-    else:
-        with _show_bar(delay) as update:
-            yield update
+        return
+    with _show_line() if is_realtime else _show_bar() as update:
+        yield update
 
 
 @contextlib.contextmanager
-def _show_bar(delay: float) -> Iterator[Progress]:
+def _show_bar(delay: float = 2.0) -> Iterator[Progress]:
+    """A bar that appears after `delay` s: shorter work needs none."""
     from rich.console import Console  # here: 0.1 s that a command without a bar does not spend
     from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -64,11 +61,9 @@ def _show_line() -> Iterator[Progress]:
         now = (stage, int(20 * share))  # each write may cost the loop some microseconds: only every 5 %
         if now != shown:
             shown = now
-            sys.stderr.write(f"\r\033[K{stage:<14} {100 * share:3.0f} %")
-            sys.stderr.flush()
+            print(f"\r\033[K{stage:<14} {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
 
     try:
         yield update
-    finally:
-        sys.stderr.write("\r\033[K\n" if shown[0] else "\r\033[K")  # the headline begins a line, also in a capture
-        sys.stderr.flush()
+    finally:  # the headline begins a line, also in a capture
+        print("\r\033[K", end="\n" if shown[0] else "", file=sys.stderr, flush=True)

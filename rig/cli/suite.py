@@ -2,13 +2,34 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rig.run.job import JobChoice
-    from rig.suite.suite import CaseResult, Suite
+from rich.text import Text
+
+from fdi.output import write_text
+from fdi.report.numbers import count_nouns
+from fdi.report.report import Cell
+from fdi.report.terminal import style_of
+from plant.errors import InputError
+from rig.cli.answer import Places, choose_file, give_answer, make_folder
+from rig.cli.interruption import catch_signals
+from rig.cli.terminal import open_console
+from rig.network.clock import WallClock
+from rig.run.job import JobChoice
+from rig.run.participants import EMBEDDED_NAMES
+from rig.suite.report import MOODS, build_suite_report, write_junit
+from rig.suite.suite import (
+    CaseResult,
+    Suite,
+    Variant,
+    build_suite,
+    find_status,
+    is_suite_file,
+    read_suite_file,
+    run_cases,
+)
 
 
 def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable[[], Path]) -> int:
@@ -22,35 +43,24 @@ def run_suite(args: argparse.Namespace, base: JobChoice, choose_folder: Callable
     Raises:
         RigError: a sequence, model or parameter that cannot be used; nothing has run then.
     """
-    from fdi.output import write_text
-    from fdi.report.html import write_html
-    from fdi.report.json import to_json
-    from rig.cli.answer import choose_file, show_answer
-    from rig.cli.interruption import catch_signals
-    from rig.network.clock import WallClock
-    from rig.suite.report import build_suite_report, write_junit
-    from rig.suite.suite import find_status, run_cases
-
     tried = read_suite(args, base)
     processes = choose_processes(args, base, len(tried.cases))
     folder = choose_folder()
     suite = tried.put_into(folder)
-    make_folders(suite, folder)
+    for path in (folder, *(case.folder for case in suite.cases)):
+        make_folder(path)
     junit = choose_file(args.junit, (".xml",), None, "--junit")
     show = announce_suite(suite, processes, is_silent=args.json or args.quiet)
     clock = WallClock()
     with catch_signals():  # Ctrl-C and SIGTERM both break it off
         results, is_interrupted = run_cases(suite.cases, processes, show, 5.0 if base.bus == "embedded" else 30.0)
-    seconds = 1e-9 * clock.now()
     files = [("results", f"{folder}/ suite.html, suite.json, a folder for each case")]
     files += [("JUnit", str(junit))] if junit else []
-    report = build_suite_report(suite, results, seconds, processes, folder, files)
-    write_html(report, folder / "suite.html")
-    write_text(folder / "suite.json", to_json(report.data) + "\n")
+    report = build_suite_report(suite, results, 1e-9 * clock.now(), processes, folder, files)
     if junit is not None:
         write_text(junit, write_junit(suite.title, results), "--junit")
-    show_answer(report, args)
-    return find_status(results, is_interrupted=is_interrupted)
+    return give_answer(report, args, find_status(results, is_interrupted=is_interrupted),
+                       Places(folder / "suite.html", folder / "suite.json"))
 
 
 def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
@@ -59,12 +69,8 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
     Raises:
         InputError: what cannot be used, or an option that a suite file has to say.
     """
-    from plant.errors import InputError
-    from rig.suite.suite import Variant, build_suite, is_suite_file, read_suite_file
-
     variants: list[Variant] = []
-    titles: list[str] = []
-    sources: list[str] = []
+    titles: dict[str, str] = {}  # of each suite file
     requirements: dict[str, str] = {}
     for name in args.sequence:
         if not is_suite_file(name):
@@ -74,27 +80,11 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
             raise InputError("--model, --set, --seed", "", f"in the suite file {name}, as keys of its cases")
         content, own = read_suite_file(Path(name), base)
         variants += own
-        titles.append(content.title)
-        sources.append(name)
+        titles[name] = content.title
         listed = content.requirements
         requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
-    title = titles[0] if len(titles) == 1 else f"{len(args.sequence)} sequences"
-    return build_suite(title, variants, requirements, ", ".join(sources), is_trusted=args.trust)
-
-
-def make_folders(suite: Suite, folder: Path) -> None:
-    """Make the folder of a suite and those of its cases.
-
-    Raises:
-        InputError: they cannot be made.
-    """
-    from plant.errors import InputError
-
-    try:
-        for case in suite.cases:
-            case.folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--out", str(folder), f"a folder that can be written ({error.strerror})") from error
+    title = next(iter(titles.values())) if len(titles) == 1 else f"{len(args.sequence)} sequences"
+    return build_suite(title, variants, requirements, ", ".join(titles), is_trusted=args.trust)
 
 
 def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> int:
@@ -103,51 +93,31 @@ def choose_processes(args: argparse.Namespace, base: JobChoice, cases: int) -> i
     Raises:
         InputError: --jobs above 1 where only one run at a time is possible.
     """
-    import os
-
-    from plant.errors import InputError
-
-    is_alone = base.bus.partition(":")[0] not in ("embedded", "virtual") or base.pace == "realtime"
+    is_alone = base.bus.partition(":")[0] not in EMBEDDED_NAMES or base.pace == "realtime"
     if is_alone and (args.jobs or 1) > 1:
         raise InputError("--jobs", str(args.jobs), "1 in real time and on a bus between programs, which the runs share")
-    wanted = 1 if is_alone else args.jobs or len(os.sched_getaffinity(0))
-    return max(1, min(wanted, cases))
+    return min(1 if is_alone else args.jobs or len(os.sched_getaffinity(0)), cases)
 
 
 def announce_suite(suite: Suite, processes: int, *, is_silent: bool) -> Callable[[CaseResult], None]:
     """Say what is about to run; the function returned prints a line for each case that has ended."""
-    from rich.text import Text
-
-    from fdi.report.numbers import count_nouns
-    from fdi.report.report import Cell
-    from fdi.report.terminal import style_of
-    from rig.cli.terminal import open_console
-    from rig.suite.report import MOODS
-
-    console = open_console()
-    ended = 0
+    if is_silent:
+        return lambda _: None
+    console, ended, cases = open_console(), 0, len(suite.cases)
 
     def show(result: CaseResult) -> None:
         nonlocal ended
         ended += 1
-        line = Text(describe_result(result, ended, len(suite.cases)))
+        line = Text(describe_result(result, ended, cases))
         line.stylize(style_of(Cell("", MOODS[result.verdict])), 0, len(result.verdict))
         console.print(line, soft_wrap=True)
 
-    if is_silent:
-        return ignore_result
-    cases = count_nouns(len(suite.cases), "case")
-    console.print(Text(f"{suite.title}: {cases}, {processes} at a time"), soft_wrap=True)
+    console.print(Text(f"{suite.title}: {count_nouns(cases, 'case')}, {processes} at a time"), soft_wrap=True)
     return show
-
-
-def ignore_result(result: CaseResult) -> None:
-    """Print nothing about a case."""
 
 
 def describe_result(result: CaseResult, number: int, cases: int) -> str:
     """A line about a case that has ended: verdict, time, its number of all, name, reason."""
-    width = len(str(cases))
     time = f"{result.seconds:7.1f} s" if result.seconds else " " * 9
     reason = f": {result.reason}" if result.reason else ""
-    return f"{result.verdict:<14} {time}  {number:>{width}}/{cases}  {result.case.name}{reason}"
+    return f"{result.verdict:<14} {time}  {number:>{len(str(cases))}}/{cases}  {result.case.name}{reason}"

@@ -25,8 +25,7 @@ MESSAGES, MESSAGE_BYTES = 2048, 1024
 _HEAD = 4096  # bytes; words of 8: rows, messages, whether the run is over, whether the reader is ready
 _ROW = struct.Struct(f"={len(COLUMNS)}d")
 _MESSAGE_HEAD = struct.Struct("=QQ")  # number, length
-_WORD = struct.Struct("=Q")
-_AT_ROWS, _AT_MESSAGES, _AT_END, _AT_READY = 0, 8, 16, 24
+_MOST = MESSAGE_BYTES - _MESSAGE_HEAD.size
 _SIZE = _HEAD + ROWS * _ROW.size + MESSAGES * MESSAGE_BYTES
 
 
@@ -46,14 +45,24 @@ def make_shared_file() -> IO[bytes]:
     return file
 
 
-class LiveFeed:
+class _Memory:
+    """The shared file with this descriptor, as both ends see it."""
+
+    def __init__(self, number: int) -> None:
+        self._memory = mmap.mmap(number, _SIZE)
+        self._words = np.frombuffer(self._memory, np.uint64, 4)
+        self._rows = self._messages = 0  # written or read here
+
+    def _find_message(self, number: int) -> int:
+        return _HEAD + ROWS * _ROW.size + number % MESSAGES * MESSAGE_BYTES
+
+
+class LiveFeed(_Memory):
     """The writing end."""
 
     def __init__(self, number: int) -> None:
-        """Use the shared file with this file descriptor."""
-        self._memory = mmap.mmap(number, _SIZE)
+        super().__init__(number)
         self._memory[:] = bytes(_SIZE)  # every page is there before the run begins
-        self._rows = self._messages = 0
         self._signals: Signals | None = None
 
     def observe(self, t_ns: int, record: Record) -> None:
@@ -67,59 +76,53 @@ class LiveFeed:
                                row.com, row.xj, row.cor, row.p12, row.xs, row.load, record.lateness, record.response,
                                record.overrun)
                 self._rows += 1
-                _WORD.pack_into(self._memory, _AT_ROWS, self._rows)
+                self._words[0] = self._rows
         else:
             self._add_message(Message(type(record).__name__, t_ns, asdict(record)))
 
     def _add_message(self, message: Message) -> None:
         data = json.dumps(message).encode()
-        if len(data) > MESSAGE_BYTES - _MESSAGE_HEAD.size:  # a text for people, too long for a screen anyway
+        if len(data) > _MOST:  # a text for people, too long for a screen anyway
             fields = {key: value[:60] if isinstance(value, str) else value for key, value in message.fields.items()}
             data = json.dumps(message._replace(fields=fields)).encode()
-        if len(data) <= MESSAGE_BYTES - _MESSAGE_HEAD.size:
-            at = _HEAD + ROWS * _ROW.size + self._messages % MESSAGES * MESSAGE_BYTES
+        if len(data) <= _MOST:
+            at = self._find_message(self._messages)
             self._memory[at + _MESSAGE_HEAD.size:at + _MESSAGE_HEAD.size + len(data)] = data
             _MESSAGE_HEAD.pack_into(self._memory, at, self._messages, len(data))
             self._messages += 1
-            _WORD.pack_into(self._memory, _AT_MESSAGES, self._messages)
+            self._words[1] = self._messages
 
     def end(self) -> None:
         """Say that the run is over."""
-        _WORD.pack_into(self._memory, _AT_END, 1)
+        self._words[2] = 1
 
     @property
     def is_read(self) -> bool:
         """Whether a reader has said that it is ready."""
-        return bool(_WORD.unpack_from(self._memory, _AT_READY)[0])
+        return bool(self._words[3])
 
 
-class LiveReader:
+class LiveReader(_Memory):
     """The reading end, in another process."""
 
     def __init__(self, number: int) -> None:
-        """Use the shared file with this file descriptor."""
-        self._memory = mmap.mmap(number, _SIZE)
+        super().__init__(number)
         self._ring = np.frombuffer(self._memory, count=ROWS * len(COLUMNS), offset=_HEAD).reshape(ROWS, -1)
-        self._rows = self._messages = 0
         self.lost = 0  # entries that were overwritten before they were read
 
     def say_ready(self) -> None:
         """Let the run begin."""
-        _WORD.pack_into(self._memory, _AT_READY, 1)
+        self._words[3] = 1
 
     @property
     def is_over(self) -> bool:
         """Whether the run has ended."""
-        return bool(self._read_word(_AT_END))
-
-    def _read_word(self, at: int) -> int:
-        return int(_WORD.unpack_from(self._memory, at)[0])
+        return bool(self._words[2])
 
     def read_rows(self) -> NDArray[np.float64]:
         """The rows since the last call, (rows, columns)."""
-        count = self._read_word(_AT_ROWS)
-        first = max(self._rows, count - ROWS)
-        wanted = np.arange(first, count)
+        count = int(self._words[0])
+        wanted = np.arange(max(self._rows, count - ROWS), count)
         rows: NDArray[np.float64] = self._ring[wanted % ROWS]  # a copy
         rows = rows[rows[:, 0] == wanted]
         self.lost += count - self._rows - len(rows)
@@ -128,10 +131,10 @@ class LiveReader:
 
     def read_messages(self) -> list[Message]:
         """The messages since the last call."""
-        count = self._read_word(_AT_MESSAGES)
+        count = int(self._words[1])
         found = []
         for number in range(max(self._messages, count - MESSAGES), count):
-            at = _HEAD + ROWS * _ROW.size + number % MESSAGES * MESSAGE_BYTES
+            at = self._find_message(number)
             entry = bytes(self._memory[at:at + MESSAGE_BYTES])
             stored, length = _MESSAGE_HEAD.unpack_from(entry)
             try:

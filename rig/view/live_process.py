@@ -7,7 +7,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from plant.errors import InputError
 from rig.interrupts import ignore_interrupts
 from rig.view.live_feed import LiveFeed, make_shared_file
 from rig.view.live_run import LivePlan
-from rig.view.viewer import is_listening
+from rig.view.viewer import is_listening, lacks_display, wait_until
 
 
 @contextlib.contextmanager
@@ -37,16 +36,12 @@ def show_live(plan: LivePlan, last_cpu_is_taken: bool, place: ViewerPlace | None
     with make_shared_file() as file:
         feed = LiveFeed(file.fileno())
         with ignore_interrupts():
-            program = ["rig.view.live_dashboard", str(file.fileno())]
-            if place is not None:
-                program = ["rig.view.live_feeder", str(file.fileno()), str(place.port), str(place.file or "")]
-            process = subprocess.Popen([sys.executable, "-m", *program],
+            words = [str(file.fileno()), *([str(place.port), str(place.file or "")] if place is not None else [])]
+            process = subprocess.Popen([sys.executable, "-m", "rig.view.live_show", *words],
                                        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
         try:
             _send_plan(process, plan, last_cpu_is_taken)
-            deadline = time.monotonic() + patience
-            while not feed.is_read and process.poll() is None and time.monotonic() < deadline:
-                time.sleep(0.02)
+            wait_until(lambda: feed.is_read, process, patience)
             yield feed
         finally:
             feed.end()
@@ -105,7 +100,7 @@ def find_viewer_place(text: str) -> ViewerPlace:
         return ViewerPlace(port=int(word))
     if text != "rerun":
         raise InputError("--live", text, "rerun, rerun:PORT of an open viewer, or rerun:FILE.rrd")
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if lacks_display():
         raise InputError("--live", text, "a display for the viewer's window; without one rerun:FILE.rrd writes a file, "
                                          "and rerun:PORT uses a viewer that is open")
     return ViewerPlace()

@@ -3,8 +3,9 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
+from collections.abc import Mapping
 from math import isnan, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,11 @@ class LivePlan(NamedTuple):
     starts: dict[str, float]
     has_load: bool
 
+    @property
+    def check_names(self) -> list[str]:
+        """The checks of the sequence, those that only the run itself can judge last."""
+        return [*(check.name for check in self.checks), *self.unknown_checks]
+
 
 def make_live_plan(sequence: Sequence, pace: str) -> LivePlan:
     """The plan of a sequence; checks that cannot be sent to another process (Python of a user) keep their names."""
@@ -68,6 +74,23 @@ class CheckState(NamedTuple):
     is_final: bool = False  # said by the run itself
     detail: str = ""
 
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> CheckState:
+        """What the run itself says of a check at its end."""
+        return cls(fields["name"], "PASS" if fields["passed"] else "FAIL", fields["value"], fields["unit"], True,
+                   fields["detail"])
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether it has a verdict."""
+        return self.word in ("PASS", "FAIL")
+
+    @property
+    def measured(self) -> str:
+        """Value and unit behind a space; empty for none."""
+        unit = "" if self.unit in ("", "1") else f" {self.unit}"
+        return "" if isnan(self.value) else f" {self.value:.4g}{unit}"
+
 
 class LiveRun:
     """Collects rows and messages of a run."""
@@ -75,35 +98,32 @@ class LiveRun:
     def __init__(self, plan: LivePlan) -> None:
         self.plan = plan
         self._table = np.empty((1 << 14, len(COLUMNS)))
-        self._count = 0
-        self._main_from = -1  # row at which main begins
-        self._main_until = -1
-        self._zero_ns = 0.0  # log time of that row
+        self.cycles = 0  # so far, without those that were missed
+        self._main_from = self._main_until = -1  # rows
+        self.zero_ns = nan  # log time at which main began
         self.states = {RIG: "operational", CONTROLLER: "unknown", PLANT: "unknown"}
         self.troubles: dict[int, str] = {}  # nodes that are gone, and how that is known
         self.events: deque[Event] = deque(maxlen=5000)
-        self.checks = {check.name: CheckState(check.name, "waits" if check.kind not in _AFTER_RUN else "after the run")
-                       for check in plan.checks}
-        self.checks |= {name: CheckState(name, "after the run") for name in plan.unknown_checks}
+        waiting = {check.name for check in plan.checks if check.kind not in _AFTER_RUN}
+        self.checks = {name: CheckState(name, "waits" if name in waiting else "after the run")
+                       for name in plan.check_names}
         self.overruns = 0
 
     # ------------------------------------------------------------------------------------ what comes in
 
     def add_rows(self, rows: NDArray[np.float64]) -> None:
         """Append cycles."""
-        if not len(rows):
-            return
-        while self._count + len(rows) > len(self._table):
+        first, self.cycles = self.cycles, self.cycles + len(rows)
+        while self.cycles > len(self._table):
             self._table = np.concatenate((self._table, np.empty_like(self._table)))
-        self._table[self._count:self._count + len(rows)] = rows
-        self._count += len(rows)
+        self._table[first:self.cycles] = rows
         self.overruns += int(rows[:, _COLUMN["overrun"]].sum())
-        phase = self._table[:self._count, _COLUMN["phase"]]
-        if self._main_from < 0 and (phase[-len(rows):] >= 1).any():
-            self._main_from = int(np.argmax(phase >= 1))
-            self._zero_ns = float(self._table[self._main_from, _COLUMN["t_ns"]])
-        if self._main_from >= 0 and self._main_until < 0 and (phase[-len(rows):] >= 2).any():
-            self._main_until = self._main_from + int(np.argmax(phase[self._main_from:] >= 2))
+        phase = rows[:, _COLUMN["phase"]]
+        if self._main_from < 0 and (phase >= 1).any():
+            self._main_from = first + int(np.argmax(phase >= 1))
+            self.zero_ns = float(self._table[self._main_from, _COLUMN["t_ns"]])
+        if self._main_until < 0 and (phase >= 2).any():
+            self._main_until = first + int(np.argmax(phase >= 2))
 
     def add_message(self, message: Message) -> None:
         """Take in an event, a state of a node or a check."""
@@ -111,11 +131,9 @@ class LiveRun:
         if message.kind == "NmtState":
             self.states[int(fields["node"])] = str(fields["name"])
         elif message.kind == "Check":
-            self.checks[fields["name"]] = CheckState(fields["name"], "PASS" if fields["passed"] else "FAIL",
-                                                     fields["value"], fields["unit"], True, fields["detail"])
+            self.checks[fields["name"]] = CheckState.read(fields)
         elif message.kind == "Event":
-            t = (message.t_ns - self._zero_ns) * 1e-9 if self._main_from >= 0 else nan
-            event = Event(t, fields["level"], fields["kind"], fields["text"])
+            event = Event((message.t_ns - self.zero_ns) * 1e-9, fields["level"], fields["kind"], fields["text"])
             self.events.append(event)
             node = find_dead_node(event.level, event.kind, event.text)
             if node:
@@ -125,19 +143,13 @@ class LiveRun:
 
     # ------------------------------------------------------------------------------------ what is shown
 
-    @property
-    def cycles(self) -> int:
-        """Cycles so far, without those that were missed."""
-        return self._count
-
-    @property
-    def zero_ns(self) -> float:
-        """Log time at which main began; NaN before it."""
-        return self._zero_ns if self._main_from >= 0 else nan
-
     def read_rows_from(self, first: int) -> NDArray[np.float64]:
         """The rows from this one on, (rows, columns)."""
-        return self._table[first:self._count]
+        return self._table[first:self.cycles]
+
+    def read_last(self, name: str, cycles: int) -> NDArray[np.float64]:
+        """The last values of a column, at most so many."""
+        return self._table[max(self.cycles - cycles, 0):self.cycles, _COLUMN[name]]
 
     @property
     def is_over(self) -> bool:
@@ -145,30 +157,23 @@ class LiveRun:
         return any(event.kind == "phase" and event.text == "end" for event in self.events)
 
     @property
-    def phase(self) -> str:
-        """Name of the phase of the last cycle."""
-        return PHASES[min(int(self._table[self._count - 1, _COLUMN["phase"]]), 2)] if self._count else "bring-up"
-
-    @property
     def t(self) -> float:
         """Time of the last cycle, s of main; NaN before main."""
-        return (self._table[self._count - 1, _COLUMN["t_ns"]] - self._zero_ns) * 1e-9 if self._main_from >= 0 else nan
+        return float(self._table[self.cycles - 1, _COLUMN["t_ns"]] - self.zero_ns) * 1e-9
 
     @property
     def section(self) -> str:
         """The section of main that is played, else the phase."""
-        row = self._count - 1 - self._main_from
-        if self.phase == "main":
-            return next((name for name, rows in self.plan.sections.items() if rows.start <= row < rows.stop), "main")
-        return self.phase
-
-    def read_last(self, name: str, cycles: int) -> NDArray[np.float64]:
-        """The last values of a column, at most so many."""
-        return self._table[max(self._count - cycles, 0):self._count, _COLUMN[name]]
+        if not self.cycles:
+            return "bring-up"
+        phase = PHASES[min(int(self.read_last("phase", 1)[0]), 2)]
+        row = self.cycles - 1 - self._main_from
+        sections = self.plan.sections.items() if phase == "main" else ()
+        return next((name for name, rows in sections if rows.start <= row < rows.stop), phase)
 
     def judge_checks(self) -> None:
         """Judge the checks whose window is over, and those whose number has passed its limit already."""
-        rows = (self._main_until if self._main_until >= 0 else self._count) - self._main_from
+        rows = (self._main_until if self._main_until >= 0 else self.cycles) - self._main_from
         if self._main_from < 0 or rows < 1:
             return
         table = self._table[self._main_from:self._main_from + rows]
@@ -177,19 +182,17 @@ class LiveRun:
                        self.plan.starts)
         for check in self.plan.checks:
             state = self.checks[check.name]
-            if state.is_final or state.word in ("PASS", "FAIL", "after the run"):
+            if state.is_judged or state.word == "after the run":
                 continue
             start, stop = _find_window(check, self.plan.sections, self.plan.duration)
-            if rows >= stop:
+            if rows > start:
+                state = state._replace(word="measures")
+            if rows >= stop or (rows > start and check.window == MAIN and check.kind in _GROWS):
                 result = check.judge(data)
-                word = "PASS" if result.passed else "FAIL"
-                self.checks[check.name] = CheckState(check.name, word, result.value, result.unit, detail=result.detail)
-            elif rows > start:
-                self.checks[check.name] = state._replace(word="measures")
-                if check.window == MAIN and check.kind in _GROWS:
-                    result = check.judge(data)
-                    word = "measures" if result.passed or isnan(result.value) else "FAIL"
-                    self.checks[check.name] = CheckState(check.name, word, result.value, result.unit)
+                is_early = rows < stop and (result.passed or isnan(result.value))
+                word = "measures" if is_early else "PASS" if result.passed else "FAIL"
+                state = CheckState(check.name, word, result.value, result.unit, detail=result.detail)
+            self.checks[check.name] = state
 
 
 def _find_window(check: Check, sections: dict[str, slice], duration: float) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """The screen of a run: nodes, command and position as a moving plot, checks, timing, events."""
 from __future__ import annotations
 
-from math import isnan
+from math import isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,8 @@ def describe_line(run: LiveRun) -> str:
     words = [state.word for state in run.checks.values()]
     t = "" if isnan(run.t) else f"{run.t:.1f} of {run.plan.duration:g} s, "
     nodes = ", ".join(f"{node} {run.troubles.get(node) or state}" for node, state in run.states.items() if node != 1)
-    last = [_last_number(run.read_last(name, 1)) * 1e3 for name in ("com", "xj")]
-    return (f"{t}{run.section}; command {last[0]:.2f} mm, ram {last[1]:.2f} mm; checks {words.count('PASS')} pass, "
+    com, xj = (float(run.read_last(name, 1)[0]) * 1e3 if run.cycles else nan for name in ("com", "xj"))
+    return (f"{t}{run.section}; command {com:.2f} mm, ram {xj:.2f} mm; checks {words.count('PASS')} pass, "
             f"{words.count('FAIL')} fail of {len(words)}; {_describe_lateness(run)}; nodes: {nodes}")
 
 
@@ -90,9 +90,7 @@ def _draw_checks(run: LiveRun, count: int) -> list[Text]:
 
 
 def _draw_check(state: CheckState) -> Text:
-    value = "" if isnan(state.value) else f" {state.value:.4g}" + (f" {state.unit}" if state.unit not in ("", "1")
-                                                                   else "")
-    return Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (value, "bold"))
+    return Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (state.measured, "bold"))
 
 
 def _draw_timing(run: LiveRun) -> list[Text]:
@@ -124,10 +122,6 @@ def _draw_events(run: LiveRun, count: int) -> list[Text]:
     return [Text("Events", style="bold"),
             *(Text((f"{event.t:.2f} s " if not isnan(event.t) else "") + f"{event.kind}: {event.text}",
                    style=styles.get(event.level, "")) for event in events)]
-
-
-def _last_number(values: NDArray[np.float64]) -> float:
-    return float(values[-1]) if len(values) else float("nan")
 
 
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])  # row and column of a dot -> its bit

@@ -21,7 +21,7 @@ from play_newcomer import make_environment
 from rig_command import rig
 from shown_commands import NEEDS_HARDWARE, Step, judge_line, list_steps, play_page
 
-from rig.cli.command_list import HELP_OF_COMMAND
+from rig.cli.command_list import COMMANDS
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_bad_input_gets_one_line_that_names_it(
 
 
 def test_bad_inputs_are_of_every_command() -> None:
-    assert {case.words.split()[0] for case in BAD_INPUTS} == {*HELP_OF_COMMAND, "fly"}
+    assert {case.words.split()[0] for case in BAD_INPUTS} == {*COMMANDS, "fly"}
     assert len(BAD_INPUTS) >= 60
 
 
@@ -107,7 +107,7 @@ def test_what_an_interrupted_command_leaves_is_judged(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir() if find_damage(path)} == {*damaged}
     assert judge_end(130, "rig fdi: interrupted\n") == [] and len(judge_end(1, "Traceback\nx\n")) == 3
     assert judge_time(0.5, 0.4) == [] and judge_time(0.5, 2.5) and judge_time(1e6, 0.1)
-    assert {words.split()[0] for words in LONG_COMMANDS.values()} <= {*HELP_OF_COMMAND}
+    assert {words.split()[0] for words in LONG_COMMANDS.values()} <= {*COMMANDS}
 
 
 def test_every_command_line_of_a_page_is_played_or_has_a_reason() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from rig.view.viewer import TIMELINE
+from rig.view.recording import TIMELINE
 
 Rows = dict[str, list[tuple[float, object]]]
 _SHOWN = {"StateChange:state", "TextLog:text", "Scalars:scalars", "TextDocument:text"}

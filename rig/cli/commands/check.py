@@ -2,35 +2,21 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
-from rig.cli import options
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `rig check`."""
-    parser.add_argument("sequence", metavar="SEQUENCE",
-                        help="test sequence: a .toml file, or the name of a shipped one")
-    options.add_model_options(parser)
+from rig.cli.answer import choose_places, give_answer
+from rig.cli.inputs import parse_changes
+from rig.cli.progress_bar import show_progress
+from rig.run.job import JobChoice, build_job
+from rig.suite.dry_run import make_dry_run
+from rig.suite.dry_run_report import build_dry_run_report
 
 
 def run_command(args: argparse.Namespace) -> int:
-    """Nothing is opened and nothing moves. Exit status 1 if a limit is violated; --out FILE.html has a picture."""
-    from pathlib import Path
-
-    from rig.cli.answer import choose_places, show_answer, write_answer
-    from rig.cli.progress_bar import show_progress
-    from rig.run.job import JobChoice, build_job
-    from rig.suite.dry_run import make_dry_run
-    from rig.suite.dry_run_report import build_dry_run_report
-
-    source = args.sequence if Path(args.sequence).is_file() else ""
-    places = choose_places(args, "", source)
-    choice = JobChoice(args.sequence, args.model, options.parse_changes(args.set), args.seed, tuple(args.effects))
+    """Exit status 1 if a limit is violated."""
+    places = choose_places(args, "", args.sequence if Path(args.sequence).is_file() else "")
+    choice = JobChoice(args.sequence, args.model, parse_changes(args.set), args.seed, tuple(args.effects))
     with show_progress(is_silent=args.json or args.quiet) as progress:
         progress("simulating", 0.0)
         dry = make_dry_run(build_job(choice, is_trusted=args.trust))
-        report = build_dry_run_report(dry, places.files)
-        progress("page", 0.0)
-        write_answer(report, places)
-    show_answer(report, args)
-    return 1 if dry.problems else 0
+    return give_answer(build_dry_run_report(dry, places.files), args, int(bool(dry.problems)), places)

@@ -3,46 +3,42 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rig.cli import options
-
-if TYPE_CHECKING:
-    from fdi.report.report import Report
-    from plant.model import Model
-    from plant.quantity import Quantity
+from fdi.report.report import Cell, Column, Report, Section, Table
+from fdi.trace.signals import OUTPUTS, SIGNALS
+from plant.model import (
+    SHIPPED_MODELS,
+    Model,
+    find_parameter_groups,
+    find_quantity,
+    list_offered_effects,
+    load_model,
+)
+from plant.plants import list_plants
+from plant.quantity import Quantity
+from rig.cli.answer import give_answer
+from rig.cli.inputs import list_shipped_sequences, load_chosen_model
 
 Rows = list[dict[str, Any]]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `rig list`."""
-    parser.add_argument("kind", choices=list(KINDS), metavar="KIND", help="one of: " + ", ".join(KINDS))
-    parser.add_argument("word", nargs="?", default="", metavar="WORD", help="only names that contain this word")
-    options.add_model_options(parser)
-
-
 def run_command(args: argparse.Namespace) -> int:
     """Names come with unit, range and default."""
-    from rig.cli.answer import show_answer
-
-    found = KINDS[args.kind](options.load_chosen_model(args))
-    rows = [row for row in found if args.word.lower() in row["name"].lower()]
-    show_answer(build_list_report(args.kind, rows), args)
-    return 0
+    find, use = KINDS[args.kind]
+    rows = [row for row in find(load_chosen_model(args)) if args.word.lower() in row["name"].lower()]
+    return give_answer(build_list_report(args.kind, use, rows), args)
 
 
-def build_list_report(kind: str, rows: Rows) -> Report:
+def build_list_report(kind: str, use: str, rows: Rows) -> Report:
     """Report on the names of one kind."""
-    from fdi.report.report import Cell, Column, Report, Section, Table
-
-    keys = list(rows[0]) if rows else ["name"]
+    keys = [*rows[0]] if rows else ["name"]
     shown = [[Cell(_format(row[key]), is_strong=key == "name") for key in keys] for row in rows]
     sentence = f"{len(rows)} {kind}" if rows else f"no {kind} of that name"
-    return Report("list", kind, sentence=f"{sentence}. {USES[kind]}",
-                  sections=[Section("", [Table([Column(key) for key in keys], shown)] if rows else [])],
-                  data={"kind": kind, kind: rows})
+    return Report("list", kind, sentence=f"{sentence}. {use}", data={"kind": kind, kind: rows},
+                  sections=[Section("", [Table([Column(key) for key in keys], shown)] if rows else [])])
 
 
 def _format(value: Any) -> str:
@@ -53,18 +49,15 @@ def _format(value: Any) -> str:
 
 def list_parameters(model: Model) -> Rows:
     """Every parameter that --set takes: of the model, and of the effects that it does not have yet."""
-    from plant.model import find_parameter_groups, find_quantity, list_offered_effects
-
     off = {name: value for e in list_offered_effects(model.plant) for name, value in e.off.items()}
-    groups = find_parameter_groups(plant=model.plant)
-    names = [f"{group}.{field}" for group, fields in groups.items() for field in fields._fields]
     rows = []
-    for name in names:
-        quantity = find_quantity(name, plant=model.plant)
-        default = model.values.get(name, off.get(name))
-        word = next((word for word, value in quantity.words.items() if value == default), None)
-        rows.append({"name": name, "unit": quantity.unit, "default": word or default,
-                     "range": _describe_range(quantity)})
+    for group, fields_ in find_parameter_groups(plant=model.plant).items():
+        for name in (f"{group}.{field}" for field in fields_._fields):
+            quantity = find_quantity(name, plant=model.plant)
+            default = model.values.get(name, off.get(name))
+            word = next((word for word, value in quantity.words.items() if value == default), None)
+            rows.append({"name": name, "unit": quantity.unit, "default": word or default,
+                         "range": _describe_range(quantity)})
     return rows
 
 
@@ -78,8 +71,6 @@ def _describe_range(q: Quantity) -> str:
 
 def list_signals(model: Model) -> Rows:
     """The columns of a trace."""
-    from fdi.trace.signals import OUTPUTS, SIGNALS
-
     required = ("t", "com", "xj", "cor")
     return [{"name": s.name, "symbol": s.symbol, "unit": s.unit, "content": s.quantity,
              "in a trace": "required" if s.name in required else "optional",
@@ -89,33 +80,24 @@ def list_signals(model: Model) -> Rows:
 
 def list_sequences(model: Model) -> Rows:
     """The shipped sequences."""
-    from importlib.resources import files
-    from pathlib import Path
+    from rig.sequences import load_sequence  # here: only this list and that of the checks need the bench
 
-    from rig.sequences import load_sequence
-
-    names = sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
-    found = [(name, load_sequence(name)) for name in names]
+    found = [(name, load_sequence(name)) for name in list_shipped_sequences()]
     return [{"name": name, "title": s.title, "main, s": s.duration, "checks": len(s.checks), "faults": len(s.faults)}
             for name, s in found]
 
 
 def list_effects(model: Model) -> Rows:
     """The catalogue, the user's own effects included."""
-    from plant.model import list_offered_effects
-
     rows = []
     for e in list_offered_effects(model.plant):
-        parameters = [f"{name} [{q.unit}], {_describe_range(q)}, {_describe_off(e.off.get(name), name, model)}"
-                      for name, q in e.parameters.items()]
+        parameters = [f"{name} [{q.unit}], {_describe_range(q)}, " + (
+            f"off at {e.off[name]:g}" if name in e.off else f"nominal {model.kind.nominal.get(name, 0.0):g}")
+            for name, q in e.parameters.items()]
         rows.append({"name": e.name, "acts on": e.port or "reference model",
                      "in model": "yes" if e.base or e.name in model.effects else "no",
                      "parameters [unit], range, default": "\n".join(parameters)})
     return rows
-
-
-def _describe_off(off: float | None, name: str, model: Model) -> str:
-    return f"nominal {model.kind.nominal.get(name, 0.0):g}" if off is None else f"off at {off:g}"
 
 
 def list_checks(model: Model) -> Rows:
@@ -130,8 +112,6 @@ def list_checks(model: Model) -> Rows:
 
 def _describe_keys(kind: type[Any]) -> Iterator[str]:
     """The keys of a kind of check beside those that every check has."""
-    from dataclasses import MISSING, fields
-
     from rig.sequences.checks import Check
 
     common = {f.name for f in fields(Check)} - {"window"}
@@ -142,26 +122,17 @@ def _describe_keys(kind: type[Any]) -> Iterator[str]:
 
 def list_models(model: Model) -> Rows:
     """The shipped models: what --model takes beside a file."""
-    from plant.model import SHIPPED_MODELS, load_model
-    from plant.plants import list_plants
-
-    rows = []
-    for name in (*list_plants(), *SHIPPED_MODELS):
-        shipped = load_model(name)
-        rows.append({"name": name, "plant": shipped.plant, "cycle, s": shipped["controller.period"],
-                     "effects": "\n".join(shipped.effects) or "-", "default": "yes" if name == "eha" else "no"})
-    return rows
+    found = [(name, load_model(name)) for name in (*list_plants(), *SHIPPED_MODELS)]
+    return [{"name": name, "plant": m.plant, "cycle, s": m["controller.period"],
+             "effects": "\n".join(m.effects) or "-", "default": "yes" if name == "eha" else "no"} for name, m in found]
 
 
-KINDS: Mapping[str, Callable[[Any], Rows]] = {
-    "parameters": list_parameters, "signals": list_signals, "sequences": list_sequences, "effects": list_effects,
-    "checks": list_checks, "models": list_models}
-USES: Mapping[str, str] = {
-    "parameters": "Change one with --set NAME=VALUE.",
-    "signals": "Choose outputs with --signals xj,p12,xs.",
-    "sequences": "Run one with rig run NAME.",
-    "effects": "Add one with --set EFFECT.PARAMETER=VALUE; rig effects NAME shows its law.",
-    "checks": ("Use one in a sequence by its kind; every check also takes name, low, high, unit, window, skip and "
-               "requirement."),
-    "models": "Choose one with --model NAME, or a file.",
+KINDS: Mapping[str, tuple[Callable[[Model], Rows], str]] = {  # what lists them, and how to use one
+    "parameters": (list_parameters, "Change one with --set NAME=VALUE."),
+    "signals": (list_signals, "Choose outputs with --signals xj,p12,xs."),
+    "sequences": (list_sequences, "Run one with rig run NAME."),
+    "effects": (list_effects, "Add one with --set EFFECT.PARAMETER=VALUE; rig effects NAME shows its law."),
+    "checks": (list_checks, "Use one in a sequence by its kind; every check also takes name, low, high, unit, window, "
+                            "skip and requirement."),
+    "models": (list_models, "Choose one with --model NAME, or a file."),
 }

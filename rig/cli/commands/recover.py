@@ -5,20 +5,14 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `rig recover`."""
-    parser.add_argument("file", metavar="FILE", help="the trace.mcap whose writer died")
+from fdi.report.report import Report
+from rig.cli.answer import give_answer
+from rig.recorder.recover import recover_log
 
 
 def run_command(args: argparse.Namespace) -> int:
     """The log goes to --out (default: FILE with .recovered before its suffix)."""
-    from fdi.report.report import Report
-    from rig.cli.answer import show_answer
-    from rig.recorder.recover import recover_log
-
     source = Path(args.file)
     out = Path(args.out) if args.out is not None else source.with_name(f"{source.stem}.recovered{source.suffix}")
     salvage = recover_log(source, out)
-    show_answer(Report("recover", str(source), sentence=str(salvage), data=asdict(salvage)), args)
-    return 0
+    return give_answer(Report("recover", str(source), sentence=str(salvage), data=asdict(salvage)), args)

@@ -4,21 +4,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `rig report`."""
-    parser.add_argument("trace", metavar="TRACE", help="trace.mcap, the folder of a run, or a CSV")
+from fdi.report.report import Report
+from fdi.report.run_report import write_run_page
+from rig.cli.answer import give_answer
 
 
 def run_command(args: argparse.Namespace) -> int:
     """The page goes to --out (default: report.html beside the trace)."""
-    from fdi.report.report import Report
-    from fdi.report.run_report import write_run_page
-    from rig.cli.answer import show_answer
-
     source = Path(args.trace)
     folder = source if source.is_dir() else source.parent
     out = folder / "report.html" if args.out is None else Path(args.out)
     write_run_page(source, out)
-    show_answer(Report("report", str(source), sentence=str(out), data={"report": str(out)}), args)
-    return 0
+    return give_answer(Report("report", str(source), sentence=str(out), data={"report": str(out)}), args)

@@ -2,9 +2,21 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
-from rig.cli import options
+import numpy as np
+
+from fdi.output import require_new, require_writable
+from fdi.report.numbers import format_amount
+from fdi.report.report import Report
+from fdi.trace.trace import Trace
+from plant import InputError, load_model, simulate
+from plant.model import STEPS
+from plant.profile import build_profile, read_command, resample_on_cycles
+from plant.segments import RATE, Points
+from rig.cli.answer import give_answer
+from rig.cli.inputs import load_chosen_model
 
 SAMPLE_UNIT = {"jack.static_friction": 900.0, "jack.dynamic_friction": 600.0, "null_bias.current": 5e-5}
 SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3), (4.0, -3e-3), (4.001, -1e-3),
@@ -12,37 +24,13 @@ SAMPLE_POINTS = ((0.0, 0.0), (0.5, 0.0), (0.501, 2e-3), (1.5, 2e-3), (3.0, -3e-3
                  (10.0, 0.0))  # s, m: steps, slow ramps and corners
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `rig simulate`."""
-    options.add_model_options(parser)
-    parser.add_argument("--command", dest="command_file", metavar="FILE",
-                        help="CSV with t,com and optionally load (default: the main phase of preflight). Of rows at "
-                             "most 1 ms apart a cycle takes the latest; others are joined by straight lines")
-    options.add_force_option(parser)
-    parser.add_argument("--samples", action="store_true",
-                        help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv "
-                             "of another command, into the folder --out (default: here); the recorded unit has two "
-                             "effects that the nominal model lacks")
-    parser.add_argument("--steps", type=options.parse_whole_number, default=None, metavar="N",
-                        help="steps of the plant per cycle (default 100)")
-
-
 def run_command(args: argparse.Namespace) -> int:
     """Plant and controller in closed loop; t,com,xj,cor,p12,xs,load go to --out (default: simulation.csv)."""
-    from pathlib import Path
-
-    from fdi.output import require_new, require_writable
-    from fdi.report.numbers import format_amount
-    from fdi.report.report import Report
-    from fdi.trace.trace import Trace
-    from plant import InputError, simulate
-    from plant.model import STEPS
-    from rig.cli.answer import show_answer
-
     if args.samples:
         return write_samples(args)
-    model = options.load_chosen_model(args)
-    com, load, name = load_command(args.command_file, model["controller.period"])
+    model = load_chosen_model(args)
+    period = model["controller.period"]
+    com, load, name = load_command(args.command_file, period)
     if args.steps == 0:
         raise InputError("--steps", "0", "at least 1 step a cycle")
     out = Path(args.out or "simulation.csv")
@@ -50,35 +38,24 @@ def run_command(args: argparse.Namespace) -> int:
         raise InputError("--out", str(out), "a file .csv, .csv.gz or .mcap")
     require_new(require_writable(out, "--out", source=args.command_file), is_forced=args.force)
     columns = simulate(model, com, load, args.seed, args.steps or STEPS)
-    trace = Trace.from_columns(columns._asdict(), model["controller.period"], {
-        "model": model.name, "seed": str(args.seed), "command": name})
+    trace = Trace.from_columns(columns._asdict(), period, {"model": model.name, "seed": str(args.seed),
+                                                           "command": name})
     if out.suffix == ".mcap":
-        from rig.recorder.convert import write_mcap
+        from rig.recorder.convert import write_mcap  # here: it loads python-can
 
         write_mcap(trace, out)
     else:
         trace.write_csv(out)
     error = columns.com - columns.xj
-    summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * model["controller.period"],
-               "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
+    summary: dict[str, Any] = {"trace": str(out), "cycles": len(com), "seconds": len(com) * period,
+                               "rms_error": float((error**2).mean() ** 0.5), "max_error": float(abs(error).max())}
     sentence = (f"{out}: {summary['cycles']} cycles, {summary['seconds']:g} s; following error "
                 f"{format_amount(summary['rms_error'], 'm')} RMS, {format_amount(summary['max_error'], 'm')} at most")
-    show_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
-    return 0
+    return give_answer(Report("simulate", str(out), sentence=sentence, data=summary), args)
 
 
 def write_samples(args: argparse.Namespace) -> int:
     """Write the recordings of --samples; exit status 0."""
-    from pathlib import Path
-
-    from fdi.output import require_new
-    from fdi.report.report import Report
-    from fdi.trace.trace import Trace
-    from plant import InputError, load_model, simulate
-    from plant.profile import build_profile
-    from plant.segments import Points
-    from rig.cli.answer import show_answer
-
     if args.model or args.set or args.effects or args.command_file:
         raise InputError("--samples", "", "no --model, --set, --effects and --command beside it: the unit is fixed")
     folder = Path(args.out or ".")
@@ -96,9 +73,8 @@ def write_samples(args: argparse.Namespace) -> int:
         Trace.from_columns(columns._asdict(), period, {"seed": str(seed)}).write_csv(places[name])
     sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
                 f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
-    show_answer(Report("simulate", "samples", sentence=sentence, data={"traces": [str(p) for p in places.values()]}),
-                args)
-    return 0
+    data = {"traces": [str(place) for place in places.values()]}
+    return give_answer(Report("simulate", "samples", sentence=sentence, data=data), args)
 
 
 def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
@@ -107,14 +83,8 @@ def load_command(file: str | None, period: float) -> tuple[Any, Any, str]:
     Raises:
         InputError: a file that cannot be read.
     """
-    import numpy as np
-
-    from plant.profile import read_command, resample_on_cycles
-    from plant.segments import RATE
-
     if file is not None:
-        com, load = read_command(file, period)
-        return com, load, file
+        return (*read_command(file, period), file)
     from rig.sequences import load_sequence
 
     sequence = load_sequence("preflight")

@@ -16,7 +16,7 @@ from short_sequences import SHORT
 from fdi.trace.trace import CLEANUP, Trace
 from plant.effects import CATALOGUE
 from rig.cli import commands
-from rig.cli.command_list import HELP_OF_COMMAND, import_command
+from rig.cli.command_list import COMMANDS, find_work
 
 LONG = SHORT.replace('"rest", kind = "hold", time = 0.05', '"rest", kind = "hold", time = 60')
 RUN_KEYS = {"verdict", "trace", "checks", "timing", "fdi"}
@@ -33,7 +33,7 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["", *HELP_OF_COMMAND])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help(command: str) -> None:
     said = rig(*[command] if command else [], "--help")
     assert said.status == 0 and said.err == "" and len(said.out.splitlines()) > 4
@@ -42,15 +42,15 @@ def test_help(command: str) -> None:
 
 def test_the_command_list_agrees_with_the_modules() -> None:
     modules = {module.name for module in pkgutil.iter_modules(commands.__path__)}
-    assert {import_command(name).__name__.rpartition(".")[2] for name in HELP_OF_COMMAND} == modules
-    assert list(HELP_OF_COMMAND) == sorted(HELP_OF_COMMAND)
+    assert {find_work(name).__module__.rpartition(".")[2] for name in COMMANDS} == modules
+    assert list(COMMANDS) == sorted(COMMANDS)
 
 
-@pytest.mark.parametrize("command", ["", *HELP_OF_COMMAND])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_imports_no_heavy_package(command: str) -> None:
     """Help is quick because neither the plant nor any library is imported for it."""
-    source = ("import sys; from rig.cli.main import build_parser\n"
-              "try: build_parser().parse_args(sys.argv[1:])\n"
+    source = ("import sys; from rig.cli.main import run_command_line\n"
+              "try: run_command_line(sys.argv[1:])\n"
               "finally: print(*{name.partition('.')[0] for name in sys.modules})")
     done = subprocess.run([sys.executable, "-c", source, *([command] if command else []), "--help"],
                           capture_output=True, text=True)

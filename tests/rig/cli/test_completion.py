@@ -11,16 +11,6 @@ import pytest
 
 from plant import Model
 from rig.cli import completion
-from rig.cli.command_list import HELP_OF_COMMAND
-
-
-@pytest.mark.parametrize("name", HELP_OF_COMMAND)
-def test_every_command_has_its_options(name: str) -> None:
-    parser = completion.build_completion_parser(f"rig {name} --")
-    subparsers = next(action for action in parser._actions if action.dest == "command")
-    options = {word for action in subparsers.choices[name]._actions  # type: ignore[index,call-overload,union-attr]
-               for word in action.option_strings}
-    assert {"--json", "--out", "--quiet", "--help"} <= options
 
 
 def test_names_that_options_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """`rig doctor`: every finding helps, nothing is claimed that is not so, and the lateness figures are right."""
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import socket
@@ -9,22 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_command import rig
 
-from plant.errors import InputError
 from rig import doctor
-from rig.cli.commands import doctor as command
 from rig.run import priority
 
 
 @pytest.fixture(scope="module")
 def findings() -> list[doctor.Finding]:
     return doctor.examine_machine(seconds=0.05)
-
-
-def arguments(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return argparse.Namespace(json=False, out=None, quiet=False, **vars(parser.parse_args(words)))
 
 
 def test_each_finding_says_what_it_is_for_and_how_to_get_it(findings: list[doctor.Finding]) -> None:
@@ -58,13 +50,12 @@ def test_versions_are_the_installed_ones(findings: list[doctor.Finding]) -> None
     assert doctor.read_versions(["no-such-distribution"]) == {"no-such-distribution": ""}
 
 
-def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr(doctor, "read_requirements", lambda: {"": ["numpy", "no-such-distribution"]})
-    assert command.run_command(arguments("--seconds", "0")) == 1
-    out = capsys.readouterr().out
-    assert "missing: no-such-distribution" in out
-    assert out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
+    said = rig("doctor", "--seconds", "0")
+    assert said.status == 1 and "missing: no-such-distribution" in said.out
+    assert said.out.splitlines()[0] == "FAIL  The bench cannot run without: packages."
 
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,27 +65,18 @@ def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -
     assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
 
 
-def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = arguments("--seconds", "0")
-    args.json, args.out = True, tmp_path / "doctor.json"
-    assert command.run_command(args) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer == json.loads(args.out.read_text())
-    assert answer["verdict"] == "PASS"
-    assert {"area", "name", "status", "found", "purpose", "remedy", "needed"} == set(answer["findings"][0])
-
-
-def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    args = arguments("--seconds", "0")
-    args.quiet = True
-    assert command.run_command(args) == 0
-    assert capsys.readouterr().out == ""
+def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
+    said = rig("doctor", "--seconds", "0", "--json", "--out", tmp_path / "doctor.json")
+    assert said.status == 0 and said.json == json.loads((tmp_path / "doctor.json").read_text())
+    assert said.json["verdict"] == "PASS"
+    assert {"area", "name", "status", "found", "purpose", "remedy", "needed"} == set(said.json["findings"][0])
+    assert rig("doctor", "--seconds", "0", "--quiet") == (0, "", "")
 
 
 @pytest.mark.parametrize("seconds", ["-1", "4000", "nan"])
 def test_bad_seconds_are_refused(seconds: str) -> None:
-    with pytest.raises(InputError, match="--seconds: expected between 0 and 3600 s"):
-        command.run_command(arguments("--seconds", seconds))
+    said = rig("doctor", f"--seconds={seconds}")
+    assert said.status == 2 and "--seconds: expected between 0 and 3600 s" in said.err
 
 
 def test_percentiles_of_known_wake_ups() -> None:

@@ -1,22 +1,18 @@
 """Other formats, there and back."""
 from __future__ import annotations
 
-import argparse
-import json
 import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rig_command import rig
 from synthetic_run import record_run
 
 import dbc
 from fdi.trace.trace import Trace
 from plant.errors import InputError
-from rig.cli.commands import export as export_command
-from rig.cli.commands import import_ as import_command
-from rig.cli.commands import recover as recover_command
 from rig.recorder.convert import RAW_SUFFIXES, export_trace, import_csv, import_frames, read_raw_frames
 
 
@@ -111,21 +107,10 @@ def test_refusals(log: Path, tmp_path: Path) -> None:
         import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", tmp_path / "other.dbc")
 
 
-def _run(command: object, capsys: pytest.CaptureFixture[str], *words: str,
-         out: Path | None = None) -> dict[str, object]:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)  # type: ignore[attr-defined]
-    args = parser.parse_args(words)
-    args.json, args.quiet, args.out = True, False, None if out is None else str(out)
-    assert command.run_command(args) == 0  # type: ignore[attr-defined]
-    answer: dict[str, object] = json.loads(capsys.readouterr().out)
-    return answer
-
-
-def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert _run(export_command, capsys, str(log), out=tmp_path / "x.csv")["count"] == 1000
-    assert _run(export_command, capsys, str(log), "--all", "--force", out=tmp_path / "x.csv")["count"] == 1300
-    assert _run(import_command, capsys, str(tmp_path / "x.csv")) == {"trace": str(tmp_path / "x.mcap"), "cycles": 1300}
+def test_commands(log: Path, tmp_path: Path) -> None:
+    assert rig("export", log, "--out", tmp_path / "x.csv", "--json").json["count"] == 1000
+    assert rig("export", log, "--all", "--force", "--out", tmp_path / "x.csv", "--json").json["count"] == 1300
+    assert rig("import", tmp_path / "x.csv", "--json").json == {"trace": str(tmp_path / "x.mcap"), "cycles": 1300}
     (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-2000])
-    answer = _run(recover_command, capsys, str(tmp_path / "cut.mcap"))
+    answer = rig("recover", tmp_path / "cut.mcap", "--json").json
     assert answer["path"] == str(tmp_path / "cut.recovered.mcap") and not answer["complete"]

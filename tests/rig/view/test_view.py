@@ -17,8 +17,10 @@ from rig_command import rig
 from synthetic_run import record_run
 
 from fdi.trace.trace import Trace
-from rig.view import rerun_log, viewer
-from rig.view.viewer import ViewerError, make_lane_path
+from rig.view import viewer
+from rig.view.recording import TEXTS, Lane, make_lane_path, write_recording
+from rig.view.rerun_log import LANES, LIMITS, PLOTS, draw_run
+from rig.view.viewer import ViewerError
 
 REQUIRED = os.environ.get("EHA_RIG_REQUIRE_VIEWER") == "1"
 
@@ -41,7 +43,7 @@ def _rows(trace: Trace, path: Path) -> dict[str, list[tuple[float, object]]]:
     """What a recording of the trace holds: entity -> time, s (NaN: always), and value of each of its rows."""
     if importlib.util.find_spec("rerun") is None:
         pytest.skip("no rerun: pip install 'eha-rig[view]'")
-    rerun_log.write_rrd(trace, path)
+    write_recording(draw_run(trace), path)
     return read_recording(path)
 
 
@@ -108,7 +110,7 @@ faults = [{ name = "offset of XS / small", kind = "offset", signal = "xs", value
         "/fault/parameter_filter.clogging": [(0.2, "active")]}
     np.testing.assert_allclose([value for _, value in rows["/load/load"]], trace.load, atol=1e-9)
     assert trace.load.max() == 500.0
-    assert "Load on the ram [N]" in {view.title for view in rerun_log.list_shown_views(trace)}
+    assert "Load on the ram [N]" in {view.title for view in draw_run(trace).shown}
 
 
 def test_recording_holds_every_event_and_check(trace: Trace, rows: dict[str, list[tuple[float, object]]]) -> None:
@@ -143,29 +145,26 @@ def test_headless_screenshot_shows_everything(trace: Trace, tmp_path: Path,
     if missing and not REQUIRED:
         pytest.skip(missing)
     assert not missing
-    rerun_log.write_rrd(trace, tmp_path / "view.rrd")
-    pixels = viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "view.rrd", tmp_path / "view.png")
-    plots = {plot.title for plot in rerun_log.PLOTS if plot.origin != "load"}
-    assert {*pixels} == {*plots, rerun_log.LANES, rerun_log.TEXTS, rerun_log.LIMITS}
+    write_recording(draw_run(trace), tmp_path / "view.rrd")
+    pixels = viewer.take_screenshot(draw_run(trace).shown, tmp_path / "view.rrd", tmp_path / "view.png")
+    plots = {title for origin, title in PLOTS if origin != "load"}
+    assert {*pixels} == {*plots, LANES, TEXTS, LIMITS}
     assert (tmp_path / "view.png").stat().st_size > 50_000
-    assert pixels[rerun_log.LANES] > 20_000 and pixels[rerun_log.TEXTS] > 200
-    assert pixels[rerun_log.LIMITS] > 600  # at least the two lines of the position
+    assert pixels[LANES] > 20_000 and pixels[TEXTS] > 200
+    assert pixels[LIMITS] > 600  # at least the two lines of the position
     with capsys.disabled():
         print("\nviewer:", ", ".join(f"{name} {count} px" for name, count in pixels.items()))
 
 
-def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_screenshot_misses_what_is_not_drawn(trace: Trace, tmp_path: Path) -> None:
     missing = _missing()
     if missing and not REQUIRED:
         pytest.skip(missing)
-    for part in ("_send_states", "_send_texts"):
-        monkeypatch.setattr(rerun_log, part, lambda *_: None)
-    rerun_log.write_rrd(trace, tmp_path / "view.rrd")
+    drawing = draw_run(trace)
+    write_recording(drawing._replace(lanes=[Lane("run/x", [], {})], log=[]), tmp_path / "view.rrd")
     with pytest.raises(ViewerError) as caught:
-        viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "view.rrd", tmp_path / "view.png")
-    named = str(caught.value).partition("empty views: ")[2]
-    one, other = rerun_log.LANES, rerun_log.TEXTS
-    assert named in (f"{one}, {other}", f"{other}, {one}")
+        viewer.take_screenshot(drawing.shown, tmp_path / "view.rrd", tmp_path / "view.png")
+    assert str(caught.value).endswith(f"empty views: {LANES}, {TEXTS}")
 
 
 @pytest.fixture(scope="module")
@@ -179,13 +178,13 @@ def test_viewer_that_cannot_draw_says_so(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "x.rrd").write_bytes(b"")
     trace = Trace.read(folder)
     with pytest.raises(ViewerError, match="does not draw"):
-        viewer.take_screenshot(rerun_log.list_shown_views(trace), tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
+        viewer.take_screenshot(draw_run(trace).shown, tmp_path / "x.rrd", tmp_path / "x.png", patience=3)
 
 
 def test_without_rerun_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ViewerError, match=r"pip install 'eha-rig\[view\]'"):
-        rerun_log.write_rrd(Trace.read(folder), folder / "none.rrd")
+        write_recording(draw_run(Trace.read(folder)), folder / "none.rrd")
 
 
 def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,7 +197,7 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_it_listens_on_this_machine_only() -> None:
-    words = viewer._build_command(Path("x.rrd"), "9999")
+    words = viewer.make_viewer_command(9999)
     assert words[words.index("--bind") + 1] == "127.0.0.1"
 
 

@@ -133,7 +133,7 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
     (["--set", BIAS], "--set: expected --compare with it"),
     (["--repeat", "other.csv"], "--repeat: expected --compare with it"),
     (["--signals", "xj"], "--signals: expected --compare with it"),
-    (["--seed", "0"], "--seed: 0: expected --compare with it")])
+    (["--seed", "0"], "--seed: expected --compare with it")])
 def test_options_that_do_not_fit_are_one_line(folder: Path, words: list[str], message: str) -> None:
     said = rig("view", folder / "run.csv", *words)
     assert said.status == 2 and said.err == f"rig view: {message}\n"

@@ -1,0 +1,67 @@
+"""What `rig compare`, `rig explain`, `rig add`, `rig remove` and `rig identify` take: a model with its past, runs."""
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from fdi.discovery.update_model import Provenance, load_model_file
+from plant.errors import InputError, suggest_name
+from plant.model import Model, list_offered_effects, load_model
+from rig.cli.answer import choose_file
+from rig.cli.inputs import load_chosen_effects, parse_changes
+
+
+def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
+    """The model of --model, --set and --effects, with its provenance, which names all effect files in use.
+
+    Raises:
+        InputError: a file or a value that cannot be used, or a model file with code that --trust does not allow.
+    """
+    load_chosen_effects(args)
+    is_file = args.model and Path(args.model).is_file()
+    model, known = load_model_file(Path(args.model)) if is_file else (load_model(args.model or "eha"), Provenance())
+    files = tuple(dict.fromkeys([*known.effect_files, *map(str, args.effects)]))
+    return model.replace(parse_changes(args.set)), replace(known, effect_files=files)
+
+
+def split_words(words: Sequence[str], trace: str | None, plant: str) -> tuple[list[str], str | None]:
+    """The effects of a plant, and the trace, among the words of a command.
+
+    Raises:
+        InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
+    """
+    effects, known = [], [e.name for e in list_offered_effects(plant)]
+    for word in words:
+        is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
+        if word in known:
+            effects.append(word)
+        elif trace is None and is_file:
+            trace = word
+        else:
+            hint = suggest_name(word, known, 0.5) or " (rig effects lists them)"
+            raise InputError("effect", word, f"an effect of the catalogue{hint}")
+    if not effects:
+        raise InputError("effect", "", "at least one effect (rig effects lists them)")
+    return effects, trace
+
+
+def choose_model_file(args: argparse.Namespace, trace: str | None) -> Path:
+    """The model file to write: --out, else the file of --model, else model.toml.
+
+    Raises:
+        InputError: a place that cannot be written, or another kind of file.
+    """
+    own = args.model if args.model and Path(args.model).is_file() else "model.toml"
+    path = choose_file(args.out or own, (".toml",), trace)
+    assert path is not None
+    return path
+
+
+def format_command_line() -> str:
+    """The command as the user typed it, for the history of a model file; "rig" in another program."""
+    is_command = Path(sys.argv[0]).name in ("rig", "main.py")  # main.py: python -m rig.cli.main
+    return shlex.join(["rig", *sys.argv[1:]]) if is_command else "rig"

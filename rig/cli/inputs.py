@@ -1,0 +1,81 @@
+"""What the options of several commands stand for: the plant model, the effects of the user, the signals to use."""
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from fdi import foreign_code
+from plant.effects import load_effects
+from plant.errors import InputError
+from plant.model import Model, load_model
+
+
+def parse_changes(pairs: Sequence[str]) -> dict[str, str]:
+    """Parse the --set options: "GROUP.FIELD" to value.
+
+    Raises:
+        InputError: an option that is not GROUP.FIELD=VALUE.
+    """
+    table: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not (equals and value and "." in name):
+            raise InputError("--set", pair, "GROUP.FIELD=VALUE, such as spool.static_friction=35")
+        table[name.strip()] = value.strip()
+    return table
+
+
+def load_user_effects(files: Sequence[Path]) -> None:
+    """Add the effects of files that the user names to the catalogue.
+
+    Raises:
+        InputError: an invalid file, or two files of one name.
+    """
+    foreign_code.require_different_names(files)
+    for file in files:
+        load_effects(file)
+
+
+def load_chosen_effects(args: argparse.Namespace) -> None:
+    """Add the user's own effects to the catalogue: the files of --effects and, with --trust, those of a model file.
+
+    Raises:
+        InputError: an invalid file, code that --trust does not allow, or two files of one name.
+    """
+    load_user_effects(args.effects)
+    brought = foreign_code.load_effects_of_model(args.model, args.effects, is_trusted=args.trust)
+    foreign_code.require_different_names((*args.effects, *brought))
+
+
+def load_chosen_model(args: argparse.Namespace) -> Model:
+    """Load the model that --model, --set and --effects describe.
+
+    Raises:
+        InputError: a file, name or value that is invalid, or a model file with code that --trust does not allow.
+    """
+    load_chosen_effects(args)
+    return load_model(args.model or "eha").replace(parse_changes(args.set))
+
+
+def list_signals(args: argparse.Namespace) -> list[str] | None:
+    """The signals of --signals; None for all that the trace has."""
+    return [name.strip() for name in args.signals.split(",")] if args.signals is not None else None
+
+
+def format_arguments(args: argparse.Namespace) -> str:
+    """The runs and the model of a command, as arguments of the command to type next."""
+    words = [args.trace]
+    for name in ("repeat", "holdout", "model", "set", "effects", "signals"):
+        values = getattr(args, name, None) or []
+        words += [word for value in (values if isinstance(values, list) else [values])
+                  for word in (f"--{name}", str(value))]
+    words += ["--trust"] if args.trust else []
+    return shlex.join(words)
+
+
+def list_shipped_sequences() -> list[str]:
+    """Names of the sequences that come with the rig."""
+    return sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir() if entry.name.endswith(".toml"))
