@@ -1,17 +1,16 @@
 """Other formats to and from a log: CSV of the signals; raw frames as candump .log, Vector .blf/.asc or PEAK .trc."""
 from __future__ import annotations
 
-import math
 import time
 from array import array
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.output import require_writable, write_whole
 from fdi.trace.importing.formats import Channel
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 
 RAW_SUFFIXES = (".log", ".blf", ".asc", ".trc")
-NAN = math.nan
+_STATES = {state.value: state.name.lower().replace("_", "-") for state in State}
 
 
 def export_trace(source: Path, out: Path, everything: bool = False) -> int:
@@ -86,27 +85,38 @@ def write_imported(trace: Trace, chosen: ImportMap, out: Path) -> None:
 def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = None) -> None:
     """Write a trace's signals as a log; `metadata` is its own provenance by default.
 
-    Raises InputError for a place that cannot be written; unlike a run it makes no folder.
+    Raises:
+        RecorderError: a place that cannot be written.
     """
     given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
-    given = {**given, **write_sensors(trace.sensors)}
     attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
-    with write_whole(_require_mcap(out)) as part:
-        recorder = Recorder(part, attachments, given)
-        columns: tuple[NDArray[Any], ...] = (trace.phase, trace.com, trace.xj, trace.cor, trace.p12, trace.xs,
-                                             trace.load)
-        for k, (phase, *values) in enumerate(_list_rows(columns)):
-            if not all(math.isnan(value) for value in values):
-                com, xj, cor, p12, xs, load = values
-                recorder.put(round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0))
-                _wait_for_writer(recorder, k)
+    _write_log(out, attachments, {**given, **write_sensors(trace.sensors)}, _list_rows(trace))
+
+
+def _list_rows(trace: Trace, block: int = 10_000) -> Iterator[tuple[int, Signals]]:
+    """The rows of a trace that have a value, made in blocks: those of a long recording would fill the memory."""
+    signals = np.column_stack((trace.com, trace.xj, trace.cor, trace.p12, trace.xs, trace.load))
+    known = np.flatnonzero(~np.isnan(signals).all(axis=1))
+    for first in range(0, len(known), block):
+        rows = known[first:first + block]
+        for k, phase, (com, xj, cor, p12, xs, load) in zip(
+                rows.tolist(), trace.phase[rows].tolist(), signals[rows].tolist(), strict=True):
+            yield round(k * trace.period * 1e9), Signals(k, phase, com, xj, cor, p12, xs, load, 0, 0, 0)
+
+
+def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
+               items: Iterable[Frame | tuple[int, Record]]) -> None:
+    """Write raw frames, and records with their times, as fast as the writer can: here nothing paces the loop."""
+    with write_whole(out) as part:
+        recorder = Recorder(part, attachments, metadata)
+        for k, item in enumerate(items):
+            if isinstance(item, Frame):
+                recorder.frame(item)
+            else:
+                recorder.put(*item)
+            while k % 10_000 == 0 and recorder.waiting > 100_000:
+                time.sleep(0.01)
         recorder.close()
-
-
-def _list_rows(columns: Sequence[NDArray[Any]], block: int = 10_000) -> Iterator[tuple[Any, ...]]:
-    """The rows of columns as Python numbers, made in blocks: those of a long recording would fill the memory."""
-    for first in range(0, len(columns[0]), block):
-        yield from zip(*(column[first:first + block].tolist() for column in columns), strict=True)
 
 
 def import_frames(source: Path, out: Path, dbc: Path) -> int:
@@ -115,35 +125,28 @@ def import_frames(source: Path, out: Path, dbc: Path) -> int:
     Row k holds the demand sent before SYNC k, what the plant sensed at it and the drive frame that echoes its number.
     Raises InputError for a file or DBC that cannot be read, and when there is no SYNC in it.
     """
-    raw = list(_read_frames(source))
-    cycles = _CycleBuilder(_load_decoder(dbc))
-    records = [(frame.t_ns, record) for frame in raw for record in cycles.feed(frame)]
-    if not cycles.rows:
+    cycles = _CycleBuilder(_load_own_messages(dbc))
+    items: list[Frame | tuple[int, Record]] = []
+    for frame in _read_frames(source):
+        items += [frame, *((frame.t_ns, record) for record in cycles.feed(frame))]
+    starts = [t_ns for t_ns, _ in cycles.rows]
+    if not starts:
         raise InputError(source, "", f"at least one SYNC frame (0x{codec.SYNC:03X})")
-    spans = [b[0] - a[0] for a, b in zip(cycles.rows, cycles.rows[1:], strict=False)]
-    period = round(sorted(spans)[len(spans) // 2] / 1e9, 4) if spans else 1e-3
-    items: list[tuple[int, Frame | Record]] = [(f.t_ns, f) for f in raw]
-    items += [*cycles.rows, *records]
-    with write_whole(_require_mcap(out)) as part:
-        recorder = Recorder(part, {dbc.name: ("text/plain", dbc.read_bytes())},
-                            collect_provenance(imported=source.name, period=period, pace="imported"))
-        for k, (t_ns, item) in enumerate(sorted(items, key=lambda pair: pair[0])):
-            if isinstance(item, Frame):
-                recorder.frame(item)
-            else:
-                recorder.put(t_ns, item)
-            _wait_for_writer(recorder, k)
-        recorder.close()
-    return len(cycles.rows)
+    spans = np.sort(np.diff(starts))
+    period = round(float(spans[len(spans) // 2]) / 1e9, 4) if len(spans) else 1e-3
+    items = sorted([*items, *cycles.rows], key=lambda item: item[0])
+    _write_log(out, {dbc.name: ("text/plain", dbc.read_bytes())},
+               collect_provenance(imported=source.name, period=period, pace="imported"), items)
+    return len(starts)
 
 
 class _CycleBuilder:
     """Frames in, one Signals a SYNC out; heartbeats and emergencies become records on the way."""
 
-    def __init__(self, decode: dict[int, Any]) -> None:
+    def __init__(self, messages: Mapping[int, Any]) -> None:
         self.rows: list[tuple[int, Signals]] = []
-        self._decode = decode
-        self._demand, self._control = NAN, 0
+        self._messages = messages
+        self._demand, self._control = nan, 0
         self._sent: int | None = None  # cycle of the command since the last SYNC
         self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
         self._nmt: dict[int, int] = {}
@@ -153,14 +156,14 @@ class _CycleBuilder:
         cob_id, node = frame.cob_id, frame.cob_id & 0x7F
         if cob_id == codec.SYNC:
             self._open(frame.t_ns)
-        elif cob_id in self._decode:
-            message = self._decode[cob_id]
+        elif cob_id in self._messages:
+            message = self._messages[cob_id]
             if len(frame.data) < message.length:
                 return [Event("WARN", "frame", f"0x{cob_id:03X}: {len(frame.data)} bytes instead of {message.length}")]
-            self._signals(cob_id, message.decode(frame.data, decode_choices=False))
+            self._take(cob_id, message.decode(frame.data, decode_choices=False))
         elif 0x700 < cob_id < 0x780 and len(frame.data) == 1 and self._nmt.get(node) != frame.data[0]:
-            self._nmt[node] = frame.data[0]
-            return [NmtState(node, frame.data[0], _name_state(frame.data[0]))]
+            state = self._nmt[node] = frame.data[0]
+            return [NmtState(node, state, _STATES.get(state, f"state {state}"))]
         elif codec.SYNC < cob_id < 0x100 and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
             return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
@@ -171,12 +174,12 @@ class _CycleBuilder:
         sent = expected if self._sent is None else self._sent
         skipped = (sent - expected) & 0xFFFF if self.rows else 0
         cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
-        row = Signals(cycle, 1, self._demand, NAN, NAN, NAN, NAN, NAN, self._control, 0, 0)
+        row = Signals(cycle, 1, self._demand, nan, nan, nan, nan, nan, self._control, 0, 0)
         self.rows.append((t_ns, row))
         self._recent.append((sent & 0xFFFF, row))
         self._sent = None
 
-    def _signals(self, cob_id: int, values: dict[str, Any]) -> None:
+    def _take(self, cob_id: int, values: Mapping[str, Any]) -> None:
         if cob_id == codec.COMMAND:
             self._demand, self._control = values["position_demand"], values["control_word"]
             self._sent = values["cycle"]
@@ -190,21 +193,13 @@ class _CycleBuilder:
                     row.cor, row.status = values["current"], values["status_word"]
 
 
-def _name_state(code: int) -> str:
-    try:
-        return State(code).name.lower().replace("_", "-")
-    except ValueError:
-        return f"state {code}"
-
-
 def _read_frames(source: Path) -> Iterator[Frame]:
     first = None
     for message in list_can_messages(source):
-        if message.is_extended_id or message.is_fd:
-            continue
-        first = message.timestamp if first is None else first
-        t_ns = max(0, round((message.timestamp - first) * 1e9))
-        yield Frame(t_ns, message.arbitration_id, bytes(message.data))
+        if not (message.is_extended_id or message.is_fd):
+            first = message.timestamp if first is None else first
+            t_ns = max(0, round((message.timestamp - first) * 1e9))
+            yield Frame(t_ns, message.arbitration_id, bytes(message.data))
 
 
 def list_can_messages(source: Path) -> Iterator[can.Message]:
@@ -227,36 +222,33 @@ def list_can_messages(source: Path) -> Iterator[can.Message]:
         raise InputError(source, "", f"CAN frames as {source.suffix} ({error})") from error
 
 
-def _load_decoder(dbc: Path) -> dict[int, Any]:
+def _load_messages(dbc: Path) -> dict[tuple[int, bool], Any]:
+    """The messages of a DBC by identifier and whether it is extended.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     import cantools
 
     try:
-        base = cantools.database.load_file(str(dbc), database_format="dbc")
+        base = cantools.database.load_file(str(dbc))
     except OSError as error:
         raise InputError(dbc, "--dbc", f"a readable file ({error.strerror})") from error
-    except cantools.Error as error:
-        raise InputError(dbc, "--dbc", f"a DBC file ({str(error).splitlines()[0]})") from error
-    found = {m.frame_id: m for m in base.messages}  # type: ignore[union-attr]
-    wanted: dict[int, set[str]] = {}
+    except (cantools.Error, ValueError) as error:
+        reason = [*str(error).splitlines(), type(error).__name__][0]
+        raise InputError(dbc, "--dbc", f"a DBC file ({reason})") from error
+    return {(m.frame_id, m.is_extended_frame): m for m in getattr(base, "messages", ())}
+
+
+def _load_own_messages(dbc: Path) -> dict[int, Any]:
+    """The messages of our own frames, which have all our signals."""
+    found = _load_messages(dbc)
+    own: dict[int, Any] = {}
     for signal in codec.SIGNALS:
-        wanted.setdefault(signal.cob_id, set()).add(signal.name)
-    for cob_id, names in wanted.items():
-        if cob_id not in found or not names <= {s.name for s in found[cob_id].signals}:
-            raise InputError(dbc, f"frame 0x{cob_id:03X}", f"the signals {', '.join(sorted(names))}")
-    return {cob_id: found[cob_id] for cob_id in wanted}
-
-
-def _require_mcap(out: Path) -> Path:
-    if out.suffix != ".mcap":
-        raise InputError(out, "--out", "a name that ends in .mcap")
-    return require_writable(out, "--out")
-
-
-def _wait_for_writer(recorder: Recorder, item: int) -> None:
-    """Let the writer keep up: here nothing paces the loop."""
-    if item % 10_000 == 0:
-        while recorder.waiting > 100_000:
-            time.sleep(0.01)
+        own[signal.cob_id] = message = found.get((signal.cob_id, False))
+        if message is None or signal.name not in [each.name for each in message.signals]:
+            raise InputError(dbc, f"frame 0x{signal.cob_id:03X}", f"the signal {signal.name}")
+    return own
 
 
 @dataclass(frozen=True)
@@ -275,28 +267,23 @@ class CanMeasurement:
         Raises:
             InputError: a log that cannot be read, or without a frame of one of the signals.
         """
-        wanted: dict[str, list[str]] = {}
-        for name in names:
-            message, _, signal = name.rpartition(".")
-            wanted.setdefault(message, []).append(signal)
-        values = {name: array("d") for name in names}
-        times = {name: array("d") for name in names}
+        wanted = {name.rpartition(".")[0] for name in names}
+        columns = {name: (array("d"), array("d")) for name in names}  # values, times
         first: float | None = None
         for frame in list_can_messages(self.path):
             first = frame.timestamp if first is None else first
             known = self.messages.get((frame.arbitration_id, frame.is_extended_id))
             if known is None or known.name not in wanted or len(frame.data) < known.length:
                 continue
-            found = known.decode(bytes(frame.data), decode_choices=False)
-            for signal in wanted[known.name]:
-                if signal in found:  # of a multiplexed message, those of this frame
-                    name = f"{known.name}.{signal}"
-                    values[name].append(float(found[signal]))
-                    times[name].append(frame.timestamp - first)
-        for name, column in values.items():
-            if not column:
+            for signal, value in known.decode(bytes(frame.data), decode_choices=False).items():
+                name = f"{known.name}.{signal}"
+                if name in columns:
+                    columns[name][0].append(float(value))
+                    columns[name][1].append(frame.timestamp - first)
+        for name, (values, _) in columns.items():
+            if not values:
                 raise InputError(self.path, name, "at least one frame of this message")
-        return {name: Channel(np.frombuffer(values[name]), np.frombuffer(times[name])) for name in names}
+        return {name: Channel(*map(np.frombuffer, column)) for name, column in columns.items()}
 
 
 def open_can_log(path: Path, dbc: Path) -> CanMeasurement:
@@ -305,16 +292,7 @@ def open_can_log(path: Path, dbc: Path) -> CanMeasurement:
     Raises:
         InputError: a DBC that cannot be read or has no signals.
     """
-    import cantools
-
-    try:
-        base: Any = cantools.database.load_file(str(dbc))
-    except OSError as error:
-        raise InputError(dbc, "--dbc", f"a readable file ({error.strerror})") from error
-    except (cantools.Error, ValueError) as error:
-        reason = str(error).splitlines()
-        raise InputError(dbc, "--dbc", f"a DBC file ({reason[0] if reason else type(error).__name__})") from error
-    messages = {(m.frame_id, m.is_extended_frame): m for m in getattr(base, "messages", ())}
+    messages = _load_messages(dbc)
     units = {f"{m.name}.{s.name}": s.unit or "" for m in messages.values() for s in m.signals}
     if not units:
         raise InputError(dbc, "--dbc", "a DBC file with at least one signal")

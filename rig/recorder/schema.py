@@ -162,9 +162,7 @@ def make_packer(record: type) -> Callable[[int, Any], bytes]:
     for number, item in enumerate(fields(record), 1):
         _, wire, code = _WIRE[hints[item.name]]
         tag = number << 3 | wire
-        if code:
-            if blobs:
-                raise TypeError(f"{record.__name__}.{item.name}: fields of fixed width come first")
+        if code:  # fields of fixed width come first
             layout, args = layout + "B" + code, [*args, tag, 0]
         else:
             blobs.append((item.name, bytes([tag])))
@@ -178,11 +176,7 @@ def make_packer(record: type) -> Callable[[int, Any], bytes]:
     def pack(t_ns: int, values: Any) -> bytes:
         args[4] = args[5] = t_ns
         args[7::2] = get(values)
-        if not blobs:
-            args[1] = size
-            whole: bytes = fixed.pack(*args)
-            return whole
-        tail = b"".join(tag + _encode_blob(getattr(values, name)) for name, tag in blobs)
+        tail = b"".join([tag + _encode_blob(getattr(values, name)) for name, tag in blobs]) if blobs else b""
         args[1] = size + len(tail)
         head: bytes = fixed.pack(*args)
         return head + tail
@@ -195,11 +189,10 @@ def _make_frame_packer(pack_head: Callable[..., bytes], args: list[int], size: i
     tails = [bytes([2 << 3 | 2, n]) for n in range(9)]
 
     def pack(t_ns: int, frame: Any) -> bytes:
-        data = frame[2]
+        data: bytes = frame[2]
         n = len(data)
         head: bytes = pack_head(opcode, size + 2 + n, channel, sequence, t_ns, t_ns, tag, frame[1])
-        whole: bytes = head + tails[n] + data
-        return whole
+        return head + tails[n] + data
 
     return pack
 

@@ -65,15 +65,13 @@ class RecorderError(RigError):
 
 
 def list_channels() -> tuple[list[Schema], list[Channel]]:
-    """Schemas and channels of a log of this rig."""
-    schemas, out = [], []
-    for topic, record in TOPICS.items():
-        number = CHANNELS[record]
-        schemas.append(Schema(id=number, data=encode_schema(record), encoding="protobuf",
-                              name=f"eha.{record.__name__}"))
-        out.append(Channel(id=number, topic=topic, message_encoding="protobuf", metadata=describe_channel(record),
-                           schema_id=number))
-    return schemas, out
+    """Schemas and channels of a log of this rig; both have the number of the channel."""
+    schemas = [Schema(id=CHANNELS[record], data=encode_schema(record), encoding="protobuf",
+                      name=f"eha.{record.__name__}") for record in TOPICS.values()]
+    channels = [Channel(id=CHANNELS[record], topic=topic, message_encoding="protobuf",
+                        metadata=describe_channel(record), schema_id=CHANNELS[record])
+                for topic, record in TOPICS.items()]
+    return schemas, channels
 
 
 class Recorder:
@@ -94,8 +92,7 @@ class Recorder:
                  epoch_ns: int = 0, observe: Callable[[int, Record], None] | None = None) -> None:
         self.path = path
         self._epoch_ns, self._observe = epoch_ns, observe
-        self._failure: RecorderError | None = None
-        self._told = False
+        self._failure: RecorderError | None = None  # that the loop has not heard of
         self._queue: deque[Any] = deque()
         self.frame = self._queue.append
         self._stop = threading.Event()
@@ -146,13 +143,12 @@ class Recorder:
         """Write all that is queued, the indexes and statistics. Safe to call again."""
         self._stop.set()
         self._thread.join()
-        if self._failure is not None and not self._told:
-            self._tell()
+        self._tell()
 
     def _tell(self) -> None:
-        if not self._told and self._failure is not None:
-            self._told = True
-            raise self._failure
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
     def _run(self) -> None:
         try:
@@ -183,7 +179,8 @@ class Recorder:
         for _ in range(waiting):
             item = queue.popleft()
             if len(item) == 3:
-                self._add(item[0] + epoch_ns, frames, pack_frame(item[0] + epoch_ns, item))
+                t_ns = item[0] + epoch_ns
+                self._add(t_ns, frames, pack_frame(t_ns, item))
                 continue
             t_ns, record = item
             pack = packers.get(type(record))

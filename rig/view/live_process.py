@@ -5,65 +5,70 @@ import contextlib
 import importlib.util
 import os
 import pickle
+import select
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from fdi.output import require_writable
 from plant.errors import InputError
 from rig.interrupts import ignore_interrupts
-from rig.view.live_feed import LiveFeed, make_shared_file
 from rig.view.live_run import LivePlan
-from rig.view.viewer import is_listening, lacks_display, wait_until
+from rig.view.viewer import is_listening, lacks_display
 
 
 @contextlib.contextmanager
-def show_live(plan: LivePlan, last_cpu_is_taken: bool, place: ViewerPlace | None = None,
-              patience: float = 30.0) -> Iterator[LiveFeed]:
-    """Start the showing process, wait until it is ready, and give the feed to fill; end the process afterwards.
+def show_live(plan: LivePlan, log: Path, last_cpu_is_taken: bool, place: ViewerPlace | None = None,
+              patience: float = 30.0) -> Iterator[Callable[[], None]]:
+    """Start the showing process, wait until it is ready, and give the function to call as soon as the log is there.
 
     The process has normal priority. It ignores Ctrl-C, which ends the run and through it the process; what it leaves of
     the screen if it is killed is cleared here.
 
     Args:
         plan: of the run.
+        log: of the run.
         place: of the viewer; None: the screen in the terminal.
         last_cpu_is_taken: the loop runs on the last CPU; the process gets the others, where there are any.
         patience: s to wait for the process; without it the run begins anyway.
     """
-    with make_shared_file() as file:
-        feed = LiveFeed(file.fileno())
-        with ignore_interrupts():
-            words = [str(file.fileno()), *([str(place.port), str(place.file or "")] if place is not None else [])]
-            process = subprocess.Popen([sys.executable, "-m", "rig.view.live_show", *words],
-                                       stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[file.fileno()])
-        try:
-            _send_plan(process, plan, last_cpu_is_taken)
-            wait_until(lambda: feed.is_read, process, patience)
-            yield feed
-        finally:
-            feed.end()
-            _end_process(process, is_on_screen=place is None)
+    words = [str(log), *([str(place.port), str(place.file or "")] if place is not None else [])]
+    with ignore_interrupts():
+        process = subprocess.Popen([sys.executable, "-m", "rig.view.live_show", *words], stdin=subprocess.PIPE,
+                                   stdout=subprocess.PIPE)
+    assert process.stdin is not None and process.stdout is not None
+    stdin, is_begun = process.stdin, False
 
+    def send(data: bytes) -> None:
+        with contextlib.suppress(BrokenPipeError):  # it has ended
+            stdin.write(data)
+            stdin.flush()
 
-def _send_plan(process: subprocess.Popen[bytes], plan: LivePlan, last_cpu_is_taken: bool) -> None:
-    assert process.stdin is not None
-    cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if last_cpu_is_taken and len(cpus) > 1:
-        with contextlib.suppress(OSError):  # it has ended
-            os.sched_setaffinity(process.pid, cpus[:-1])
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.write(pickle.dumps(plan))
-        process.stdin.flush()
+    def begin() -> None:
+        nonlocal is_begun
+        if not is_begun:
+            is_begun = True
+            send(b"\n")
+
+    try:
+        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        if last_cpu_is_taken and len(cpus) > 1:
+            with contextlib.suppress(OSError):  # it has ended
+                os.sched_setaffinity(process.pid, cpus[:-1])
+        send(pickle.dumps(plan))
+        select.select([process.stdout], [], [], patience)  # it closes its output when it is ready, or ends
+        yield begin
+    finally:
+        _end_process(process, is_on_screen=place is None)
 
 
 def _end_process(process: subprocess.Popen[bytes], *, is_on_screen: bool) -> None:
     """Let the process end by itself, kill it if it does not, and restore the screen if it could not."""
-    assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.close()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(BrokenPipeError):
+            pipe.close()  # type: ignore[union-attr]
     try:
         process.wait(3.0 if is_on_screen else 20.0)  # a file is to be whole
     except subprocess.TimeoutExpired:

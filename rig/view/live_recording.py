@@ -2,13 +2,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.network.node_objects import NAMES
-from rig.view.live_feed import COLUMNS, Message
-from rig.view.live_run import CheckState, LivePlan, LiveRun
+from rig.recorder import Check, Event, NmtState, Record
+from rig.view.live_run import COLUMNS, CheckState, LivePlan, LiveRun
 from rig.view.recording import FAIL, MEASURED, NEUTRAL, NOTHING, PASS, Drawing, Lane, LogText, Recording
 from rig.view.rerun_log import (
     ACTIVE,
@@ -39,7 +40,7 @@ def draw_plan(plan: LivePlan) -> Drawing:
 def _list_signals(plan: LivePlan) -> list[str]:
     """The signals that are drawn; in lockstep nothing is ever late."""
     left_out = {"lateness": plan.pace == "lockstep", "load": not plan.has_load}
-    return [name for name in ("error", *COLUMNS[3:-1]) if not left_out.get(name)]
+    return [name for name in ("error", *COLUMNS[2:-1]) if not left_out.get(name)]
 
 
 class LiveView:
@@ -49,28 +50,25 @@ class LiveView:
         """Use the recording of the drawing of this plan."""
         self._recording, self._plan, self._signals = recording, plan, _list_signals(plan)
         self._rows = 0
-        self._waiting: list[Message] = []
+        self._waiting: list[tuple[int, Record]] = []
         self._shown: dict[str, str] = {}  # lane -> state
 
-    def update(self, run: LiveRun, messages: list[Message], *, is_last: bool = False) -> None:
-        """Send the rows and messages that have come since the last call; before main only if it is the last one."""
-        self._waiting += messages
-        zero = run.zero_ns
-        if math.isnan(zero):
-            if not is_last:
-                return
-            zero = self._waiting[-1].t_ns if self._waiting else 0.0
-        for message in self._waiting:
-            self._send_message(message, (message.t_ns - zero) * 1e-9)
+    def update(self, run: LiveRun, new: Sequence[tuple[int, Record]]) -> None:
+        """Send the records that have come since the last call, once main has begun."""
+        self._waiting += new
+        if math.isnan(run.zero_ns):
+            return
+        for t_ns, record in self._waiting:
+            self._send_record(record, (t_ns - run.zero_ns) * 1e-9)
         self._waiting.clear()
         rows = run.read_rows_from(self._rows)
         self._rows += len(rows)
         if len(rows):
-            self._send_rows(rows, zero, run)
+            self._send_rows(rows, run)
 
-    def _send_rows(self, rows: NDArray[np.float64], zero: float, run: LiveRun) -> None:
+    def _send_rows(self, rows: NDArray[np.float64], run: LiveRun) -> None:
         columns = dict(zip(COLUMNS, rows.T, strict=True))
-        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - zero) * 1e-9
+        columns["error"], t = columns["com"] - columns["xj"], (columns["t_ns"] - run.zero_ns) * 1e-9
         for (origin, _), lines in PLOTS.items():
             for line in lines:
                 if line.signal in self._signals:
@@ -83,20 +81,19 @@ class LiveView:
             if not state.is_final:
                 self._send_check(state, float(t[-1]))
 
-    def _send_message(self, message: Message, t: float) -> None:
-        fields = message.fields
-        if message.kind == "NmtState":
-            self._send_state(name_node_lane(int(fields["node"])), t, str(fields["name"]))
-        elif message.kind == "Check":
-            state = CheckState.read(fields)
+    def _send_record(self, record: Record, t: float) -> None:
+        if isinstance(record, NmtState):
+            self._send_state(name_node_lane(record.node), t, record.name)
+        elif isinstance(record, Check):
+            state = CheckState.read(record)
             self._send_check(state, t)
             self._recording.send_text(LogText(
                 "log/checks", t, f"{state.word} {state.name}:{state.measured} {state.detail}".rstrip(),
-                "INFO" if state.word == "PASS" else "ERROR"))
-        elif message.kind == "Event":
-            text = f"{t:8.3f} s  {fields['kind']}: {fields['text']}"
-            self._recording.send_text(LogText("log/events", t, text, fields["level"]))
-            fault = read_fault_event(fields["text"]) if fields["kind"] == "fault" else None
+                "INFO" if record.passed else "ERROR"))
+        elif isinstance(record, Event):
+            text = f"{t:8.3f} s  {record.kind}: {record.text}"
+            self._recording.send_text(LogText("log/events", t, text, record.level))
+            fault = read_fault_event(record.text) if record.kind == "fault" else None
             if fault:
                 self._send_state(f"fault/{fault[0]}", t, fault[1])
 

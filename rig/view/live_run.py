@@ -3,22 +3,22 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Mapping
 from math import isnan, nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant import Columns
 from plant.segments import RATE
+from rig import recorder
 from rig.network.node_objects import CONTROLLER, NAMES, PLANT, RIG
 from rig.sequences import Sequence
 from rig.sequences.checks import Check
 from rig.sequences.measures import MAIN, RunData
-from rig.view.live_feed import COLUMNS, Message
 
 PHASES = ("set-up", "main", "clean-up")
+COLUMNS = ("t_ns", "phase", "com", "xj", "cor", "p12", "xs", "load", "lateness", "response", "overrun")
 _COLUMN = {name: number for number, name in enumerate(COLUMNS)}
 _AFTER_RUN = ("shut_off", "recovers")  # kinds that need all drive frames
 _GROWS = ("never_exceeds", "max_error", "event_never")  # kinds whose number only grows: a limit passed stays passed
@@ -75,10 +75,9 @@ class CheckState(NamedTuple):
     detail: str = ""
 
     @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> CheckState:
+    def read(cls, check: recorder.Check) -> CheckState:
         """What the run itself says of a check at its end."""
-        return cls(fields["name"], "PASS" if fields["passed"] else "FAIL", fields["value"], fields["unit"], True,
-                   fields["detail"])
+        return cls(check.name, "PASS" if check.passed else "FAIL", check.value, check.unit, True, check.detail)
 
     @property
     def is_judged(self) -> bool:
@@ -93,7 +92,7 @@ class CheckState(NamedTuple):
 
 
 class LiveRun:
-    """Collects rows and messages of a run."""
+    """Collects the records of a run's log."""
 
     def __init__(self, plan: LivePlan) -> None:
         self.plan = plan
@@ -108,40 +107,40 @@ class LiveRun:
         self.checks = {name: CheckState(name, "waits" if name in waiting else "after the run")
                        for name in plan.check_names}
         self.overruns = 0
+        self._signals: recorder.Signals | None = None
 
-    # ------------------------------------------------------------------------------------ what comes in
-
-    def add_rows(self, rows: NDArray[np.float64]) -> None:
-        """Append cycles."""
-        first, self.cycles = self.cycles, self.cycles + len(rows)
-        while self.cycles > len(self._table):
-            self._table = np.concatenate((self._table, np.empty_like(self._table)))
-        self._table[first:self.cycles] = rows
-        self.overruns += int(rows[:, _COLUMN["overrun"]].sum())
-        phase = rows[:, _COLUMN["phase"]]
-        if self._main_from < 0 and (phase >= 1).any():
-            self._main_from = first + int(np.argmax(phase >= 1))
-            self.zero_ns = float(self._table[self._main_from, _COLUMN["t_ns"]])
-        if self._main_until < 0 and (phase >= 2).any():
-            self._main_until = first + int(np.argmax(phase >= 2))
-
-    def add_message(self, message: Message) -> None:
-        """Take in an event, a state of a node or a check."""
-        fields = message.fields
-        if message.kind == "NmtState":
-            self.states[int(fields["node"])] = str(fields["name"])
-        elif message.kind == "Check":
-            self.checks[fields["name"]] = CheckState.read(fields)
-        elif message.kind == "Event":
-            event = Event((message.t_ns - self.zero_ns) * 1e-9, fields["level"], fields["kind"], fields["text"])
-            self.events.append(event)
-            node = find_dead_node(event.level, event.kind, event.text)
+    def add(self, t_ns: int, record: recorder.Record) -> None:
+        """Take in a record of the log: `Signals` with the `Timing` that follows are a row."""
+        if isinstance(record, recorder.Signals):
+            self._signals = record
+        elif isinstance(record, recorder.Timing):
+            self._add_row(t_ns, record)
+        elif isinstance(record, recorder.NmtState):
+            self.states[record.node] = record.name
+        elif isinstance(record, recorder.Check):
+            self.checks[record.name] = CheckState.read(record)
+        else:
+            self.events.append(Event((t_ns - self.zero_ns) * 1e-9, record.level, record.kind, record.text))
+            node = find_dead_node(record.level, record.kind, record.text)
             if node:
-                self.troubles[node] = event.text.partition(": ")[2] or "is silent"
-            elif event.kind == "heartbeat" and event.level == "INFO" and event.text.startswith("node "):
-                self.troubles.pop(int(event.text.split()[1]), None)
+                self.troubles[node] = record.text.partition(": ")[2] or "is silent"
+            elif record.kind == "heartbeat" and record.level == "INFO" and record.text.startswith("node "):
+                self.troubles.pop(int(record.text.split()[1]), None)
 
-    # ------------------------------------------------------------------------------------ what is shown
+    def _add_row(self, t_ns: int, timing: recorder.Timing) -> None:
+        row = self._signals
+        if row is None or row.cycle != timing.cycle:
+            return
+        if self.cycles == len(self._table):
+            self._table = np.concatenate((self._table, np.empty_like(self._table)))
+        self._table[self.cycles] = (t_ns, row.phase, row.com, row.xj, row.cor, row.p12, row.xs, row.load,
+                                    timing.lateness, timing.response, timing.overrun)
+        if self._main_from < 0 and row.phase >= 1:
+            self._main_from, self.zero_ns = self.cycles, float(t_ns)
+        if self._main_until < 0 and row.phase >= 2:
+            self._main_until = self.cycles
+        self.cycles += 1
+        self.overruns += timing.overrun
 
     def read_rows_from(self, first: int) -> NDArray[np.float64]:
         """The rows from this one on, (rows, columns)."""

@@ -1,11 +1,12 @@
-"""The program that shows a run, in a process of its own: `python -m rig.view.live_show NUMBER [PORT FILE]`.
+"""The program that shows a run, in a process of its own: `python -m rig.view.live_show LOG [PORT FILE]`.
 
-NUMBER is the file descriptor of the shared memory. Without more words it shows the run in the terminal. PORT is that of
+LOG is the log of the run. Without more words this program shows the run in the terminal. PORT is that of
 an open viewer on 127.0.0.1, or 0; FILE is a recording for the viewer to write, or empty; with neither, a viewer is
 opened, which stays open after the run.
 
-The plan of the run comes on standard input, which stays open as long as the rig runs: when it ends, however it ends,
-this program restores the terminal and ends too.
+The plan of the run comes on standard input, and a byte when the log is there. Standard input stays open as long as the
+rig runs: when it ends, however it ends, this program restores the terminal and ends too. It closes its standard output
+when it is ready.
 """
 from __future__ import annotations
 
@@ -16,11 +17,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
 
-from rig.view.live_feed import LiveReader, Message
+from rig.recorder import Record
+from rig.view.live_log import follow_log
 from rig.view.live_run import LivePlan, LiveRun
 from rig.view.live_screen import describe_line, draw_screen
 from rig.view.viewer import find_free_port, is_listening, make_viewer_command, wait_until
@@ -28,39 +31,39 @@ from rig.view.viewer import find_free_port, is_listening, make_viewer_command, w
 _EVERY = 0.1  # s between two frames, or pieces
 
 
-def follow_run(reader: LiveReader, run: LiveRun) -> Iterator[list[Message]]:
-    """Add what is new to the run again and again, and give the messages, until it is over or the rig has gone."""
+Batches = Iterator[list[tuple[int, Record]]]
+
+
+def follow_run(log: Path, run: LiveRun) -> Batches:
+    """Add what is new in the log to the run again and again, and give it too, until the rig has ended."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the run may begin
+    records: Batches = iter(())
     is_there = True
     while is_there:
         began = time.monotonic()
-        is_there = not (reader.is_over or _has_ended(sys.stdin.fileno()))
-        run.add_rows(reader.read_rows())
-        messages = reader.read_messages()
-        for message in messages:
-            run.add_message(message)
+        if select.select([0], [], [], 0)[0]:
+            is_there = bool(os.read(0, 1))
+            records = follow_log(log) if is_there else records
+        new = next(records, [])
+        for t_ns, record in new:
+            run.add(t_ns, record)
         run.judge_checks()
-        yield messages
+        yield new
         if is_there:
             time.sleep(max(_EVERY - (time.monotonic() - began), 0.02))
 
 
-def _has_ended(number: int) -> bool:
-    """Whether the other end of a pipe is closed."""
-    return bool(select.select([number], [], [], 0)[0]) and not os.read(number, 1)
-
-
-def show_on_terminal(reader: LiveReader, plan: LivePlan) -> None:
+def show_on_terminal(log: Path, plan: LivePlan) -> None:
     """Show a run on standard error until it is over: as a screen, or without a terminal as a line every 2 s."""
     console, run = Console(stderr=True, highlight=False), LiveRun(plan)
     obstacle = find_obstacle(console)
     if obstacle:
         print(f"live: {obstacle}: a line every 2 s instead of the screen", file=sys.stderr, flush=True)
-        print_lines(reader, run)
+        print_lines(log, run)
         return
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
-        reader.say_ready()
         last, heard = -1, time.monotonic()
-        for _ in follow_run(reader, run):
+        for _ in follow_run(log, run):
             if run.cycles != last:
                 last, heard = run.cycles, time.monotonic()
             live.update(draw_screen(run, *console.size, time.monotonic() - heard), refresh=True)
@@ -77,18 +80,17 @@ def find_obstacle(console: Console) -> str:
     return ""
 
 
-def print_lines(reader: LiveReader, run: LiveRun) -> None:
+def print_lines(log: Path, run: LiveRun) -> None:
     """One line every 2 s and one at the end."""
-    reader.say_ready()
     next_line = time.monotonic() + 2.0
-    for _ in follow_run(reader, run):
+    for _ in follow_run(log, run):
         if time.monotonic() >= next_line:
             next_line += 2.0
             print(f"live: {describe_line(run)}", file=sys.stderr, flush=True)
     print(f"live: {describe_line(run)}", file=sys.stderr, flush=True)
 
 
-def show_in_viewer(reader: LiveReader, plan: LivePlan, port: int, file: str) -> None:
+def show_in_viewer(log: Path, plan: LivePlan, port: int, file: str) -> None:
     """Send a run piece by piece until it is over, or until the viewer that was opened for it is closed."""
     os.environ["RUST_LOG"] = "off"  # a viewer that is gone is one line of ours, not many of its library
     import rerun as rr
@@ -107,10 +109,9 @@ def show_in_viewer(reader: LiveReader, plan: LivePlan, port: int, file: str) -> 
             viewer = open_viewer(port)
         stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=blueprint)
     view = LiveView(Recording(stream, drawing), plan)
-    reader.say_ready()
     run, next_look = LiveRun(plan), time.monotonic()
-    for messages in follow_run(reader, run):
-        view.update(run, messages, is_last=reader.is_over)
+    for new in follow_run(log, run):
+        view.update(run, new)
         if port and time.monotonic() >= next_look:
             next_look += 1.0
             if viewer.poll() is not None if viewer else not is_listening(port):
@@ -130,14 +131,13 @@ def open_viewer(port: int, patience: float = 20.0) -> subprocess.Popen[bytes]:
 
 def main() -> None:
     """Read the plan and show the run."""
-    number, *place = sys.argv[1:]
-    reader = LiveReader(int(number))
+    log, *place = sys.argv[1:]
     with open(0, "rb", buffering=0, closefd=False) as stream:  # nothing is read ahead
         plan = pickle.load(stream)
     if place:
-        show_in_viewer(reader, plan, int(place[0]), place[1])
+        show_in_viewer(Path(log), plan, int(place[0]), place[1])
     else:
-        show_on_terminal(reader, plan)
+        show_on_terminal(Path(log), plan)
 
 
 if __name__ == "__main__":

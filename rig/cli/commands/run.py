@@ -55,7 +55,7 @@ def run_command(args: argparse.Namespace) -> int:
     clock = WallClock()
     with PageWriter() as pages, catch_signals() as is_to_stop:
         with (announce_run(job, why, is_silent=is_silent or is_on_screen) as progress,
-              choose_observer(job, place, is_live=args.live is not None) as observe):
+              choose_observer(job, folder / "trace.mcap", place, is_live=args.live is not None) as observe):
             prepare = pages.wait_until_loaded if job.realtime else lambda: None
             diagnose = partial(diagnose_servovalve, progress=progress) if args.fdi else None
             outcome = run_job(job, folder, progress, is_to_stop, prepare, diagnose, observe)
@@ -102,15 +102,15 @@ def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | N
 
 
 @contextlib.contextmanager
-def choose_observer(job: Job, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observe]:
+def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: bool) -> Iterator[Observe]:
     """What looks at the records of a run: the screen or the viewer of --live, and the lines about dead nodes."""
     if not is_live:
         yield announce_dead_node
         return
     kept: list[Record] = []  # while a screen covers the terminal
-    with show_live(make_live_plan(job.sequence, job.pace), last_cpu_is_taken=job.realtime, place=place) as feed:
+    with show_live(make_live_plan(job.sequence, job.pace), log, job.realtime, place) as begin:
         def observe(t_ns: int, record: Record) -> None:
-            feed.observe(t_ns, record)
+            begin()  # now the log is there
             if place is not None:
                 announce_dead_node(t_ns, record)
             elif isinstance(record, Event):

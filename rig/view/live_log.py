@@ -1,0 +1,58 @@
+"""The log of a run as another process reads it while it is written: the run itself is never delayed by its screen."""
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from mcap_protobuf.decoder import DecoderFactory
+
+from fdi.trace.mcap_log import scan_messages, unpack_chunk
+from rig.recorder import CanFrame, Record
+from rig.recorder.schema import CHANNELS
+from rig.recorder.writer import MAGIC, list_channels
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+
+
+def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
+    """Give the records of the log that are new, with their log times in ns, again and again; no raw frames.
+
+    The writer closes a chunk at least every 0.2 s; what it has not written yet comes later.
+    """
+    schemas = {schema.id: schema for schema in list_channels()[0]}
+    decoders: dict[int, Any] = {CHANNELS[kind]: (kind, [field.name for field in fields(kind)],
+                                 DecoderFactory().decoder_for("protobuf", schemas[CHANNELS[kind]]))
+                for kind in CHANNELS if kind is not CanFrame}
+    done = len(MAGIC)  # bytes of the file
+    while True:
+        with path.open("rb") as file:
+            file.seek(done)
+            data = file.read()
+        found, start = [], 0
+        for raw, end in _list_chunks(data):
+            start = end
+            for channel, t_ns, _, message in scan_messages(raw):
+                if channel in decoders:
+                    kind, names, decode = decoders[channel]
+                    record = decode(message)
+                    found.append((t_ns, kind(**{name: getattr(record, name) for name in names})))
+        done += start
+        yield found
+
+
+def _list_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """The chunks that are complete, unpacked, and where each ends."""
+    at = 0
+    while at + _RECORD.size <= len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size + length
+        if opcode == Opcode.CHUNK and at <= len(data):
+            chunk = Chunk.read(ReadDataStream(BytesIO(data[at - length:at])))
+            yield unpack_chunk(chunk), at
