@@ -1,15 +1,16 @@
 """Chapter 5: SYNC, emergencies, error register and history, heartbeat producer and consumer, error behaviour."""
 from __future__ import annotations
 
-from rig.conformance.conformance_case import Case, for_each, join_labels, require, require_applicable
+from rig.conformance.conformance_case import Case, for_each, require, require_applicable
 from rig.conformance.data_sheet import HISTORY, RESTRICTED_ENDS, Pdo
 from rig.conformance.pdo_cases import (
     EXTENDED,
-    list_accepted,
     list_received,
     operational,
     read_mapped,
     require_emcy,
+    require_fixed,
+    require_unrestricted,
     send_short,
     send_values,
 )
@@ -20,7 +21,6 @@ from rig.conformance.target import (
     NO_SUB,
     OPERATIONAL,
     PRE_OPERATIONAL,
-    STATE,
     STOPPED,
     TOO_HIGH,
     TOO_LOW,
@@ -49,24 +49,19 @@ def check_sync_identifier(t: Target) -> str:
 
 def check_emcy_identifier(t: Target) -> str:
     """0x1014, where the node has it."""
-    variable, expected = t.variable(0x1014), t.sheet.default(0x1014)
-    word = t.read(0x1014)
+    word, expected = t.read(*t.variable(0x1014).key), t.sheet.default(0x1014)
     require(expected in (word, None), f"0x{word:08X}, the EDS says 0x{expected or 0:08X}")
-    if variable.is_writable:
-        with t.restore_afterwards(variable.key):
-            code = t.try_download(0x1014, 0, word & ~0x7FF | t.find_free_identifier())
-            require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021), "changed while it is valid")
+    if t.sheet.is_writable(0x1014):
+        require_fixed(t, (0x1014, 0))
     return refuse_restricted(t, 0x1014)
 
 
 def refuse_restricted(t: Target, index: int) -> str:
-    """A COB-ID refuses the restricted identifiers, if it can be written at all. Raises Problem."""
-    variable = t.variable(index)
+    """A COB-ID refuses the restricted identifiers, if it can be written at all."""
     text = f"0x{t.read(index) & 0x7FF:03X}"
-    if not variable.is_writable:
-        return f"{text}, {variable.access}"
-    accepted = list_accepted(t, variable.key)
-    require(not accepted, f"not refused with 0x06090030: {join_labels(accepted)}")
+    if not t.sheet.is_writable(index):
+        return f"{text}, {t.variable(index).access}"
+    require_unrestricted(t, (index, 0))
     return f"{text}; {len(RESTRICTED_ENDS)} identifiers refused"
 
 

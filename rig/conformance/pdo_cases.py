@@ -118,20 +118,13 @@ def check_reserved_types(t: Target, pdo: Pdo) -> str:
 
 
 def check_fixed_while_valid(t: Target, pdo: Pdo) -> str:
-    """Bits 0 to 29 may only be changed while bit 31 says that the PDO is off. The standard names no abort code."""
-    word, free = t.read(pdo.parameter, 1), t.find_free_identifier()
-    with t.restore_afterwards((pdo.parameter, 1)):
-        code = t.try_download(pdo.parameter, 1, word & ~0x7FF | free)
-        said = require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000),
-                             f"{pdo.name} 0x{word & 0x7FF:03X} to 0x{free:03X}")
-        require(t.read(pdo.parameter, 1) == word, f"{pdo.name} has changed all the same")
-    return f"{pdo.name} {said}"
+    """Bits 0 to 29 may only be changed while bit 31 says that the PDO is off."""
+    return f"{pdo.name} {require_fixed(t, (pdo.parameter, 1))}"
 
 
 def check_restricted(t: Target, pdo: Pdo) -> str:
     """The PDO is switched off first, so that nothing else can be the reason."""
-    accepted = list_accepted(t, (pdo.parameter, 1))
-    require(not accepted, f"{pdo.name}: {join_labels(accepted)}")
+    require_unrestricted(t, (pdo.parameter, 1))
     return pdo.name
 
 
@@ -147,30 +140,37 @@ def check_extended(t: Target, pdo: Pdo) -> str:
     return f"{pdo.name} {'refused' if code else 'supported'}"
 
 
-def check_tpdo_switch(t: Target, pdo: Pdo) -> str:
-    """With transmission type 1, at SYNC."""
-    require_type(t, pdo, 1)
-    word, counts = t.read(pdo.parameter, 1), []
+def check_switching(t: Target, pdo: Pdo, phases: Sequence[tuple[str, str, bool]]) -> str:
+    """A PDO is on, off or moved to another COB-ID, and works under the old and the new one as a phase says."""
+    if pdo.is_sent:
+        require_type(t, pdo, 1)
+    else:
+        require_emcy(t)
+    word, free, values = t.read(pdo.parameter, 1), t.find_free_identifier(), read_mapped(t, pdo)
+    cob_ids = {"old": word & 0x7FF, "new": free}
+    moved = word & ~0x7FF | free
+    words = {"on": (word,), "off": (word | INVALID,), "moved": (word | INVALID, moved | INVALID, moved)}
     with operational(t), t.restore_afterwards((pdo.parameter, 1)):
-        for value, expected in ((word, 3), (word | INVALID, 0), (word, 3)):
-            t.write(pdo.parameter, 1, value)
-            counts.append(len(answer_syncs(t, word & 0x7FF, 3, expected)))
-    require(counts == [3, 0, 3], f"{pdo.name}: at 3 SYNCs each {counts[0]} frames on, {counts[1]} off, "
-                                 f"{counts[2]} on again")
-    return pdo.name
+        for action, name, is_expected in phases:
+            for value in words[action]:
+                t.write(pdo.parameter, 1, value)
+            require(works_as(t, pdo, values, cob_ids[name], is_expected),
+                    f"{pdo.name} is {action}, its {name} COB-ID is {'not used' if is_expected else 'used'}")
+        if not pdo.is_sent:
+            send_values(t, pdo, values)
+    used = [f"{action} 0x{cob_ids[name]:03X} {'used' if is_expected else 'silent'}"
+            for action, name, is_expected in phases]
+    return f"{pdo.name} {', '.join(used)}"
 
 
-def check_tpdo_move(t: Target, pdo: Pdo) -> str:
-    """As a master links PDOs."""
-    require_type(t, pdo, 1)
-    old, free = identify(t, pdo), t.find_free_identifier()
-    with operational(t), t.restore_afterwards((pdo.parameter, 1)):
-        move(t, pdo, free)
-        mark = len(t.frames)
-        new_count, old_count = len(answer_syncs(t, free, 3, 3)), len(t.heard(mark, old))
-        require((new_count, old_count) == (3, 0),
-                f"{pdo.name}: {new_count} frames under 0x{free:03X}, {old_count} under the old COB-ID")
-    return f"{pdo.name} 0x{old:03X} to 0x{free:03X}"
+def works_as(t: Target, pdo: Pdo, values: list[bytes], cob_id: int, is_expected: bool) -> bool:
+    """Whether a TPDO comes at 3 SYNCs, or an RPDO that is too short is noticed, if and only if it is expected.
+
+    The wrong length changes nothing.
+    """
+    if pdo.is_sent:
+        return len(answer_syncs(t, cob_id, 3, 3 * is_expected)) == 3 * is_expected
+    return bool(send_short(t, pdo, values, cob_id, is_expected)) is is_expected
 
 
 def check_short_rpdo(t: Target, pdo: Pdo) -> str:
@@ -194,21 +194,6 @@ def check_long_rpdo(t: Target, pdo: Pdo) -> str:
         codes = {read_error_code(frame) for frame in t.listen(SETTLE, t.emcy_id)}
     require(codes <= {TOO_LONG}, f"{pdo.name}: EMCY {', '.join(f'0x{code:04X}' for code in codes)}")
     return f"{pdo.name} {'EMCY 0x8220' if codes else 'no EMCY'}"
-
-
-def check_rpdo_move(t: Target, pdo: Pdo) -> str:
-    """The wrong length shows whether a frame is received, and changes nothing."""
-    require_emcy(t)
-    old, free = identify(t, pdo), t.find_free_identifier()
-    values = read_mapped(t, pdo)
-    with operational(t), t.restore_afterwards((pdo.parameter, 1)):
-        t.write(pdo.parameter, 1, t.read(pdo.parameter, 1) | INVALID)
-        require(not send_short(t, pdo, values, old, False), f"{pdo.name} is received while it is off")
-        move(t, pdo, free)
-        require(not send_short(t, pdo, values, old, False), f"{pdo.name} is received under its old COB-ID")
-        require(send_short(t, pdo, values, free), f"{pdo.name} is not received under 0x{free:03X}")
-        send_values(t, pdo, values)
-    return f"{pdo.name} 0x{old:03X} to 0x{free:03X}"
 
 
 def check_rpdo_values(t: Target, pdo: Pdo) -> str:
@@ -375,9 +360,20 @@ def list_valid(t: Target, is_sent: bool | None = None, is_changeable: bool = Fal
     return chosen
 
 
-def list_accepted(t: Target, key: tuple[int, int]) -> list[str]:
-    """The restricted identifiers that a COB-ID takes while it is off, or refuses with another code than 0x06090030."""
-    word, found = t.read(*key), []
+def require_fixed(t: Target, key: tuple[int, int]) -> str:
+    """The abort with which a COB-ID that is in use refuses another one. The standard names no code."""
+    word, free = t.read(*key), t.find_free_identifier()
+    with t.restore_afterwards(key):
+        code = t.try_download(*key, word & ~0x7FF | free)
+        text = f"{t.variable(*key).label} 0x{word & 0x7FF:03X} to 0x{free:03X}"
+        said = require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000), text)
+        require(t.read(*key) == word, f"{text} has changed all the same")
+    return said
+
+
+def require_unrestricted(t: Target, key: tuple[int, int]) -> None:
+    """A COB-ID refuses every restricted identifier with 0x06090030, even while it is off. Raises Problem."""
+    word, accepted = t.read(*key), []
     is_switchable = t.variable(*key).has_valid_bit
     base = word & ~(0x7FF | (INVALID if is_switchable else PRODUCER))
     with t.restore_afterwards(key):
@@ -386,8 +382,8 @@ def list_accepted(t: Target, key: tuple[int, int]) -> list[str]:
                 require_abort(t.try_download(*key, word | INVALID), (0,), "it cannot be switched off")
             code = t.try_download(*key, base | can_id)
             if code != VALUE:
-                found.append(f"0x{can_id:03X} {format_abort(code)}")
-    return found
+                accepted.append(f"0x{can_id:03X} {format_abort(code)}")
+    require(not accepted, f"{t.variable(*key).label}: {join_labels(accepted)}")
 
 
 def require_emcy(t: Target) -> None:
@@ -421,13 +417,6 @@ def require_type(t: Target, pdo: Pdo, *kinds: int) -> None:
         raise CaseNotApplicable(f"no TPDO accepts transmission type {' or '.join(map(str, kinds))}")
 
 
-def move(t: Target, pdo: Pdo, can_id: int) -> None:
-    """Off, another identifier, on. Raises Refusal."""
-    word = t.read(pdo.parameter, 1) & ~(0x7FF | INVALID)
-    for value in (word | INVALID, word | INVALID | can_id, word | can_id):
-        t.write(pdo.parameter, 1, value)
-
-
 list_received, list_sent = partial(list_valid, is_sent=False), partial(list_valid, is_sent=True)
 list_changeable = partial(list_valid, is_changeable=True)
 
@@ -455,16 +444,19 @@ CASES = (
          for_each(list_changeable, check_extended)),
     Case("4.10", "a TPDO is switched off and on", "7.5.2.37",
          "not sent while bit 31 is set; sent again afterwards",
-         for_each(partial(list_changeable, is_sent=True), check_tpdo_switch, text="3, 0 and 3 frames: {}")),
+         for_each(partial(list_changeable, is_sent=True), partial(check_switching, phases=(
+             ("on", "old", True), ("off", "old", False), ("on", "old", True))))),
     Case("4.11", "a TPDO gets another COB-ID", "7.5.2.37", "off, changed, on: it is sent under the new one only",
-         for_each(partial(list_changeable, is_sent=True), check_tpdo_move)),
+         for_each(partial(list_changeable, is_sent=True), partial(check_switching, phases=(
+             ("moved", "new", True), ("moved", "old", False))))),
     Case("4.12", "received PDO too short", "7.2.2.5, table 26", "EMCY 0x8210, and the values stay as they were",
          for_each(list_received, check_short_rpdo, text="EMCY 0x8210 for {}")),
     Case("4.13", "received PDO too long", "7.2.2.5, table 26",
          "the first bytes are used or not; EMCY, if any, is 0x8220", for_each(list_received, check_long_rpdo)),
     Case("4.14", "an RPDO is switched off, moved and on", "7.5.2.35",
          "a frame that is too short is noticed (EMCY 0x8210) only under the COB-ID in force",
-         for_each(partial(list_changeable, is_sent=False), check_rpdo_move)),
+         for_each(partial(list_changeable, is_sent=False), partial(check_switching, phases=(
+             ("off", "old", False), ("moved", "old", False), ("moved", "new", True))))),
     Case("4.15", "values of a received PDO", "7.2.2.2, 7.5.2.35",
          "type 0 to 240: in the dictionary after the next SYNC, not before; 254 and 255: at once",
          for_each(list_received, check_rpdo_values)),

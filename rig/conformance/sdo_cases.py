@@ -7,8 +7,9 @@ from functools import partial
 
 from canopen.objectdictionary.datatypes import DOMAIN
 
-from rig.conformance.conformance_case import Case, CaseNotApplicable, for_each, join_labels, require
+from rig.conformance.conformance_case import Case, CaseNotApplicable, for_each, join_labels, require, require_applicable
 from rig.conformance.data_sheet import Variable
+from rig.conformance.object_cases import read_values
 from rig.conformance.target import (
     COMMAND,
     HEAD,
@@ -17,7 +18,6 @@ from rig.conformance.target import (
     TOO_LONG,
     TOO_SHORT,
     WRONG_LENGTH,
-    Refusal,
     Target,
     format_abort,
     pack_segment,
@@ -63,7 +63,7 @@ def check_segmented_download(t: Target) -> str:
     variable = find_long_writable(t)
     if variable is None:
         variable = find_harmless(t)
-        begin_download(t, variable)
+        require_abort(begin_download(t, variable, variable.size), (0,), "the transfer was refused")
         t.send(t.request_id, HEAD.pack(0x80, *variable.key) + bytes(4))
     data = t.upload(*variable.key)
     t.download(*variable.key, data, segmented=True)
@@ -81,25 +81,18 @@ def check_upload_toggle(t: Target) -> str:
     return said
 
 
-def check_segment(t: Target, change: Change, codes: Sequence[int], toggle: int = 0) -> str:
-    """A download announces the right length; its only segment is refused, and the object is unchanged."""
+def check_segment(t: Target, change: Change, codes: Sequence[int], toggle: int = 0, is_announced: bool = False) -> str:
+    """A download announces its own length, or that of the object; it is refused, and the object is unchanged."""
     what, alter = change
     with changed_number(t) as (variable, before, other):
-        begin_download(t, variable)
-        said = require_abort(t.try_demand(pack_segment(alter(other), True, toggle)), codes, what)
+        offered = alter(other)
+        code = begin_download(t, variable, len(offered) if is_announced else variable.size)
+        if not (is_announced and code):
+            require_abort(code, (0,), "the transfer was refused")
+            code = t.try_demand(pack_segment(offered, True, toggle))
+        said = require_abort(code, codes, what)
         t.require_value(variable, before, "was changed")
     return f"{what}: {said}"
-
-
-def check_announced_length(t: Target, change: Change) -> str:
-    """A segmented download announces one byte more, or less, than the object has."""
-    what, alter = change
-    with changed_number(t) as (variable, before, _):
-        try:
-            t.download(*variable.key, alter(before), segmented=True)
-        except Refusal as refusal:
-            return f"{what}: {require_abort(refusal.code, LENGTH_CODES, what)}"
-    return require_abort(0, LENGTH_CODES, what)
 
 
 def check_refused_frame(t: Target, frame: bytes) -> str:
@@ -200,21 +193,10 @@ def find_long_readable(t: Target) -> tuple[Variable, bytes]:
 
     Raises CaseNotApplicable.
     """
-    candidates = [variable for variable in t.sheet.variables if variable.is_readable
-                  and (variable.size > 4 or not variable.size) and variable.data_type != DOMAIN]
-    found: list[tuple[Variable, bytes]] = []
-    for variable in sorted(candidates, key=lambda each: not each.is_communication):
-        try:
-            data = t.upload(*variable.key)
-        except Refusal:
-            continue
-        if len(data) > 7:
-            return variable, data
-        if len(data) > 4:
-            found.append((variable, data))
-    if not found:
-        raise CaseNotApplicable("no object has more than four bytes")
-    return found[0]
+    values = [value for value in read_values(t, lambda each: each.data_type != DOMAIN and not 0 < each.size <= 4)
+              if len(value[1]) > 4]
+    require_applicable(values, "no object has more than four bytes")
+    return max(values, key=lambda value: (len(value[1]) > 7, value[0].is_communication))
 
 
 def find_long_writable(t: Target) -> Variable | None:
@@ -230,12 +212,12 @@ def begin_upload(t: Target) -> tuple[Variable, bytes]:
     return variable, data
 
 
-def begin_download(t: Target, variable: Variable) -> None:
-    """Begin a segmented one with the right length. Raises CaseNotApplicable for a server without segments."""
-    code = t.try_demand(HEAD.pack(0x21, *variable.key) + variable.size.to_bytes(4, "little"))
+def begin_download(t: Target, variable: Variable, size: int) -> int:
+    """Begin a segmented one; its abort code. Raises CaseNotApplicable for a server without segments."""
+    code = t.try_demand(HEAD.pack(0x21, *variable.key) + size.to_bytes(4, "little"))
     if code == COMMAND and find_long_writable(t) is None:
         raise CaseNotApplicable("no object needs segments, and the server refuses them")
-    require_abort(code, (0,), "the transfer was refused")
+    return code
 
 
 CASES = (
@@ -268,7 +250,8 @@ CASES = (
     Case("3.12", "a transfer that is not finished", "7.2.4.3", "a new request to another object is answered",
          check_unfinished_transfer),
     Case("3.13", "announced length differs from the object", "7.2.4.3.3, table 22",
-         "refused with 0x06070012, 0x06070013 or 0x06070010", for_each(lambda t: LENGTHS, check_announced_length)),
+         "refused with 0x06070012, 0x06070013 or 0x06070010",
+         for_each(lambda t: LENGTHS, partial(check_segment, codes=LENGTH_CODES, is_announced=True))),
     Case("3.14", "segments differ from the announced length", "7.2.4.3.4, table 22",
          "too many or too few bytes are refused with 0x0607001x, and the object is unchanged",
          for_each(lambda t: LENGTHS, partial(check_segment, codes=LENGTH_CODES))),

@@ -17,7 +17,6 @@ class EmcyCode(IntEnum):
     """Error codes the core itself raises, and those the bench needs."""
 
     RESET = 0x0000
-    CURRENT = 0x2000
     SOFTWARE = 0x6000
     COMMUNICATION = 0x8100
     HEARTBEAT_LOST = 0x8130
@@ -28,15 +27,10 @@ class EmcyCode(IntEnum):
 
 
 class ErrorRegister(IntFlag):
-    """Bits of 0x1001."""
+    """Bits of 0x1001 that are used here."""
 
     GENERIC = 0x01
-    CURRENT = 0x02
-    VOLTAGE = 0x04
-    TEMPERATURE = 0x08
     COMMUNICATION = 0x10
-    PROFILE = 0x20
-    MANUFACTURER = 0x80
 
 
 class Emcy:

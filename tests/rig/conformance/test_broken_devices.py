@@ -180,7 +180,7 @@ DEFECTS: list[tuple[str, Break, str]] = [
      "5.9 7.6"),
     ("heartbeat never lost", wrap("consumer.tick", lambda device, old, t_ns: None), "5.3 5.6 5.10 5.12 5.17"),
     ("heartbeat lost too late", wrap("consumer.configure", watch_slackly), "5.10"),
-    ("heartbeat missed before it came", wrap("consumer.configure", watch_at_once), "4.10 4.11 4.14 5.11 6.4 7.5"),
+    ("heartbeat missed before it came", wrap("consumer.configure", watch_at_once), "4.10 4.14 5.11 6.4 7.5"),
     ("no boot-up", wrap("heartbeat.send_boot_up", lambda device, old: None),
      "5.12 5.17 6.1 6.2 6.3 6.5 6.11 6.12 6.13 7.2 7.3"),
     ("starts by itself", wrap("_boot", start_by_itself), "6.3 6.13"),

@@ -78,11 +78,6 @@ def test_master_sees_boot_up_and_heartbeat(bench: Bench) -> None:
     assert bench.devices[2].state is NmtState.PRE_OPERATIONAL
 
 
-def test_master_starts_all_at_once(bench: Bench) -> None:
-    bench.master.nmt.state = "OPERATIONAL"
-    assert {device.state for device in bench.devices.values()} == {NmtState.OPERATIONAL}
-
-
 @pytest.mark.parametrize("node", [2, 3])
 def test_master_reads_every_readable_object(bench: Bench, node: int) -> None:
     """Each answers as the dictionary says, expedited or segmented; an empty history entry says there is no data."""
@@ -108,16 +103,6 @@ def test_master_writes_gains_and_a_scenario_of_several_kilobytes(bench: Bench) -
     scenario = bytes(range(256)) * 20
     bench.remotes[3].sdo[0x2210].raw = scenario
     assert bench.devices[3].read(0x2210) == scenario
-
-
-@pytest.mark.parametrize(("index", "sub", "data", "code"), [
-    (0x2200, 0, b"\0\0\0\0", 0x06010002), (0x2999, 0, b"\0", 0x06020000), (0x1029, 1, b"\7", 0x06090031),
-    (0x1017, 0, b"\0", 0x06070013), (0x1A00, 0, b"\0", 0x06010002),
-])  # fmt: skip
-def test_master_is_told_why_a_write_is_refused(bench: Bench, index: int, sub: int, data: bytes, code: int) -> None:
-    with pytest.raises(canopen.SdoAbortedError) as caught:
-        bench.remotes[3].sdo.download(index, sub, data)
-    assert caught.value.code == code
 
 
 def test_master_decodes_pdos(bench: Bench) -> None:

@@ -1,6 +1,7 @@
 """Runs with the C firmware on the project's UDP bus: it is built, started and gives the numbers of the built-in one."""
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -38,21 +39,16 @@ def test_gains_of_the_model_reach_the_firmware(tmp_path: Path) -> None:
     assert describe_first_difference(tmp_path / "c", tmp_path / "builtin").startswith("none in")
 
 
-def test_effects_in_the_firmware_need_the_builtin_one(tmp_path: Path) -> None:
-    said = rig("run", "--controller", "c", "--set", "command_rate_limit.rate=0.05", "--out", tmp_path)
-    assert said.status == 2 and "builtin" in said.err and said.err.count("\n") == 1
-
-
-@pytest.mark.parametrize("bus", ["virtual", "embedded", "slcan:x"])
-def test_a_bus_without_a_port_is_refused(tmp_path: Path, bus: str) -> None:
-    said = rig("run", "--controller", "c", "--bus", bus, "--out", tmp_path)
-    assert said.status == 2 and "--bus" in said.err and said.err.count("\n") == 1
-
-
-def test_a_missing_compiler_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    said = rig("run", "--controller", "c", "--bus", spec("udp_multicast"), "--out", tmp_path)
-    assert said.status == 2 and "apt-get install gcc" in said.err and said.err.count("\n") == 1
+@pytest.mark.parametrize(("words", "path", "said"), [
+    (["--set", "command_rate_limit.rate=0.05"], None, "builtin"),  # effects in the firmware
+    *((["--bus", bus], None, "--bus") for bus in ("virtual", "embedded", "slcan:x")),  # no port for it
+    (["--bus", "udp_multicast"], "/nowhere", "apt-get install gcc"),
+])
+def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str],
+                                                 path: str | None, said: str) -> None:
+    monkeypatch.setenv("PATH", path or os.environ["PATH"])
+    answer = rig("run", "--controller", "c", *words, "--out", tmp_path)
+    assert answer.status == 2 and said in answer.err and answer.err.count("\n") == 1
 
 
 def test_it_is_compiled_once_and_again_when_a_source_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
