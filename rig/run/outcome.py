@@ -66,13 +66,10 @@ class Outcome:
             return "ABORTED"
         if self.failures:
             return "FAIL"
-        return "PASS" if self._has_requirement else "NOT_JUDGED"
-
-    @property
-    def _has_requirement(self) -> bool:
-        """Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`."""
+        # Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`.
         sequence = self.job.sequence
-        return bool(sequence.checks) or sequence.ends == "safe_state" or self.fdi.get("verdict") == "ACCEPTABLE"
+        is_judged = sequence.checks or sequence.ends == "safe_state" or self.fdi.get("verdict") == "ACCEPTABLE"
+        return "PASS" if is_judged else "NOT_JUDGED"
 
     @property
     def failures(self) -> list[str]:
@@ -80,14 +77,9 @@ class Outcome:
         failed = [check.name for check in self.checks if not check.passed]
         if self.job.sequence.ends == "safe_state" and not self.safe:
             failed.append("the run did not end in the safe state")
-        if self._has_fault:
+        if has_fault(self.fdi):
             failed.append(f"rig fdi: {self.fdi['sentence'].rstrip('.')}")
         return failed
-
-    @property
-    def _has_fault(self) -> bool:
-        """Whether the diagnosis found a fault of the servovalve beyond acceptable, or another deviation."""
-        return has_fault(self.fdi)
 
     @property
     def timing_problem(self) -> str:
@@ -102,8 +94,9 @@ class Outcome:
         if self.aborted or not self.failures:
             return ""
         failed = [check for check in self.checks if not check.passed]
-        is_affected = (len(failed) + self._has_fault == len(self.failures) and all(map(self._is_affected, failed))
-                       and (not self._has_fault or bool(self.attribution.affected.any())))
+        is_fault_found = has_fault(self.fdi)
+        is_affected = (len(failed) + is_fault_found == len(self.failures) and all(map(self._is_affected, failed))
+                       and (not is_fault_found or bool(self.attribution.affected.any())))
         if self.attribution.by_bench or is_affected:
             return (f"the bench was late, and the checks that failed depend on it: {'; '.join(self.failures)}; "
                     f"{self._describe_first_lateness()}")
@@ -115,16 +108,16 @@ class Outcome:
         overruns[:round(policy.grace * RATE)] = 0
         if self.attribution.cause is not None and self.aborted:
             overruns = overruns[:self.attribution.cause.cycle]
-        total, most = int(overruns.sum()), policy.most_in_a_row
-        accepted = self.job.max_overruns * self.timing["cycles"]
-        if self.job.max_overruns < 1 and total > accepted:  # a run that skipped periods has more overruns than cycles
-            return (f"the bench itself was late: {total} overruns in {self.timing['cycles']} cycles, more than "
-                    f"{100 * self.job.max_overruns:g} %: the controller cannot be judged; "
-                    f"{self._describe_first_lateness()}")
-        if most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
-            return (f"the bench itself was late: {in_a_row} overruns in a row, {most} are accepted: the controller "
-                    f"cannot be judged; {self._describe_first_lateness()}")
-        return ""
+        total, most, cycles = int(overruns.sum()), policy.most_in_a_row, self.timing["cycles"]
+        if self.job.max_overruns < 1 and total > self.job.max_overruns * cycles:
+            # a run that skipped periods has more overruns than cycles
+            found = f"{total} overruns in {cycles} cycles, more than {100 * self.job.max_overruns:g} %:"
+        elif most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
+            found = f"{in_a_row} overruns in a row, {most} are accepted:"
+        else:
+            return ""
+        return (f"the bench itself was late: {found} the controller cannot be judged; "
+                f"{self._describe_first_lateness()}")
 
     def _is_affected(self, check: CheckResult) -> bool:
         """Whether a check saw rows that lateness of the bench changed, or the heartbeats of a bench that was late."""
@@ -188,7 +181,10 @@ class Outcome:
                 "timing": self.timing, "counters": self.counters, "speed": round(self.speed, 2),
                 **self._attribution_to_json(), "differences": find_differences(self.job).to_json(),
                 "limits": [limit._asdict() for limit in self.limits],
-                "nodes": {str(node): self._node_to_json(node) for node in sorted(self.identities)},
+                "nodes": {str(node): {
+                    "name": NAMES[node], "identity": self.identities[node]._asdict(),
+                    "operational_ms": round(1e3 * self.start_times[node], 1) if node in self.start_times else None}
+                    for node in sorted(self.identities)},
                 "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
                 "run": self.job.list_settings(), "fdi": self.fdi}
 
@@ -215,11 +211,6 @@ class Outcome:
                 "text": str(cause.get("text", "")), "evidence": json.dumps(cause.get("evidence", [])),
                 "consequences": json.dumps(found["consequences"])}
 
-    def _node_to_json(self, node: int) -> dict[str, Any]:
-        seconds = self.start_times.get(node)
-        return {"name": NAMES[node], "identity": self.identities[node]._asdict(),
-                "operational_ms": None if seconds is None else round(1e3 * seconds, 1)}
-
     def save(self) -> None:
         """Write verdict.json."""
         write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
@@ -227,13 +218,13 @@ class Outcome:
 
 def select_events(events: Sequence[SessionEvent], most: int = 200) -> tuple[list[SessionEvent], dict[str, int]]:
     """The first `most` events of each kind, in order, and how many of each kind are omitted; the log has them all."""
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     selected = []
     for event in events:
-        seen[event.kind] += 1
-        if seen[event.kind] <= most:
+        counts[event.kind] += 1
+        if counts[event.kind] <= most:
             selected.append(event)
-    return selected, {kind: count - most for kind, count in seen.items() if count > most}
+    return selected, {kind: count - most for kind, count in counts.items() if count > most}
 
 
 def name_source(cause: Cause) -> str:
@@ -286,12 +277,9 @@ class LimitReached(NamedTuple):
 
     def describe(self) -> str:
         """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
-        scale, unit = (1e3, "mA") if self.signal == "cor" else (1e3, "mm")
-        return (f"{WORDS[self.signal]} ({scale * self.limit:.3g} {unit}) for {1e3 * self.seconds:.0f} ms, "
-                f"first at t = {self.t:.3f} s")
-
-
-WORDS = {"xj": "ram at its stop", "xs": "spool at its stop", "cor": "current at its limit"}
+        words = {"xj": "ram at its stop", "xs": "spool at its stop", "cor": "current at its limit"}[self.signal]
+        return (f"{words} ({1e3 * self.limit:.3g} {'mA' if self.signal == 'cor' else 'mm'}) for "
+                f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
 def find_limits(column: Callable[[str], NDArray[np.float64]], model: Model, zero: int) -> tuple[LimitReached, ...]:

@@ -68,39 +68,26 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
         Actuator(job.scenario.model).warm()
     if can_open(job.bus):  # before any node is started: on a new machine this takes seconds
         compile_cycle(job.realtime)
-    with lock_folder(folder), play_user_steps(job, folder) as finished:
-        with open_participants(job) as participants:
-            prepare()
-            epoch_ns = read_epoch_ns() - participants.wire.clock.now()
-            with (open_recorder(job, folder, epoch_ns, observe) as recorder,
-                  contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
-                outcome = play_job(job, folder, session, recorder, progress, diagnose)
-            outcome.save()
-        finished.append(outcome)
+    with lock_folder(folder):
+        try:
+            _play_steps(job, folder, "before", "")
+            with open_participants(job) as participants:
+                prepare()
+                epoch_ns = read_epoch_ns() - participants.wire.clock.now()
+                with (open_recorder(job, folder, epoch_ns, observe) as recorder,
+                      contextlib.closing(Session(job, participants, recorder, progress, stop)) as session):
+                    outcome = play_job(job, folder, session, recorder, progress, diagnose)
+                outcome.save()
+        except BaseException:
+            with contextlib.suppress(InputError):  # the exception of the run comes first
+                _play_steps(job, folder, "after", "")
+            raise
+        _play_steps(job, folder, "after", outcome.verdict)
     return outcome
 
 
-@contextlib.contextmanager
-def play_user_steps(job: Job, folder: Path) -> Iterator[list[Outcome]]:
-    """Play the user's steps before and after what is inside, the latter whatever happens there.
-
-    Whoever is inside puts the outcome into the list, if there is one.
-
-    Raises:
-        InputError: an error in a step; an exception of the run comes first.
-    """
-    finished: list[Outcome] = []
-    try:
-        _play_steps(job, folder, "before", "")
-        yield finished
-    except BaseException:
-        with contextlib.suppress(InputError):
-            _play_steps(job, folder, "after", "")
-        raise
-    _play_steps(job, folder, "after", finished[0].verdict)
-
-
 def _play_steps(job: Job, folder: Path, when: str, verdict: str) -> None:
+    """Play the user's steps before or after the run, whatever happens in it."""
     run = StepRun(job.sequence.title, folder, job.seed, job.list_settings(), verdict)
     for step in job.sequence.steps:
         if step.when == when:
@@ -122,12 +109,12 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
             rights.enter_context(lock_memory())
             rights.enter_context(prevent_deep_sleep())
             rights.enter_context(suspend_garbage_collection())
-        scheduled = name_scheduler()
         session.run_phases()
-        scheduled = loop.scheduler or scheduled
+        scheduled = loop.scheduler or name_scheduler()
     spent = stopwatch.now() * 1e-9
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
-    reason = explain_soft_time(job)
+    why = f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
+    reason = why if kind == "soft real time" else ""
     recorder.metadata("timing", {"kind": kind, "reason": reason})
     history = session.log.history
     attribution = attribute_run(job, session)
@@ -174,20 +161,17 @@ def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
 
 def attribute_run(job: Job, session: Session) -> Attribution:
     """Find the cycles of a run that may be judged, and the first cause of its troubles."""
-    return attribute(collect_records(job, session), session.safety.troubles, job.sequence.timing, session.nodes.gone)
-
-
-def collect_records(job: Job, session: Session) -> CycleRecords:
-    """The records of all cycles for the attribution. In lockstep nothing is late; frames are there or missing."""
     history = session.log.history
-    columns = {name: history.column(name) for name in ("lateness", "feedback_response", "valve_response", "response")}
-    if not job.realtime:
-        columns = {name: np.where(np.isnan(values), values, 0.0) for name, values in columns.items()}
+    times = [history.column(name) for name in ("lateness", "feedback_response", "valve_response", "response")]
+    if not job.realtime:  # nothing is late in lockstep; frames are there or missing
+        times = [np.where(np.isnan(values), values, 0.0) for values in times]
+    lateness, feedback, valve, response = times
     plan = job.scenario.plan
     injected = find_injected(plan, Schedule(plan, job.scenario.model.values), len(history))
-    return CycleRecords(np.array(session.log.due_ns, dtype=np.int64), columns["lateness"], columns["feedback_response"],
-                        columns["valve_response"], columns["response"], history.column("flags").astype(np.int64),
-                        injected, select_plant_delays(session.plant_record, len(history)))
+    records = CycleRecords(np.array(session.log.due_ns, dtype=np.int64), lateness, feedback, valve, response,
+                           history.column("flags").astype(np.int64), injected,
+                           select_plant_delays(session.plant_record, len(history)))
+    return attribute(records, session.safety.troubles, job.sequence.timing, session.nodes.gone)
 
 
 def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array:
@@ -249,10 +233,3 @@ def _make_check_record(check: CheckResult) -> Check:
     return Check(name=check.name, kind=check.kind, signal=check.signal, value=check.value, unit=check.unit,
                  low=check.low, high=check.high, passed=check.passed, t0=check.t0, t1=check.t1, after=check.after,
                  above=check.above, below=check.below, detail=check.detail, requirement=", ".join(check.requirement))
-
-
-def explain_soft_time(job: Job) -> str:
-    """One sentence that says why the cycles of a real-time run are Python; empty if they are compiled."""
-    if not job.realtime or can_open(job.bus):
-        return ""
-    return f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
