@@ -5,7 +5,7 @@ state (no current). A sequence that must end in the safe state continues with ma
 every other sequence ends main.
 
 The parts: `Stage`, `Journal` and `SafeState` (state.py), `BringUp`, `NodeWatch`, and here `CycleLog` (the cycles that
-are complete), `FaultAgenda` (the faults of the cycles to come) and `Session`, which plays the phases.
+are complete) and `Session`, which plays the phases and announces and injects faults.
 """
 from __future__ import annotations
 
@@ -107,32 +107,6 @@ class CycleLog:
         return None
 
 
-class FaultAgenda:
-    """The faults of the cycles to come: their announcement, resets of the controller, frames of other nodes."""
-
-    def __init__(self, faults: Schedule, stage: Stage, journal: Journal, master: Master) -> None:
-        self._faults, self._stage, self._journal, self._master = faults, stage, journal, master
-        self._edges, self._resets = sorted(faults.edges), list(faults.resets)
-        self._injected = 0  # cycles whose frames of other nodes are sent
-
-    def announce(self) -> None:
-        """Announce the faults that begin or end in the next cycle that is given to the loop."""
-        while self._edges and self._edges[0].cycle <= self._stage.playing.queued:
-            edge = self._edges.pop(0)
-            level, word = ("WARN", "begins") if edge.begins else ("INFO", "ends")
-            self._journal.announce(level, "fault", f"{edge.label} {word}")
-
-    def inject(self) -> None:
-        """Send the resets and the frames of other nodes that are due before the next cycle."""
-        k = self._stage.playing.k
-        while self._resets and self._resets[0][0] <= k:
-            self._master.reset_controller(self._resets.pop(0)[1])
-        for cycle in range(self._injected, k + 1):
-            for cob_id, data in self._faults.foreign_frames(cycle):
-                self._master.send(cob_id, data)
-        self._injected = k + 1
-
-
 class Session:
     """Runs a job's sequence on a bus. `stop()`, called every cycle, is True when the operator wants to end."""
 
@@ -156,7 +130,8 @@ class Session:
                                       set(np.flatnonzero(injected.sync | injected.plant).tolist()))
         self.log = CycleLog(job, self.journal, self.nodes, self._overruns)
         self._master.hooks.on_frame = self.log.keep_drive if job.sequence.disturbs_bus else recorder.frame
-        self._agenda = FaultAgenda(self._faults, self.stage, self.journal, self._master)
+        self._edges, self._resets = sorted(self._faults.edges), list(self._faults.resets)  # those to come
+        self._injected = 0  # cycles whose frames of other nodes are sent
         self.starter = BringUp(job, self.stage, self.journal, self.safety, self._master, stop)
         self.plant_record: CycleRecord | None = None  # the plant's own, read after a real-time run with trouble
         self._stalled_ns = 0  # how long the rig had not received before the nodes were started
@@ -227,7 +202,7 @@ class Session:
             self.journal.announce("INFO", "section", f"{PHASES[phase]}: {section.name}")
             shown = section.name if phase == MAIN else PHASES[phase]
             for i in range(section.start, section.stop):
-                self._agenda.announce()
+                self._announce_faults()
                 if phase == CLEANUP and i == _SETTLING and not self._powered:
                     self._try_again()
                 self._demand = float(profile.command[i])
@@ -241,7 +216,7 @@ class Session:
 
     def _must_end(self) -> bool:
         """Before each cycle of set-up and main: whether something ends main."""
-        self._agenda.inject()
+        self._inject_faults()
         self.nodes.is_node_gone()
         if self._overruns.problem and not self.safety.aborted:
             self.safety.abort("overrun", self._overruns.problem)
@@ -252,6 +227,23 @@ class Session:
             self.safety.note("guard", why)
             self.safety.abort("guard", why)
         return bool(self.safety.aborted)
+
+    def _announce_faults(self) -> None:
+        """Announce the faults that begin or end in the next cycle that is given to the loop."""
+        while self._edges and self._edges[0].cycle <= self.stage.playing.queued:
+            edge = self._edges.pop(0)
+            level, word = ("WARN", "begins") if edge.begins else ("INFO", "ends")
+            self.journal.announce(level, "fault", f"{edge.label} {word}")
+
+    def _inject_faults(self) -> None:
+        """Send the resets of the controller and the frames of other nodes that are due before the next cycle."""
+        k = self.stage.playing.k
+        while self._resets and self._resets[0][0] <= k:
+            self._master.reset_controller(self._resets.pop(0)[1])
+        for cycle in range(self._injected, k + 1):
+            for cob_id, data in self._faults.foreign_frames(cycle):
+                self._master.send(cob_id, data)
+        self._injected = k + 1
 
     def _find_load(self, cycle: int) -> float:
         """Force on the ram from the scenario in a cycle, N."""

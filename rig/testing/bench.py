@@ -216,11 +216,13 @@ def build_sequence(sequence: str | None, command: Command | None, **more: Sequen
 
 def _make_table(command: Command) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The table of a sequence that plays a command, and its files."""
+    main: Any = list(command)
+    files = {}
     if isinstance(command, np.ndarray):
         rows = "\n".join(f"{k / RATE!r},{float(value)!r}" for k, value in enumerate(np.atleast_1d(command)))
-        main: list[Any] = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
-        return {"title": "Command from Python", "main": main}, {_COMMAND_FILE: f"t,com\n{rows}\n".encode()}
-    return {"title": "Command from Python", "main": list(command)}, {}
+        main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
+        files[_COMMAND_FILE] = f"t,com\n{rows}\n".encode()
+    return {"title": "Command from Python", "main": main}, files
 
 
 def write_toml(table: Table) -> str:
@@ -237,17 +239,14 @@ def _write_key(key: str) -> str:
 
 
 def _write_value(value: object) -> str:
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
-    if isinstance(value, int | np.integer):
-        return str(int(value))
-    if isinstance(value, float | np.floating):
-        return repr(float(value))
-    if isinstance(value, str):
+    value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    if isinstance(value, bool | str):
         return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, int | float):
+        return repr(value)
     if isinstance(value, Mapping):
         pairs = ", ".join(f"{_write_key(str(key))} = {_write_value(inner)}" for key, inner in value.items())
         return f"{{ {pairs} }}"
-    if isinstance(value, Sequence | np.ndarray):
-        return f"[{', '.join(_write_value(inner) for inner in value)}]"
+    if isinstance(value, Sequence):
+        return f"[{', '.join(map(_write_value, value))}]"
     raise InputError("sequence", "", f"numbers, texts, lists and tables, not {type(value).__name__}")
