@@ -131,7 +131,8 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     grid = _search_grid(fitted, model, notes)
     if with_effects:
         progress("refinement", 0.07)
-    refinement = refine_sizes(model, fitted, (*_list_starts(grid), *COARSE_STARTS), floor, workers, trace,
+    starts = [] if grid is None else [grid.merged[:2], *(m.minimum[:2] for m in (grid.joint, grid.step, grid.ramp) if m)]
+    refinement = refine_sizes(model, fitted, (*starts, *COARSE_STARTS), floor, workers, trace,
                               ignore_progress if with_effects else progress)
     sizes = _widen_intervals(refinement)
     beside = None
@@ -178,32 +179,18 @@ def _search_grid(trace: Trace, model: Model, notes: list[str]) -> Grid | None:
         return None
 
 
-def _list_starts(grid: Grid | None) -> list[tuple[float, float]]:
-    """The grid's answers as starts of the refinement."""
-    if grid is None:
-        return []
-    minima = [m.minimum for m in (grid.joint, grid.step, grid.ramp) if m is not None]
-    return [(grid.merged.kintas, grid.merged.fss), *((p.kintas, p.fss) for p in minima)]
-
-
 def _judge_sizes(sizes: Mapping[str, Estimate], refinement: Refinement) -> dict[str, Level | None]:
     """Level of each fault; where physics is missing in the fit, a fault is acceptable at most, or cannot be judged."""
     levels = {f.name: judge_size(f, sizes[f.name]) for f in FAULTS}
     if refinement.is_explained:
         return levels
-    if _is_useless(refinement):
-        return dict.fromkeys(levels)
-    return {name: level if level == Level.ACCEPTABLE else None for name, level in levels.items()}
-
-
-def _is_useless(refinement: Refinement) -> bool:
-    """Whether the fit leaves so much that it says nothing of any size."""
-    return max(refinement.ratio.values()) > RESIDUAL_JUDGES_NOTHING
+    is_known = max(refinement.ratio.values()) <= RESIDUAL_JUDGES_NOTHING
+    return {name: level if is_known and level == Level.ACCEPTABLE else None for name, level in levels.items()}
 
 
 def _find_unhealthy(refinement: Refinement, model: Model) -> dict[str, Estimate]:
-    """The suspects outside the healthy range, by parameter."""
-    if _is_useless(refinement):
+    """The suspects outside the healthy range, by parameter; none if the fit leaves so much that it says nothing."""
+    if max(refinement.ratio.values()) > RESIDUAL_JUDGES_NOTHING:
         return {}
     return {name: e for name, e in refinement.others.items() if _is_unhealthy(name, e, model)}
 
@@ -217,9 +204,9 @@ def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
 
 
 def _decide_verdict(levels: Mapping[str, Level | None], is_explained: bool) -> str:
-    known = [found for found in levels.values() if found is not None]
     if not is_explained:
         return "SOMETHING_ELSE"
+    known = [found for found in levels.values() if found is not None]
     worst = max(known, default=Level.ACCEPTABLE)
     if worst > Level.ACCEPTABLE:
         return worst.name

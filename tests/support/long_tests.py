@@ -11,7 +11,6 @@ LONG_TESTS = (
     "fdi/comparison/test_sensor_dynamics.py",
     "fdi/comparison/test_servo.py",
     "fdi/diagnosis/test_bands.py",
-    "fdi/diagnosis/test_beside.py",
     "fdi/diagnosis/test_precursors.py",
     "fdi/diagnosis/test_refine.py",
     "fdi/diagnosis/test_rms_grid.py",

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import gzip
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from fdi.trace.mcap_log import Log, open_log
 from fdi.trace.sections import find_sections
 from fdi.trace.trace import Check, Gap, Trace
 from plant.errors import InputError
-from rig.recorder import U32, Event, NmtState, Recorder, Signals, Timing, schema
+from rig.recorder import Event, NmtState, Recorder, Signals, Timing
 
 KINDS = ["hold", "step", "step", "step", "step", "ramp", "hold", "ramp", "hold", "dynamic", "hold"]  # of preflight
 
@@ -70,30 +69,6 @@ def test_events_keep_to_the_rows_after_a_stall(tmp_path: Path, everything: bool)
     assert [event.t for event in trace.events] == pytest.approx([-0.6, -1e-4, 0.0995, 0.1005, 3.199], abs=1e-6)
     assert trace.nmt[0].t == 0.05
     np.testing.assert_array_equal(trace.timing.t, trace.t)
-
-
-@dataclass(slots=True)
-class OldTiming:
-    """A cycle's timing as logs of version 0.1 have it."""
-
-    cycle: U32 = field(metadata={"unit": "", "doc": ""})
-    overrun: bool = field(metadata={"unit": "", "doc": ""})
-    lateness: float = field(metadata={"unit": "s", "doc": ""})
-    response: float = field(metadata={"unit": "s", "doc": ""})
-    work: float = field(metadata={"unit": "s", "doc": ""})
-
-
-def test_a_log_of_an_earlier_version_has_no_feedback_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(schema.TOPICS, "/timing", OldTiming)
-    monkeypatch.setitem(schema.CHANNELS, OldTiming, schema.CHANNELS[Timing])
-    recorder = Recorder(tmp_path / "trace.mcap", {}, {"period": "0.001"})
-    for k in range(10):
-        old = OldTiming(k, False, 1e-5, 2e-4, 3e-4)
-        recorder.cycle(k * 1_000_000, Signals(k, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0), old)  # type: ignore[arg-type]
-    recorder.close()
-    timing = Trace.read(tmp_path / "trace.mcap").timing
-    assert set(timing.response) == {2e-4} and len(timing.execution) == 10
-    assert np.isnan([timing.feedback_response, timing.valve_response, timing.execution]).all()
 
 
 @pytest.mark.parametrize("name", ["x.csv", "x.csv.gz"])
