@@ -131,7 +131,9 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     grid = _search_grid(fitted, model, notes)
     if with_effects:
         progress("refinement", 0.07)
-    starts = [] if grid is None else [grid.merged[:2], *(m.minimum[:2] for m in (grid.joint, grid.step, grid.ramp) if m)]
+    maps = (grid.joint, grid.step, grid.ramp) if grid else ()
+    starts = [grid.merged[:2]] if grid else []
+    starts += [m.minimum[:2] for m in maps if m is not None]
     refinement = refine_sizes(model, fitted, (*starts, *COARSE_STARTS), floor, workers, trace,
                               ignore_progress if with_effects else progress)
     sizes = _widen_intervals(refinement)

@@ -47,23 +47,25 @@ def test_counter_that_wraps_and_a_gap(tmp_path: Path) -> None:
     assert {s.name: (s.gaps, s.missing) for s in imported.signals}["xj"] == (1, 25)
 
 
-def test_counter_with_too_few_bits_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"n: expected whole numbers from 0 to 255 \(8 bits\); row 257 has 256"):
-        convert(tmp_path, '[time]\nsource = "n"\nbits = 8\nrate = 1000\n', n=np.arange(1000))
+P12 = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\n'
 
 
-def test_scale_offset_and_sign_of_counts(tmp_path: Path) -> None:
-    """Value = sign * (scale * raw + offset)."""
-    text = ('[time]\nrate = 1000\n[signals.p12]\nsource = "adc"\nunit = "bar"\nscale = 0.0625\noffset = -0.625\n'
-            'sign = -1\n')
-    trace = convert(tmp_path, text, adc=np.arange(1000)).trace
-    assert trace.p12[[0, 10, 26]].tolist() == [62500.0, 0.0, -100000.0]
+@pytest.mark.parametrize(("keys", "rows"), [
+    ('unit = "bar"\nscale = 0.0625\noffset = -0.625\nsign = -1', {0: 62500.0, 10: 0.0, 26: -100000.0}),
+    ("delay = 0.003", {0: 3.0, 4: 7.0, 996: 999.0, 997: math.nan, 999: math.nan}),
+    ("sensor = {dead = [[0.2, 0.3]]}", {199: 199.0, 200: math.nan, 300: math.nan, 301: 301.0})])
+def test_scale_delay_and_dead_span(keys: str, rows: dict[int, float], tmp_path: Path) -> None:
+    """Value = sign * (scale * raw + offset), some rows earlier, NaN where the channel was dead."""
+    got = convert(tmp_path, f"{P12}{keys}\n", p=np.arange(1000)).trace.p12
+    assert got[list(rows)].tolist() == pytest.approx(list(rows.values()), abs=0.0, nan_ok=True)
 
 
-def test_delay_moves_a_signal_by_rows(tmp_path: Path) -> None:
-    text = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\ndelay = 0.003\n'
-    trace = convert(tmp_path, text, p=np.arange(1000)).trace
-    assert trace.p12[:5].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0] and np.isnan(trace.p12[-3:]).all()
+@pytest.mark.parametrize(("text", "reason"), [
+    ('[time]\nsource = "p"\nbits = 8\nrate = 1000\n', r"whole numbers from 0 to 255 \(8 bits\); row 257 has 256"),
+    (f"{P12}sensor = {{dead = true}}\n", "marked dead")])
+def test_too_few_bits_and_a_dead_channel_are_refused(text: str, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=reason):
+        convert(tmp_path, text, p=np.arange(1000))
 
 
 def test_slow_signal_lies_on_straight_lines_and_its_gap_stays(tmp_path: Path) -> None:
@@ -76,14 +78,6 @@ def test_slow_signal_lies_on_straight_lines_and_its_gap_stays(tmp_path: Path) ->
     assert got[:5].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])
     assert np.isnan(got[391:500]).all() and not np.isnan(got[:391]).any() and not np.isnan(got[500:991]).any()
     assert "straight lines between samples 10 ms apart" in imported.signals[0].how
-
-
-def test_dead_span_is_left_out(tmp_path: Path) -> None:
-    text = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\nsensor = {dead = [[0.2, 0.3]]}\n'
-    got = convert(tmp_path, text, p=np.arange(1000)).trace.p12
-    assert np.flatnonzero(np.isnan(got)).tolist() == list(range(200, 301))
-    with pytest.raises(InputError, match="marked dead"):
-        convert(tmp_path, text.replace("[[0.2, 0.3]]", "true"), p=np.arange(1000))
 
 
 def test_what_would_fold_is_filtered_first() -> None:
@@ -133,20 +127,18 @@ def test_guess_of_a_table_without_names(tmp_path: Path) -> None:
     assert "# [signals.cor]" in guessed.text and "every analysis needs it" in guessed.text
 
 
-def test_guess_finds_a_counter(tmp_path: Path) -> None:
-    lines = ["cnt;Sollwert_mm;Istwert_mm;i_mA"]
-    lines += [f"{(250 + k) % 256};{math.sin(k / 90):.5f};{-math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(2000)]
-    text = guess(tmp_path, lines).text
-    assert 'source = "cnt"\nbits = 8' in text and "sign = -1" in text
-
-
-def test_guess_takes_the_rate_of_a_counter_from_its_unit(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "step", "size", "said"), [
+    ("cnt", 1, 256, 'source = "cnt"\nbits = 8\nrate = 1000  # counts a second: put in the true one'),
+    ("cnt [us]", 500, 65536, "bits = 16\nrate = 1000000  # counts a second, as the header says (us): 2000 rows")])
+def test_guess_finds_a_counter_and_takes_its_rate_from_its_unit(name: str, step: int, size: int, said: str,
+                                                                tmp_path: Path) -> None:
     """A counter of microseconds that wraps counts 1e6 a second: 500 counts a row are 2000 rows a second."""
-    lines = ["cnt [us];Soll [mm];Ist [mm];i [mA]"]
-    lines += [f"{500 * k % 65536};{math.sin(k / 90):.5f};{math.sin(k / 90 - 0.1):.5f};{k % 3}" for k in range(500)]
+    lines = [f"{name};Sollwert_mm;Istwert_mm;i_mA"]
+    lines += [f"{step * (250 + k) % size};{math.sin(k / 90):.5f};{-math.sin(k / 90 - 0.1):.5f};{k % 3}"
+              for k in range(2000)]
     guessed = guess(tmp_path, lines)
-    assert "bits = 16\nrate = 1000000  # counts a second, as the header says (us): 2000 rows" in guessed.text
-    assert guessed.chosen["time"][1] != "unsure"
+    assert said in guessed.text and "sign = -1" in guessed.text
+    assert (guessed.chosen["time"][1] == "unsure") == (name == "cnt")
 
 
 def test_guess_scales_counts_and_writes_their_step(tmp_path: Path) -> None:
