@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import ctypes
 import dis
 import fcntl
 import hashlib
@@ -18,7 +17,8 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -32,63 +32,30 @@ Function = Any  # a plain function, or numba's dispatcher of one
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
 
 
-class LibraryFunction:
-    """A function of the C library by its name: compiled code calls it directly, interpreted code through ctypes.
+@dataclass(frozen=True)
+class ForeignCall:
+    """A call of machine code that is not ours, for compiled code: of a function of the C library, or by address.
 
-    Compiled code that calls one can be stored on disk, which is not so for a function pointer of ctypes.
+    Code that calls the library by name can be stored on disk, which is not so for a function pointer of ctypes. A loop
+    that calls the plant by its address, `call(address, arguments..)`, is compiled once for all plants.
     """
 
-    def __init__(self, name: str, signature: str) -> None:
-        """`signature`: type of the result, then of the arguments, a letter each; for instance "qiqi" for recvmsg.
+    signature: str  # type of the result, then of the arguments: i 32-bit integer; q 64-bit, size or address; d double
+    name: str = ""  # of the function of the C library
 
-        i is a 32-bit integer; q is a 64-bit integer, a size or an address.
-        """
-        self.name, self.signature = name, signature
-        self._entry: Any = None
-
-    def __call__(self, *arguments: int) -> int:
-        """Call it from interpreted code."""
-        if self._entry is None:
-            kinds = {"i": ctypes.c_int32, "q": ctypes.c_int64}
-            self._entry = ctypes.CDLL(None)[self.name]
-            self._entry.restype, *self._entry.argtypes = (kinds[letter] for letter in self.signature)
-        return int(self._entry(*arguments))
+    def __call__(self, *arguments: float) -> int:
+        raise TypeError(f"{self}: only compiled code can call it")
 
     def declare(self) -> Any:
-        """The declaration that numba needs."""
-        import numba
-
-        kinds: dict[str, Any] = {"i": numba.types.int32, "q": numba.types.int64}
-        result, *arguments = (kinds[letter] for letter in self.signature)
-        return numba.types.ExternalFunction(self.name, result(*arguments))
-
-    def __repr__(self) -> str:
-        return f"LibraryFunction({self.name!r}, {self.signature!r})"
-
-
-class PointerCall:
-    """A call of machine code by its address, `call(address, arguments..)`: what is called is chosen at run time.
-
-    A loop that calls the plant by its address is compiled once for all plants.
-    """
-
-    def __init__(self, signature: str) -> None:
-        """`signature`: as for `LibraryFunction`; d is a double."""
-        self.signature = signature
-
-    def __call__(self, address: int, *arguments: float) -> int:
-        """Call it from interpreted code."""
-        kinds: dict[str, Any] = {"i": ctypes.c_int32, "q": ctypes.c_int64, "d": ctypes.c_double}
-        return int(ctypes.CFUNCTYPE(*(kinds[letter] for letter in self.signature))(address)(*arguments))
-
-    def declare(self) -> Any:
-        """The function that numba compiles into a call."""
+        """What numba compiles into the call."""
         import llvmlite.ir
         import numba
         import numba.extending
 
         kinds: dict[str, Any] = {"i": numba.types.int32, "q": numba.types.int64, "d": numba.types.float64}
         result, *arguments = (kinds[letter] for letter in self.signature)
+        if self.name:
+            return numba.types.ExternalFunction(self.name, result(*arguments))
 
         def type_call(given: tuple[Any, ...]) -> Any:
             def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -102,12 +69,6 @@ class PointerCall:
         made: dict[str, Any] = {"type_call": type_call}
         exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))", made)
         return numba.extending.intrinsic(made[f"call_{self.signature}"])
-
-    def __repr__(self) -> str:
-        return f"PointerCall({self.signature!r})"
-
-
-Foreign = LibraryFunction | PointerCall
 
 
 def find_cache_folder() -> Path:
@@ -200,24 +161,6 @@ def _find_folder_of_code(root: Function) -> Path:
     return find_cache_folder() / compute_fingerprint(root)
 
 
-@contextlib.contextmanager
-def list_compilations() -> Iterator[list[str]]:
-    """An entry for each time that numba's compiler is entered while the context lasts, to compile or to load code."""
-    import numba.core.event
-
-    entries: list[str] = []
-
-    class Listener(numba.core.event.Listener):
-        def on_start(self, event: Any) -> None:
-            entries.append(str(event.data))
-
-        def on_end(self, event: Any) -> None:
-            """The end says nothing that the start did not."""
-
-    with numba.core.event.install_listener("numba:compiler_lock", Listener()):
-        yield entries
-
-
 # no fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is only
 # called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
 INLINE_OPTIONS: Any = {
@@ -242,7 +185,7 @@ def _declare_part(f: Function) -> Function:
 
 
 def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
-                declare: Callable[[Foreign], Any] = lambda call: call) -> Function:
+                declare: Callable[[ForeignCall], Any] = lambda call: call) -> Function:
     """Copy the call graph below `function`, names in `ports` replaced by theirs.
 
     Each copy goes through `make`, each function of the C library through `declare`.
@@ -255,7 +198,7 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
             return f
         if f not in made:
             calls = {name: link(ports.get(name, g)) for name, g in _find_calls(f).items()}
-            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, Foreign)}
+            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, ForeignCall)}
             made[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
         return made[f]
 

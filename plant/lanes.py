@@ -144,11 +144,9 @@ class Lanes:
             InputError: shapes that do not fit.
         """
         where = np.empty(0) if position is None else position
-        values, driven, load, where = self._check(values, current, load, where)
-        work = self._make_blocks(values, len(driven))
-        inputs = driven, load, where, float(anchor), False, float(self.model["controller.period"]), self.steps
-        for first in range(0, len(driven), rows):
-            stop = min(first + rows, len(driven))
+        work, inputs = self._prepare(values, current, load, where, anchor, False)
+        for first in range(0, len(current), rows):
+            stop = min(first + rows, len(current))
             out = np.empty((len(values) + 1, 3, stop - first))
 
             def go_on(block: Block, first: int = first, stop: int = stop, out: Array = out) -> None:
@@ -175,11 +173,9 @@ class Lanes:
 
     def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
              parts: Sequence[Part] = ()) -> Array:
-        values, driven, load, position = self._check(values, driven, load, position)
+        blocks, inputs = self._prepare(values, driven, load, position, anchor, closed)
         out = np.empty((len(values) + 1, 4 if closed else 3, len(driven)))  # the last for idle lanes
-        inputs = driven, load, position, float(anchor), closed, float(self.model["controller.period"]), self.steps
-        pieces = parts or (Part(0, len(driven), 0),)
-        work = [(block, part) for block in self._make_blocks(values, len(driven)) for part in pieces]
+        work = [(block, part) for block in blocks for part in parts or (Part(0, len(driven), 0),)]
 
         def do(task: tuple[Block, Part]) -> None:
             block, part = task
@@ -191,8 +187,9 @@ class Lanes:
         map_in_threads(do, work, self.workers)
         return out[:-1].transpose(0, 2, 1)
 
-    def _check(self, values: Array, driven: Array, load: Array, position: Array) -> tuple[Array, Array, Array, Array]:
-        """The inputs of runs as contiguous arrays.
+    def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool
+                 ) -> tuple[list[Block], tuple[Any, ...]]:
+        """The runs in blocks, and the inputs that they share.
 
         Raises:
             InputError: shapes that do not fit.
@@ -203,11 +200,10 @@ class Lanes:
         if driven.ndim != 1 or load.shape != driven.shape or position.shape not in (driven.shape, (0,)):
             raise InputError("lanes", "load", "one number a cycle in each input, not shapes "
                              f"{driven.shape}, {load.shape} and {position.shape}")
-        return values, driven, load, position
-
-    def _make_blocks(self, values: Array, samples: int) -> list[Block]:
-        return [block for rung, members in self._assign_runs(values, samples)
-                for block in rung.build_blocks(self.names, values, members)]
+        blocks = [block for rung, members in self._assign_runs(values, len(driven))
+                  for block in rung.build_blocks(self.names, values, members)]
+        period = float(self.model["controller.period"])
+        return blocks, (driven, load, position, float(anchor), closed, period, self.steps)
 
     def _assign_runs(self, values: Array, samples: int) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones.
@@ -291,7 +287,7 @@ class KernelVariant:
 
         def is_stored() -> bool:
             plan = plan_layout(self.model.effects, self.model.plant, NARROW)
-            return is_function_stored(bind_block_loop(plan), plan.names)
+            return is_function_stored(plan.loop, plan.names)
 
         return KERNEL_USE.is_ready(key, steps, is_stored, self.prepare)
 
@@ -369,19 +365,19 @@ def list_laws(effects: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 @cache
-def _compile_layout(effects: tuple[str, ...], functions: tuple[Any, ...], plant: str, width: int
-              ) -> tuple[Layout, Function]:
+def _compile_layout(effects: tuple[str, ...], laws: tuple[Any, ...], plant: str, width: int) -> tuple[Layout, Function]:
+    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
     plan = plan_layout(effects, plant, width)
-    return plan, compile_block_kernel(plan)
+    return plan, compile_function(plan.loop, plan.names)
 
 
 class Layout(NamedTuple):
     """The layout of a block's buffer for a plant with certain effects."""
 
+    loop: Function  # `run_block` for so many lanes
     names: dict[str, Function]  # replace the placeholders below and the ports
     parameters: int  # the number of the first parameter, which follow each other as in `Model.names`
     numbers: int  # of a lane
-    width: int  # lanes
 
 
 class Drive(NamedTuple):
@@ -391,13 +387,14 @@ class Drive(NamedTuple):
     next: float = 0.0
 
 
-def _raise_unbound(*arguments: Any) -> Any:
-    raise TypeError("no model is bound")
+def raise_unbound(*arguments: Any) -> Any:
+    """Stands for a function that is bound later."""
+    raise TypeError("no layout is bound")
 
 
 # each of these stands for a model's own, which is put in its place: x_at(buffer, lane), keep_x(x, buffer, lane)
-state_at = parameters_at = coefficients_at = loop_at = drive_at = _raise_unbound
-keep_state = keep_coefficients = keep_loop = keep_drive = _raise_unbound
+state_at = parameters_at = coefficients_at = loop_at = drive_at = raise_unbound
+keep_state = keep_coefficients = keep_loop = keep_drive = raise_unbound
 
 
 def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> Layout:
@@ -409,17 +406,7 @@ def plan_layout(effects: tuple[str, ...], plant: str, width: int = NARROW) -> La
     for name, shape in shapes.items():
         made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, width, place)
     made["parameters_at"] = make_record_reader(record.dtype, place * width, width)
-    return Layout(made, place, place + record.view(float).size, width)
-
-
-def compile_block_kernel(plan: Layout) -> Function:
-    """`run_block` as machine code."""
-    return compile_function(bind_block_loop(plan), plan.names)
-
-
-def bind_block_loop(plan: Layout) -> Function:
-    """`run_block` for the lanes of a layout."""
-    return rebind_names(run_block, WIDTH=plan.width)
+    return Layout(rebind_names(run_block, WIDTH=width), made, place, place + record.view(float).size)
 
 
 def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,

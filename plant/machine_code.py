@@ -69,7 +69,7 @@ class StoredCode:
                     _write_object(self._path, code)
 
     def find_address(self) -> int:
-        """Address of the machine code, for a `plant.compile.PointerCall` of ADVANCE_CALL; call `warm` before."""
+        """Address of the machine code, for a `plant.compile.ForeignCall` of ADVANCE_CALL; call `warm` before."""
         if self._entry is not None:
             return int(self._engine.get_function_address(_SYMBOL))
         return find_function_address(self._compile())
@@ -80,9 +80,7 @@ class StoredCode:
             run = self._compile()
             return lambda current, load, noise, t: run(flat, current, load, noise, t, record, steps)
         entry = self._entry
-        result, failure = ctypes.c_void_p(), ctypes.c_void_p()
-        head = ctypes.byref(result), ctypes.byref(failure), *_describe_array(flat)
-        tail = *_describe_array(record), steps
+        head, tail = _list_arguments(flat, record, steps)
 
         def advance(current: float, load: float, noise: float, t: float) -> None:
             if entry(*head, current, load, noise, t, *tail) != 0:  # an exception; numba knows how to raise it
@@ -101,14 +99,18 @@ def _gives_same_bits(code: bytes, run: Any, flat: Array, record: Array) -> bool:
     """Whether the object code moves a copy of the state as numba's function does; else it is not to be stored."""
     _engine, entry = _link_object(code)
     expected, state = flat.copy(), flat.copy()
-    result, failure = ctypes.c_void_p(), ctypes.c_void_p()
+    head, tail = _list_arguments(state, record, 10)
     for current in (1e-3, -2e-3, 5e-3):
         run(expected, current, 100.0, 0.0, 0.0, record, 10)
-        status = entry(ctypes.byref(result), ctypes.byref(failure), *_describe_array(state), current, 100.0, 0.0, 0.0,
-                       *_describe_array(record), 10)
-        if status != 0:
+        if entry(*head, current, 100.0, 0.0, 0.0, *tail) != 0:
             return False
     return state.tobytes() == expected.tobytes()
+
+
+def _list_arguments(flat: Array, record: Array, steps: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The arguments of the machine code before and behind the four numbers of a cycle."""
+    result, failure = ctypes.c_void_p(), ctypes.c_void_p()
+    return ((ctypes.byref(result), ctypes.byref(failure), *_describe_array(flat)), (*_describe_array(record), steps))
 
 
 def _describe_array(array: Array) -> tuple[int | None, ...]:

@@ -23,6 +23,7 @@ from plant.controller import Loop, compute_current
 from plant.errors import InputError
 from plant.flat import make_lane_packers
 from plant.friction import clip, soften
+from plant.lanes import Drive, raise_unbound
 from plant.model import Model
 from plant.parameters import Controller
 from plant.threads import count_threads, map_in_threads
@@ -67,13 +68,6 @@ class Motion(NamedTuple):
     position: float = 0.0  # XJ, m
     speed: float = 0.0  # XJ', m/s
     sliding: float = 0.0  # which way the spool slides: -1, 1, or 0 for stuck
-
-
-class Drive(NamedTuple):
-    """Current, A: in this cycle, and the controller's answer for the next."""
-
-    now: float = 0.0
-    next: float = 0.0
 
 
 def compute_decay(x: float) -> float:
@@ -137,12 +131,8 @@ def compute_cells(model: Model, names: Sequence[str], values: Array, h: float, s
         gp, slope, psr])
 
 
-def _raise_unbound(*arguments: Any) -> Any:
-    raise TypeError("no layout is bound")
-
-
 # each of these is replaced by `compile_monitor_kernel`: x_at(buffer, lane), keep_x(x, buffer, lane)
-motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = _raise_unbound
+motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = raise_unbound
 
 
 def sample_lane(a: Any, lane: int, pulled: float, shown: float) -> float:

@@ -249,25 +249,6 @@ def test_docstrings(path: Path) -> None:
     assert list(undocumented(path)) == [], name(path)
 
 
-def stubs(path: Path) -> Iterator[str]:
-    """Functions with neither a body nor a word why, that are not declarations (protocols, overloads)."""
-    classes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
-    protocols = [node for node in classes if "Protocol" in map(ast.unparse, node.bases)]
-    excused = {id(child) for node in protocols for child in ast.walk(node)}
-    for node in ast.walk(tree(path)):
-        if not isinstance(node, ast.FunctionDef) or id(node) in excused or decorated(node, "overload", "abstract"):
-            continue
-        body = [line for line in node.body if not isinstance(line, ast.Pass)]
-        body = [line for line in body if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))]
-        if not body and ast.get_docstring(node) is None:
-            yield f"{name(path)}:{node.lineno}: {node.name}"
-
-
-def test_no_empty_functions() -> None:
-    """Nothing is left to be filled in later; what does nothing on purpose has a docstring that says so."""
-    assert [stub for path in MODULES for stub in stubs(path)] == []
-
-
 def test_no_leftovers_and_no_machine_paths() -> None:
     """No notes to oneself, no folder of one machine, no host of a package registry."""
     notes = "|".join(["TO" + "DO", "FIX" + "ME", "X" * 3, "HA" + "CK"])
@@ -405,13 +386,12 @@ def test_each_import_is_declared() -> None:
 
 
 def test_each_dependency_is_used() -> None:
-    """Nothing is installed for nothing. The imports, or what needs the package where nothing imports it."""
+    """Nothing is installed for nothing."""
     modules = {"python-can": "can", "mcap-protobuf-support": "mcap_protobuf", "protobuf": "google"}
-    not_imported = {"msgpack"}  # python-can's udp_multicast interface does not work without it
     used = {module.partition(".")[0] for path in MODULES for module in imported(path)}
     for line in PROJECT["project"]["dependencies"]:
         distribution = re.split("[<>=]", line)[0]
-        assert distribution in not_imported or modules.get(distribution, distribution) in used, distribution
+        assert modules.get(distribution, distribution) in used, distribution
 
 
 def test_every_package_and_data_file_is_installed() -> None:

@@ -15,8 +15,7 @@ A loop that must not be late is a plain function that calls `receive_frame` and 
 `data` is the payload as one signed 64-bit integer, first byte lowest, bytes beyond `length` zero: `join_words` and
 `join_halves` build it, `split_words` and `split_halves` read it. All times are those of CLOCK_MONOTONIC, ns
 (`time.monotonic_ns()`); `receive_frame` gives the time at which the kernel received the frame. A port belongs to one
-thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN once. The same functions also run
-interpreted, which is slow.
+thread. `bus.wake()` from another thread makes `receive_frame` return WOKEN once.
 
 Filters: the kernel drops frames with other COB-IDs (CAN_RAW_FILTER; on UDP a socket filter, which also drops the bus's
 own frames). What still arrives and is not a classical data frame with an 11-bit identifier is counted and dropped.
@@ -42,7 +41,7 @@ import numpy as np
 from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
-from plant.compile import LibraryFunction, keep_apart
+from plant.compile import ForeignCall, keep_apart
 from plant.errors import InputError, RigError
 from rig.network import udp
 from rig.network.bus import parse_spec, require_interface
@@ -78,15 +77,15 @@ _EAGAIN, _EINTR, _ENOBUFS = errno.EAGAIN, errno.EINTR, errno.ENOBUFS
 _CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 
-_recvmsg = LibraryFunction("recvmsg", "qiqi")
-_send = LibraryFunction("send", "qiqqi")
-_ppoll = LibraryFunction("ppoll", "iqqqq")
-_read = LibraryFunction("read", "qiqq")
-_semtimedop = LibraryFunction("semtimedop", "iiqqq")
-_clock_gettime = LibraryFunction("clock_gettime", "iiq")
-_clock_nanosleep = LibraryFunction("clock_nanosleep", "iiiqq")
-_errno_location = LibraryFunction("__errno_location", "q")
-_memcpy = LibraryFunction("memcpy", "qqqq")
+_recvmsg = ForeignCall("qiqi", "recvmsg")
+_send = ForeignCall("qiqqi", "send")
+_ppoll = ForeignCall("iqqqq", "ppoll")
+_read = ForeignCall("qiqq", "read")
+_semtimedop = ForeignCall("iiqqq", "semtimedop")
+_clock_gettime = ForeignCall("iiq", "clock_gettime")
+_clock_nanosleep = ForeignCall("iiiqq", "clock_nanosleep")
+_errno_location = ForeignCall("q", "__errno_location")
+_memcpy = ForeignCall("qqqq", "memcpy")
 
 
 class Port(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import Model
-from plant.compile import PointerCall, keep_apart
+from plant.compile import ForeignCall, keep_apart
 from plant.flat import list_state_values
 from plant.machine_code import ADVANCE_CALL, READ_CALL
 from plant.model import STEPS
@@ -90,7 +90,7 @@ _LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
 _TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
 _MAXIMUM, _MINIMUM = 2.0**31 - 1.0, -(2.0**31)
 
-_call_advance, _call_read = PointerCall(ADVANCE_CALL), PointerCall(READ_CALL)
+_call_advance, _call_read = ForeignCall(ADVANCE_CALL), ForeignCall(READ_CALL)
 
 Words = NDArray[np.int64]
 Reals = NDArray[np.float64]

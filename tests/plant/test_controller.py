@@ -19,43 +19,27 @@ PI, PD = PID._replace(derivative_gain=0.0), PID._replace(integral_gain=0.0)
 P = PD._replace(derivative_gain=0.0)
 
 
-def answers(law: Controller, *rows: tuple[float, float]) -> list[float]:
+@pytest.mark.parametrize(("law", "rows", "expected"), [
+    # 4 A/m on the error, demand minus position; 8 mA at most, either way
+    (P, [(1e-3, 0.0), (1e-3, 0.25e-3), (0.0, 0.5e-3), (5e-3, 0.0), (-5e-3, 0.0), (2e-3, 0.0)],
+     [4e-3, 3e-3, -2e-3, 8e-3, -8e-3, 8e-3]),
+    # errors 1, 0.5, 0.5, 0.75 mm: their rates are none in the first cycle, then -0.5, 0 and +0.25 m/s; times 2 mA
+    (PD, [(1e-3, 0.0), (1e-3, 0.5e-3), (1e-3, 0.5e-3), (1e-3, 0.25e-3)], [4e-3, 2e-3 - 1e-3, 2e-3, 3e-3 + 0.5e-3]),
+    # 50 A/(m s) for 1 ms: 0.05 A per m of error and cycle, so 0.05 mA a cycle at 1 mm; then -0.1 mA at -2 mm
+    (PI, [(1e-3, 0.0), (1e-3, 0.0), (1e-3, 0.0), (0.0, 2e-3)], [4.05e-3, 4.10e-3, 4.15e-3, 0.05e-3 - 8e-3]),
+    # errors 1 and 0.5 mm: 4 + 0.05, then 2 + 0.075 - 1 mA
+    (PID, [(1e-3, 0.0), (1e-3, 0.5e-3)], [4.05e-3, 1.075e-3]),
+    # at 5 mm the output is at its limit and the integral waits; at -1 mm it falls at once, from what it was before
+    (PI, [(1e-3, 0.0), *[(5e-3, 0.0)] * 1000, (1e-3, 0.0), (-1e-3, 0.0)],
+     [4.05e-3, *[8e-3] * 1000, 4.1e-3, -4e-3 + 0.05e-3]),
+], ids=["proportional", "derivative", "integral", "all three", "no wind-up"])
+def test_law(law: Controller, rows: list[tuple[float, float]], expected: list[float]) -> None:
     """Currents, A, for rows of demand and position, m."""
     loop, out = Loop(), []
     for demand, position in rows:
         current, loop = compute_current(loop, demand, position, law)
         out.append(current)
-    return out
-
-
-def test_proportional() -> None:
-    """4 A/m on the error, demand minus position; 8 mA at most, either way."""
-    rows = [(1e-3, 0.0), (1e-3, 0.25e-3), (0.0, 0.5e-3), (5e-3, 0.0), (-5e-3, 0.0), (2e-3, 0.0)]
-    assert answers(P, *rows) == pytest.approx([4e-3, 3e-3, -2e-3, 8e-3, -8e-3, 8e-3], abs=1e-15)
-
-
-def test_derivative_opposes_an_error_that_falls() -> None:
-    """Errors 1, 0.5, 0.5, 0.75 mm: their rates are none in the first cycle, then -0.5, 0 and +0.25 m/s; times 2 mA."""
-    rows = [(1e-3, 0.0), (1e-3, 0.5e-3), (1e-3, 0.5e-3), (1e-3, 0.25e-3)]
-    expected = [4e-3, 2e-3 - 1e-3, 2e-3, 3e-3 + 0.5e-3]
-    assert answers(PD, *rows) == pytest.approx(expected, abs=1e-15)
-
-
-def test_integral_adds_this_cycles_error() -> None:
-    """50 A/(m s) for 1 ms: 0.05 A per m of error and cycle, so 0.05 mA a cycle at 1 mm; then -0.1 mA at -2 mm."""
-    rows = [(1e-3, 0.0), (1e-3, 0.0), (1e-3, 0.0), (0.0, 2e-3)]
-    assert answers(PI, *rows) == pytest.approx([4.05e-3, 4.10e-3, 4.15e-3, 0.05e-3 - 8e-3], abs=1e-15)
-
-
-def test_all_three() -> None:
-    """Errors 1 and 0.5 mm: 4 + 0.05, then 2 + 0.075 - 1 mA."""
-    assert answers(PID, (1e-3, 0.0), (1e-3, 0.5e-3)) == pytest.approx([4.05e-3, 1.075e-3], abs=1e-15)
-
-
-def test_no_wind_up_at_the_limit_and_the_way_back_is_free() -> None:
-    """At 5 mm the output is at its limit and the integral waits; at -1 mm it falls at once, from what it was before."""
-    assert answers(PI, (1e-3, 0.0), *[(5e-3, 0.0)] * 1000, (1e-3, 0.0), (-1e-3, 0.0)) == pytest.approx(
-        [4.05e-3, *[8e-3] * 1000, 4.1e-3, -4e-3 + 0.05e-3], abs=1e-15)
+    assert out == pytest.approx(expected, abs=1e-15)
 
 
 def test_the_limit_does_not_stop_an_integral_that_comes_back() -> None:

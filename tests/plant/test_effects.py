@@ -1,13 +1,9 @@
 """One suite for everything in the catalogue: what it says of itself, and what every law must keep to."""
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 from effects_cases import EASY, LAWS, QUIET_SPOOL, WHOLE
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from physics_cases import PREFLIGHT, SILENT
 
 from plant import Actuator, InputError, Model, simulate
@@ -116,14 +112,6 @@ def test_all_at_once() -> None:
     assert same_interpreted(model)
 
 
-@given(st.sets(st.sampled_from([name for name in LAWS if name != "spool_underlap"]), min_size=2, max_size=4))
-@settings(max_examples=2, deadline=None, derandomize=True)
-def test_sets_of_effects_compiled_equal_interpreted(names: set[str]) -> None:
-    model = Model().replace({k: v for name in names for k, v in largest(name).items()})
-    assert set(model.effects) == names
-    assert same_interpreted(model)
-
-
 @pytest.mark.parametrize(("name", "i"), EACH)
 def test_finite_and_deterministic_over_the_preflight(name: str, i: int) -> None:
     model = WHOLE.replace(CATALOGUE[name].starts[i])
@@ -138,16 +126,10 @@ def test_finite_at_the_ends_of_its_range(name: str) -> None:
         assert np.isfinite(columns(WHOLE.replace(values), steps=FEW)).all(), values
 
 
-@cache
-def nominal_change(name: str) -> np.ndarray:
-    """Levels over the sensors' noise of all starts of an effect, (starts, 3), driven by the nominal plant's current."""
-    load = np.full(len(PREFLIGHT), LOADED.get(name, 0.0))
-    return compute_levels(compute_changes(CATALOGUE[name], CATALOGUE[name].starts, PREFLIGHT, load))
-
-
 @pytest.mark.parametrize("name", ["command_rate_limit", "spool_overlap", "internal_leakage", "orifice_root"])
 def test_more_of_it_shows_more(name: str) -> None:
-    level = nominal_change(name).max(axis=1)
+    load = np.full(len(PREFLIGHT), LOADED.get(name, 0.0))
+    level = compute_levels(compute_changes(CATALOGUE[name], CATALOGUE[name].starts, PREFLIGHT, load)).max(axis=1)
     assert level[-1] > 3.0 and (np.diff(level) > 0.0).all()
 
 
@@ -191,14 +173,6 @@ def test_what_excludes_each_other_may_stand_side_by_side_but_not_act() -> None:
     assert both.replace({"spool_overlap.overlap": 1e-5}).effects == ("spool_overlap", "spool_underlap")
     with pytest.raises(InputError, match="not both at work"):
         both.replace({"spool_overlap.overlap": 1e-5, "spool_underlap.underlap": 1e-5})
-
-
-def test_the_hint_of_a_range_is_read_with_its_unit() -> None:
-    typical = {name: parse_hint(q) for e in CATALOGUE.values() for name, q in e.parameters.items()}
-    assert typical["constant_load.force"] == pytest.approx([200, -200, 1000, -1000, 5000, -5000])
-    assert typical["spool_overlap.overlap"] == pytest.approx([5e-6, 17.3e-6, 60e-6], rel=1e-2)
-    assert typical["compressibility.coefficient"] == pytest.approx([0.7e-9, 1.18e-9, 2e-9], rel=1e-2)
-    assert typical["orifice_root.share"] == []
 
 
 def test_a_silent_plant_is_not_woken_by_its_effects() -> None:

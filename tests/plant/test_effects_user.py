@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,13 +50,6 @@ def same_interpreted(model: Model, cycles: int = 40) -> bool:
     return bool((fast == slow).all())
 
 
-def test_a_position_law_that_cannot_run_is_refused(file: Path) -> None:
-    file.write_text(COGGING.replace('"load"', '"position"').replace("p.cogging.force", "p.cogging.farce"))
-    load_effects(file)
-    with pytest.raises(InputError, match="cogging"):
-        Actuator(Model().with_effects(["cogging"]))
-
-
 def test_the_users_effect_is_found_and_acts(file: Path) -> None:
     file.write_text(STIFF.format(scale=1.0))
     assert load_effects(file) == ["spring"]
@@ -68,8 +61,8 @@ def test_the_users_effect_is_found_and_acts(file: Path) -> None:
 
 
 def test_the_users_effect_with_memory(file: Path) -> None:
-    file.write_text(MEMORY)
-    load_effects(file)
+    file.write_text("from __future__ import annotations\n" + MEMORY)
+    assert load_effects(file) == ["wear"] and CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
     model = SILENT.replace({"wear.rate": 3e5, "constant_load.force": 100.0})
     assert same_interpreted(model)
     plant, way, last = Actuator(model), 0.0, 0.0
@@ -79,23 +72,6 @@ def test_the_users_effect_with_memory(file: Path) -> None:
         last = plant.state.jack_position
     assert plant.state.memory.load[1].travelled == pytest.approx(way, rel=0.01)
     assert way > 1e-3
-
-
-def test_the_users_effect_runs_as_machine_code(file: Path) -> None:
-    """CPU time of this thread, because others share the machine. In Python it would be a hundred times as long."""
-    file.write_text(STIFF.format(scale=1.0))
-    load_effects(file)
-    long = np.tile(COMMAND, 8)
-
-    def cost(model: Model) -> float:
-        def once() -> float:
-            start = time.thread_time()
-            simulate(model, long)
-            return time.thread_time() - start
-        once()
-        return min(once() for _ in range(7))
-
-    assert cost(SILENT.replace({"spring.stiffness": 1e5})) < 5.0 * cost(SILENT)
 
 
 @pytest.mark.parametrize(("text", "said"), [
@@ -109,6 +85,8 @@ def test_the_users_effect_runs_as_machine_code(file: Path) -> None:
     (HEAD + "raise ValueError('two\\nlines')", "a file that Python can run"),
 ])
 def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match="a Python file with effects"):
+        load_effects(file)  # there is none yet
     file.write_text(text)
     with pytest.raises(InputError) as caught:
         load_effects(file)
@@ -116,24 +94,14 @@ def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, said: str) -> 
     assert str(file) in str(caught.value)
 
 
-def test_a_file_with_annotations_as_text(file: Path) -> None:
-    file.write_text("from __future__ import annotations\n" + MEMORY)
-    assert load_effects(file) == ["wear"]
-    assert CATALOGUE["wear"].parameters["wear.rate"].unit == "N/m"
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a Python file with effects"):
-        load_effects(tmp_path / "none.py")
-
-
 @pytest.mark.parametrize("body", ["return x + p.cogging.farce", "return x + open('f')", "return [x, 'text']"])
 def test_a_law_that_cannot_run_is_refused(file: Path, body: str) -> None:
     start = COGGING.index("    return x +")
-    file.write_text(COGGING[:start] + f"    {body}\n")
-    load_effects(file)
-    with pytest.raises(InputError, match="cogging"):
-        simulate(Model().with_effects(["cogging"]), COMMAND)
+    for port, use in (("load", partial(simulate, command=COMMAND)), ("position", Actuator)):
+        file.write_text(COGGING[:start].replace("load", port) + f"    {body}\n")
+        load_effects(file)
+        with pytest.raises(InputError, match="cogging"):
+            use(Model().with_effects(["cogging"]))
 
 
 @pytest.mark.parametrize(("text", "name", "sized"), [

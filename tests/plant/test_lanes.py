@@ -19,10 +19,10 @@ from plant.anchor import (
     rest_at_reading,
     set_sample_memories,
 )
-from plant.compile import interpret_function
+from plant.compile import compile_function, interpret_function
 from plant.effects import CATALOGUE, load_effects
 from plant.kernel_use import KernelUse
-from plant.lanes import Lanes, Part, compile_block_kernel, compile_kernels, list_kernel_variants, plan_layout
+from plant.lanes import NARROW, Lanes, Part, compile_kernels, list_kernel_variants, plan_layout
 from plant.model import collect_bindings
 from plant.solve import read_sensors, step_cycle
 from plant.state import State
@@ -147,15 +147,9 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
     assert costly == {frozenset({"coil_lag"}), frozenset({"coil_lag", "viscosity_drift"})}
     assert sorted(np.concatenate([members for _, members in shared])) == list(range(len(values)))
     assert (catalogue.replay(values, CURRENT, FORCE) == without).all()
-
-
-def test_runs_that_would_not_fill_a_block_stay_together(catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A block takes as long for one run as for sixteen."""
-    monkeypatch.setattr(kernel_use, "WORTH_LOADING", 0.0)
-    monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
-    values = np.vstack([with_effects(catalogue, start(name, -1)) for name in ("coil_lag", "stribeck", "supply_ripple",
-                                                                              "sensor_lag", "orifice_root")])
-    assert len(catalogue._assign_runs(values, 1)) == 1
+    few = np.vstack([with_effects(catalogue, start(name, -1)) for name in (
+        "coil_lag", "stribeck", "supply_ripple", "sensor_lag", "orifice_root")])
+    assert len(catalogue._assign_runs(few, 1)) == 1  # a block takes as long for one run as for sixteen
 
 
 def test_all_effects_at_once(catalogue: Lanes) -> None:
@@ -220,6 +214,8 @@ def test_warming_tells_how_far_it_is() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     lanes = Lanes(QUIET, ["jack.mass"])
+    assert lanes.replay(np.empty((0, 1)), CURRENT, FORCE).shape == (0, len(CURRENT), 3)  # no runs, or no cycles, do
+    assert lanes.closed_loop(np.array([[400.0]]), np.empty(0), np.empty(0)).shape == (1, 0, 4)
     for values, current, load, position in (
             (np.ones((2, 2)), CURRENT, FORCE, None), (np.ones(2), CURRENT, FORCE, None),
             (np.ones((2, 1)), CURRENT, FORCE[1:], None), (np.ones((2, 1)), CURRENT, FORCE, FORCE[1:])):
@@ -230,20 +226,14 @@ def test_what_does_not_fit_is_refused() -> None:
             Lanes(QUIET, [name])
 
 
-def test_no_runs_and_no_cycles() -> None:
-    lanes = Lanes(QUIET, ["jack.mass"])
-    assert lanes.replay(np.empty((0, 1)), CURRENT, FORCE).shape == (0, len(CURRENT), 3)
-    assert lanes.closed_loop(np.array([[400.0]]), np.empty(0), np.empty(0)).shape == (1, 0, 4)
-
-
 @pytest.mark.skipif(not compiles_for("avx2"), reason="no code for wide registers here (AVX2)")
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over the lanes became vector code: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
     plan = plan_layout((), "eha")
-    run = compile_block_kernel(plan)
-    run(np.zeros(plan.numbers * plan.width), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
-        0, len(CURRENT), 0, 0, True, np.arange(plan.width, dtype=np.uint64), np.empty((plan.width, 3, len(CURRENT))))
+    run = compile_function(plan.loop, plan.names)
+    run(np.zeros(plan.numbers * NARROW), CURRENT, FORCE, np.empty(0), 0.0, False, 1e-3, 10,
+        0, len(CURRENT), 0, 0, True, np.arange(NARROW, dtype=np.uint64), np.empty((NARROW, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     loops = re.findall(r"^(\.LBB\w+):\n((?:\t.*\n)+?)\tj\w+\t\1$", code, re.MULTILINE)
     step = max((body for _, body in loops), key=len)
@@ -292,14 +282,10 @@ def test_an_anchored_replay_does_not_pull_the_ram_through_the_play_of_its_rod() 
 def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     """With play, a lag and an elastic mount before the transducer: an anchored run shows the pull at once and whole."""
     model = Model().replace({"rod_backlash.width": 4e-5, "sensor_lag.time": 3e-3, "mount_compliance.compliance": 1e-9})
-    kernel = interpret_function(pull_ram, collect_bindings(model.effects))
-    s, p = model.build_state(), model.build_record()[0]
-    before = initialise(model, s, p)
-    after = initialise(model, kernel(before, 0.5, before.sensed + 2e-5), p)
+    pull, initialise = (interpret_function(f, collect_bindings(model.effects))
+                        for f in (pull_ram, initialise_sensed_position))
+    p = model.build_record()[0]
+    before = initialise(model.build_state(), p)
+    after = initialise(pull(before, 0.5, before.sensed + 2e-5), p)
     assert after.jack_position - before.jack_position == pytest.approx(1e-5)
     assert after.sensed - before.sensed == pytest.approx(1e-5)
-
-
-def initialise(model: Model, s: Any, p: Any) -> Any:
-    """`s` with what its transducer shows at once."""
-    return interpret_function(initialise_sensed_position, collect_bindings(model.effects))(s, p)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -67,20 +68,18 @@ def test_stored_code_equals_numba(tmp_path: Path) -> None:
         assert plant._flat.tobytes() == other._flat.tobytes()
 
 
-def test_code_that_gives_other_bits_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def fail(run: object) -> bytes:
+    """Another release of numba."""
+    raise AttributeError("_get_module_for_linking")
+
+
+@pytest.mark.parametrize(("name", "other"), [
+    ("_link_object", lambda code: (None, lambda *arguments: 0)),  # code that moves nothing
+    ("_emit_object", fail)])
+def test_code_that_gives_other_bits_or_none_is_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
+                                                          other: Callable[[object], object]) -> None:
     plant = Actuator(Model())
     run = build_kernel(advance_flat_state, ())
-    monkeypatch.setattr(machine_code, "_link_object", lambda code: (None, lambda *arguments: 0))  # moves nothing
-    StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_another_release_of_numba_runs_without_stored_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(run: object) -> bytes:
-        raise AttributeError("_get_module_for_linking")
-
-    monkeypatch.setattr(machine_code, "_emit_object", fail)
-    plant = Actuator(Model())
-    run = build_kernel(advance_flat_state, ())
+    monkeypatch.setattr(machine_code, name, other)
     StoredCode(tmp_path, lambda: run).warm(plant._flat, plant._record)
     assert list(tmp_path.iterdir()) == []

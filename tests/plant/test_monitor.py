@@ -1,7 +1,6 @@
 """The monitoring model: its exact step, the closed forms it has to meet, and how far it is from the reference model."""
 from __future__ import annotations
 
-import time
 from math import copysign, exp, pi, sqrt
 
 import numpy as np
@@ -176,21 +175,6 @@ def test_replay_follows_the_measured_ram() -> None:
     free, held = (monitor.replay(values, run.cor, seen, anchor)[0, 0] - seen for anchor in (0.0, 20.0))
     assert abs(held[0]) < 1e-9
     assert np.abs(held[-1000:]).max() < 0.5 * np.abs(free[-1000:]).max() and not np.isnan(free).all()
-
-
-def test_several_times_cheaper_than_the_reference() -> None:
-    """Against the fewest steps at which the reference may be used for fits; docs/worked_cases.md has the figure."""
-    values = np.random.default_rng(0).uniform([0.0, 0.0], [0.5, 90.0], (64, 2))
-    monitor, reference = Monitor(QUIET, workers=1), Lanes(QUIET, FAULTS, 10, 1)
-    none = np.zeros_like(PREFLIGHT)
-    taken: dict[str, list[float]] = {"monitor": [], "reference": []}
-    for _ in range(6):  # processor time, the best of each: others may be at work here
-        for name, run in (("monitor", lambda: monitor.closed_loop(values, PREFLIGHT)),
-                          ("reference", lambda: reference.closed_loop(values, PREFLIGHT, none))):
-            begin = time.process_time()
-            run()
-            taken[name].append(time.process_time() - begin)
-    assert min(taken["reference"]) / min(taken["monitor"]) > 3.0
 
 
 @pytest.mark.parametrize(("names", "values", "word"), [

@@ -53,10 +53,7 @@ def test_every_kind_has_its_length_and_its_section(segment: Segment) -> None:
     assert profile.sections == (("it", segment.kind, 0, round(segment.duration * 1000)),)
     assert len(profile.command) == profile.sections[0].stop
     assert np.isfinite(profile.command).all()
-
-
-def test_every_kind_is_tested() -> None:
-    assert {segment.kind for segment in ONE_OF_EACH} == set(KINDS)
+    assert {each.kind for each in ONE_OF_EACH} == set(KINDS)
 
 
 @pytest.mark.parametrize("kind", ["hold", "ramp", "sine", "chirp", "multisine", "points"])
@@ -105,11 +102,12 @@ def test_rows_at_the_models_period_are_taken_as_they_are(period: float) -> None:
     assert (resample_on_cycles(np.round(7.0 + np.arange(1001) * period, 6), values, period) == values).all()
 
 
-def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle() -> None:
-    assert resample_on_cycles(np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0]), 0.002).tolist() == [0, 2, 4]
-    t, values = np.array([0.0, 0.004, 0.005]), np.array([0.0, 4.0, 9.0])
-    assert resample_on_cycles(t, values, 0.001).tolist() == [0, 1, 2, 3, 4, 9]
-    assert resample_on_cycles(np.array([5.0]), np.array([3.0]), 0.002).tolist() == [3.0]
+@pytest.mark.parametrize(("t", "values", "period", "expected"), [
+    ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.002, [0, 2, 4]), ([5.0], [3.0], 0.002, [3.0]),
+    ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.001, [0, 1, 2, 3, 4, 9])])
+def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle(t: list[float], values: list[float], period: float,
+                                                                 expected: list[float]) -> None:
+    assert resample_on_cycles(np.array(t), np.array(values), period).tolist() == expected
 
 
 def test_read_command_gives_the_load_only_if_there_is_one(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ shares code or scheme with plant/.
 """
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,36 +18,9 @@ from scipy.linalg import expm
 CYCLE = 1e-3  # s
 
 
-class Plant(NamedTuple):
-    """The symbols of the equations, filter law and clogging worked in."""
-
-    GAP: float
-    Imax: float
-    GM: float
-    JF: float
-    BF: float
-    KF: float
-    XFM: float
-    KSF: float
-    GQF1: float
-    GPF1: float
-    PS1: float
-    ASV: float
-    MS: float
-    CS: float
-    FSS: float
-    FDS: float
-    XSM: float
-    GQ: float
-    GP: float
-    PSR: float
-    AJ: float
-    MJ: float
-    CJ: float
-    FSJ: float
-    FDJ: float
-    CLK: float
-    XJM: float
+# the symbols of the equations, filter law and clogging worked in
+Plant = namedtuple("Plant", (
+    "GAP Imax GM JF BF KF XFM KSF GQF1 GPF1 PS1 ASV MS CS FSS FDS XSM GQ GP PSR AJ MJ CJ FSJ FDJ CLK XJM"))
 
 
 def convert_parameters(v: Mapping[str, float]) -> Plant:

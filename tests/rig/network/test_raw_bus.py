@@ -28,13 +28,11 @@ from rig.network.link import Link
 from rig.network.raw_bus import FRAME, NEVER, SENT, TIMEOUT, WOKEN, Port, open_raw_bus
 
 raw_kinds = pytest.mark.parametrize("bus_kind", ["udp_multicast", "socketcan"], indirect=True)
-ways = pytest.mark.parametrize("way", ["compiled", "interpreted"])
 
 
 @cache
-def function(name: str, way: str = "compiled") -> Callable[..., Any]:
-    plain = getattr(raw_bus, name)
-    return compile_function(plain) if way == "compiled" else plain  # type: ignore[no-any-return]
+def function(name: str) -> Callable[..., Any]:
+    return compile_function(getattr(raw_bus, name))  # type: ignore[no-any-return]
 
 
 def soon(seconds: float = 60.0) -> int:
@@ -65,10 +63,8 @@ def other(where: str) -> Iterator[can.BusABC]:
 
 @raw_kinds
 class TestFrames:
-    @ways
-    def test_frames_go_to_and_fro_between_python_can_and_compiled_code(self, where: str, other: can.BusABC,
-                                                                       way: str) -> None:
-        receive, send = function("receive_frame", way), function("send_frame", way)
+    def test_frames_go_to_and_fro_between_python_can_and_compiled_code(self, where: str, other: can.BusABC) -> None:
+        receive, send = function("receive_frame"), function("send_frame")
         with open_raw_bus(where) as bus:
             receive(bus.port, 0)  # compiles it
             for length in range(9):
@@ -108,9 +104,8 @@ class TestFrames:
             slewed = 100_000  # the wall clock may be corrected meanwhile
             assert before - slewed <= first <= second <= after + slewed
 
-    @ways
-    def test_waits_until_its_deadline_or_until_it_is_woken(self, where: str, way: str) -> None:
-        receive = function("receive_frame", way)
+    def test_waits_until_its_deadline_or_until_it_is_woken(self, where: str) -> None:
+        receive = function("receive_frame")
         with open_raw_bus(where) as bus:
             assert receive(bus.port, 0) == (TIMEOUT, 0, 0, 0, 0)
             end = soon(0.02)
@@ -119,15 +114,13 @@ class TestFrames:
             bus.wake()
             assert receive(bus.port, NEVER)[0] == WOKEN
             assert receive(bus.port, 0)[0] == TIMEOUT
-            if way == "compiled":  # interpreted, it keeps the interpreter lock while it waits
-                timer = threading.Timer(0.05, bus.wake)
-                timer.start()
-                assert receive(bus.port, NEVER)[0] == WOKEN
-                timer.join()
+            timer = threading.Timer(0.05, bus.wake)
+            timer.start()
+            assert receive(bus.port, NEVER)[0] == WOKEN
+            timer.join()
 
-    @ways
-    def test_waits_in_the_call_that_receives(self, where: str, other: can.BusABC, way: str) -> None:
-        await_frame = function("await_frame", way)
+    def test_waits_in_the_call_that_receives(self, where: str, other: can.BusABC) -> None:
+        await_frame = function("await_frame")
         with open_raw_bus(where) as bus:
             assert await_frame(bus.port) == (TIMEOUT, 0, 0, 0, 0)
             other.send(can.Message(arbitration_id=0x123, data=b"\x07", is_extended_id=False))
