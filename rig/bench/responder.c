@@ -2,7 +2,7 @@
  *
  *   responder RECEIVE SEND TURN CPU PRIORITY CYCLE_AT FEEDBACK VALVE_STATE
  *
- * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN the semaphores of the UDP bus (turn.py) or -1. The
+ * RECEIVE and SEND are open sockets on which only SYNC arrives, TURN the semaphores of the UDP bus (udp.py) or -1. The
  * two frames are given in hexadecimal as they go out; CYCLE_AT is the place of the cycle counter in VALVE_STATE.
  */
 #define _GNU_SOURCE

@@ -1,4 +1,4 @@
-/* The turn to send on a UDP group, see rig/network/turn.py: all programs of the machine send one after the other. */
+/* The turn to send on a UDP group, see rig/network/udp.py: all programs of the machine send one after the other. */
 #ifndef TURN_H
 #define TURN_H
 

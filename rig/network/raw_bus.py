@@ -51,7 +51,7 @@ from rig.network.udp import GIVE, SO_RXQ_OVFL, SO_TIMESTAMPNS, TAKE, TURN_LIMIT_
 TIMEOUT, FRAME, WOKEN = 0, 1, 2
 # status of send_frame
 SENT, QUEUE_FULL = 0, 1
-# of both: FAILED, the kernel refused (errno in the port); of send_frame: the turn to send did not come (turn.py)
+# of both: FAILED, the kernel refused (errno in the port); of send_frame: the turn to send did not come
 FAILED, NO_TURN = -1, -2
 NEVER = 2**63 - 1  # a deadline that does not come
 
@@ -447,7 +447,7 @@ class RawBus:
             RigError: the bus cannot be opened.
         """
         kind, channel = parse_spec(spec, "--bus")
-        if kind not in KINDS or sys.byteorder != "little":
+        if not can_open(spec):
             raise InputError("--bus", spec, "socketcan:INTERFACE or udp_multicast[:GROUP] on a little-endian machine")
         self.spec = spec
         self.port = _make_port()
@@ -514,7 +514,7 @@ class RawBus:
     def close(self) -> None:
         """Give the bus back. No thread may be using the port any more."""
         self._opened.close()
-        self._turn = None
+        self._turn, self._wake = None, -1
 
     def _open_udp(self, group: str, stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
         """Sockets that receive and send."""

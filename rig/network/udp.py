@@ -4,7 +4,7 @@ The datagrams are those of python-can's `udp_multicast`. Its own bus listens on 
 route, needs one to exist at all, and hears its own frames; here the group is joined on 127.0.0.1, sent to from there
 with a TTL of 0, and a bus does not hear itself, as on a real one. All nodes hear all frames in one order, as on a real
 one too: the kernel hands a datagram to one socket after the other, and a node that heard it early could answer before
-the others have it. The turn to send (turn.py) keeps the next frame back until this one is everywhere.
+the others have it. The turn to send (`Turn`) keeps the next frame back until this one is everywhere.
 """
 from __future__ import annotations
 

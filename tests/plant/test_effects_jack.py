@@ -47,7 +47,7 @@ def list_steady_cases() -> Iterator[Any]:
                            id=f"presliding {deflection:g}")
 
 
-@pytest.mark.parametrize(("model", "current", "load", "dry"), list_steady_cases())
+@pytest.mark.parametrize(("model", "current", "load", "dry"), list(list_steady_cases()))
 def test_pressure_at_constant_speed_is_friction_drag_and_load(model: Model, current: np.ndarray, load: float,
                                                              dry: Callable[[float], float]) -> None:
     _, p12, _, _, v = drive_plant(model, current, load)[1][:, -1]

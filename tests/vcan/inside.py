@@ -89,16 +89,6 @@ def background(out: Path, name: str, *command: str | Path) -> Iterator[subproces
             finish(process, 20)
 
 
-def await_words(log: Path, words: str, seconds: float = 120.0) -> None:
-    """Until a log has these words: on a slow machine a node needs ten seconds to load. Says so if it never does."""
-    end = time.monotonic() + seconds
-    while words not in log.read_text():
-        if time.monotonic() > end:
-            print(f"{log.name}: no {words!r} within {seconds:g} s", flush=True)
-            return
-        time.sleep(0.1)
-
-
 def preflight(out: Path) -> int:
     """The preflight by three processes; the last run's exit status.
 
@@ -124,14 +114,17 @@ def read_verdict(out: Path) -> str:
 
 def play_preflight(out: Path, attempt: int) -> int:
     """Plant, C firmware and sequencer as processes of their own; the run's exit status."""
+    from standing_nodes import wait_for_node
+
     from rig.firmware.build import build_controller
+    from rig.network.node_objects import PLANT
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(background(out, "candump", "candump", "-L", "-r", "16777216", "vcan0"))
         time.sleep(0.5)  # candump says nothing when it is ready
         commands = {"plant": [RIG, "node", "plant", "--bus", BUS], "controller": [build_controller(), BUS]}
         nodes = {name: stack.enter_context(background(out, name, *words)) for name, words in commands.items()}
-        await_words(out / "plant.log", "plant on")
+        wait_for_node(BUS, PLANT)  # on a slow machine a node needs ten seconds to load
         words = ["run", "preflight", "--bus", BUS, "--controller", "external", "--plant", "external"]
         words += ["--pace", "lockstep"]
         with (out / "run.json").open("wb") as answer, (out / "run.log").open("wb") as log:

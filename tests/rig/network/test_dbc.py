@@ -65,25 +65,17 @@ def signals(cob_id: int) -> list[Signal]:
 
 @pytest.mark.parametrize("cob_id", FRAMES, ids=hex)
 def test_dbc_and_code_agree(cob_id: int) -> None:
+    """Signal by signal; the limits are those of the raw type."""
     message = load_database().get_message_by_frame_id(cob_id)
-    assert message.length == 8
-    assert not message.is_extended_frame
+    assert message.length == 8 and not message.is_extended_frame
     assert message.senders == [NODES[SENDERS[cob_id]]]
-    found = [
-        Signal(cob_id, s.name, s.start, s.length, s.is_signed, s.scale, s.unit or "") for s in message.signals
-    ]
-    assert found == signals(cob_id)
-    assert all(s.byte_order == "little_endian" and s.offset == 0 for s in message.signals)
-    receivers = {NODES[node] for node in RECEIVERS[cob_id]}
-    assert all(set(s.receivers) == receivers for s in message.signals)
-
-
-def test_dbc_limits_are_those_of_the_raw_type() -> None:
-    for signal in SIGNALS:
-        found = load_database().get_message_by_frame_id(signal.cob_id).get_signal_by_name(signal.name)
-        high = 2 ** (signal.length - signal.signed) - 1
-        low = -high - 1 if signal.signed else 0
-        assert (found.minimum, found.maximum) == pytest.approx((low * signal.scale, high * signal.scale), rel=1e-12)
+    assert signals(cob_id) == [
+        Signal(cob_id, s.name, s.start, s.length, s.is_signed, s.scale, s.unit or "") for s in message.signals]
+    for s in message.signals:
+        assert s.byte_order == "little_endian" and s.offset == 0
+        assert set(s.receivers) == {NODES[node] for node in RECEIVERS[cob_id]}
+        low, high = (-(2**31), 2**31 - 1) if s.is_signed else (0, 2**16 - 1)
+        assert (s.minimum, s.maximum) == pytest.approx((low * s.scale, high * s.scale), rel=1e-12)
 
 
 @pytest.mark.parametrize("pdo", ALL_PDOS, ids=lambda pdo: f"node{pdo.node}-{'T' if pdo.sends else 'R'}{pdo.cob_id:03X}")
@@ -100,13 +92,10 @@ def test_dictionaries_and_code_agree(pdo: Pdo) -> None:
     assert start == 64
 
 
-def test_each_frame_has_its_sender_and_receivers() -> None:
+def test_each_frame_has_its_sender_and_receivers_and_the_transmission_types_of_the_interface() -> None:
     assert {pdo.cob_id: pdo.node for pdo in ALL_PDOS if pdo.sends} == SENDERS
     heard = {cob_id: {pdo.node for pdo in ALL_PDOS if not pdo.sends and pdo.cob_id == cob_id} for cob_id in FRAMES}
     assert heard == RECEIVERS
-
-
-def test_transmission_types_are_those_of_the_interface() -> None:
     kinds = {(pdo.node, pdo.cob_id): pdo.kind for pdo in ALL_PDOS if pdo.node != 1}
     assert kinds == {(2, 0x202): 1, (2, 0x183): 255, (2, 0x182): 255, (3, 0x182): 1, (3, 0x183): 1, (3, 0x283): 1}
 

@@ -14,6 +14,7 @@ from bus_stations import spec
 from node_bench import MS
 
 from plant import Model
+from plant.compile import compile_function
 from rig.device import NmtState
 from rig.network import codec
 from rig.network.bus import open_can
@@ -21,7 +22,7 @@ from rig.network.clock import WallClock
 from rig.network.frame import Frame
 from rig.network.link import Link, serve_node
 from rig.network.node_objects import decode_cycle_record
-from rig.network.raw_bus import open_raw_bus
+from rig.network.raw_bus import make_closed_port, open_raw_bus
 from rig.nodes import emulator_cycle as ec
 from rig.nodes.emulator import MISSED_LIMIT, Emulator
 from rig.nodes.emulator_service import LEFT_OUT, EmulatorService, compile_loop
@@ -277,12 +278,14 @@ def test_a_wake_up_does_not_end_the_wait_for_a_drive(monkeypatch: pytest.MonkeyP
     words = memory.words
     words[ec.STATE], words[ec.DRIVE_ID], words[ec.DRIVE_TYPE] = ec.OPERATIONAL, codec.DRIVE, 1
     where = spec("udp_multicast")
+    await_drive = compile_function(ec._await_drive)
+    await_drive(make_closed_port(), ec.make_memory(Model(), [], Schedule(Plan(stop=0))))  # compiles it
     with open_raw_bus(where, [codec.DRIVE]) as raw:
         link = Link(open_can(where), lambda: 0)
         raw.wake()
         timer = threading.Timer(0.05, link.send, (codec.DRIVE, codec.pack_drive(0.0, 15, 7)))
         timer.start()
-        ec._await_drive(raw.port, memory)
+        await_drive(raw.port, memory)
         timer.join()
         link.close()
     assert words[ec.WAITING] == 1
