@@ -7,7 +7,6 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Protocol
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -171,18 +170,21 @@ class Link:
 
 
 MS = 1_000_000  # ns
+_PATIENCE = 5  # cycles without all answers, after which a wire waits less for them
 _STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
 Done = Callable[[], bool]
 
 
-class Wire(Protocol):
+class Wire:
     """What the master and the loop need of a bus."""
 
     send: Send
-    receive: Callable[[Frame], None]  # where incoming frames go; set by the master
-    is_node_gone: Done  # whether a node will not answer any more; set by the session
-    blind_ns: int  # how long at most the frames that come in now have waited to be taken in
-    stalled_ns: int  # how long in all frames were not taken in, pauses of the cycle left out
+    blind_ns = 0  # how long at most the frames that come in now have waited to be taken in
+    stalled_ns = 0  # how long in all frames were not taken in, pauses of the cycle left out
+
+    def __init__(self) -> None:
+        self.receive: Callable[[Frame], None] = lambda frame: None  # where incoming frames go; set by the master
+        self.is_node_gone: Done = lambda: False  # whether a node will not answer any more; set by the session
 
     @property
     def clock(self) -> Clock:
@@ -190,12 +192,15 @@ class Wire(Protocol):
 
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
+        raise NotImplementedError
 
     def wait_for_answers(self, t_ns: int, done: Done) -> None:
         """Lockstep: let the frames of the cycle at `t_ns` come in, until `done()` or nothing more can come."""
+        raise NotImplementedError
 
     def run_until(self, t_ns: int) -> None:
         """Real time: let frames come in until the clock says `t_ns`."""
+        raise NotImplementedError
 
     def hear_all(self) -> None:
         """Let the frames of nodes that are not of the bench in, for the log; during bring-up they stay out."""
@@ -204,23 +209,12 @@ class Wire(Protocol):
         """Give the bus back."""
 
 
-def _ignore_frame(frame: Frame) -> None:
-    """Nobody listens yet."""
-
-
-def _is_false() -> bool:
-    """Nobody watches the nodes yet."""
-    return False
-
-
-class EmbeddedWire:
+class EmbeddedWire(Wire):
     """All nodes in this process and thread. With a virtual clock a run repeats bit for bit."""
 
     def __init__(self, clock: Clock, makers: Sequence[Callable[[Send], Node]], period_ns: int = MS) -> None:
+        super().__init__()
         self.clock, self._period = clock, period_ns
-        self.receive: Callable[[Frame], None] = _ignore_frame
-        self.is_node_gone: Done = _is_false
-        self.blind_ns = self.stalled_ns = 0
         self._bus = EmbeddedBus()
         self.send = self._bus.attach(lambda frame: self.receive(frame))
         self._nodes = [self._bus.add(make) for make in makers]
@@ -249,12 +243,6 @@ class EmbeddedWire:
             self.clock.sleep_until(min(t_ns, self.clock.now() + MS))
             self._deliver(self.clock.now())
 
-    def hear_all(self) -> None:
-        """See `Wire`; all frames come in here."""
-
-    def close(self) -> None:
-        """See `Wire`; nothing to give back."""
-
     def _deliver(self, t_ns: int) -> None:
         """Deliver what is there, run the nodes' timers, deliver what came of them."""
         self._bus.deliver(t_ns)
@@ -263,20 +251,18 @@ class EmbeddedWire:
         self._bus.deliver(t_ns)
 
 
-class LinkWire:
+class LinkWire(Wire):
     """A bus between programs or machines. Waiting is in wall time, whatever the pace."""
 
-    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2, patience: int = 5) -> None:
-        """`grace`: how late an answer may be in lockstep, s; a tenth of it after `patience` cycles without all answers.
+    def __init__(self, link: Link, clock: WallClock, grace: float = 0.2) -> None:
+        """`grace`: how late an answer may be in lockstep, s; a tenth of it after some cycles without all answers.
 
         A node that is gone must not make clean-up last minutes.
         """
-        self.clock = clock
-        self.link, self._grace, self._patience = link, grace, patience
+        super().__init__()
+        self.clock: WallClock = clock
+        self.link, self._grace = link, grace
         self._missed = 0  # cycles in a row without all frames
-        self.receive: Callable[[Frame], None] = _ignore_frame
-        self.is_node_gone: Done = _is_false
-        self.blind_ns = self.stalled_ns = 0
         self._looked_ns = clock.now()  # when the link was last seen to be empty
         self.send: Send = link.send
 
@@ -295,7 +281,7 @@ class LinkWire:
 
         When a node is gone, a cycle takes its 1 ms, in which the other nodes can answer.
         """
-        is_patient = self._missed < self._patience
+        is_patient = self._missed < _PATIENCE
         grace = self._grace if is_patient else 0.1 * self._grace
         is_answered = not self.is_node_gone() and self.wait(lambda: done() or self.is_node_gone(), grace)
         if self.is_node_gone():
