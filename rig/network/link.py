@@ -168,7 +168,6 @@ class Link:
         return epoch
 
 
-
 MS = 1_000_000  # ns
 _PATIENCE = 5  # cycles without all answers, after which a wire waits less for them
 _STALL = 100 * MS  # twice the longest pause of the cycle in lockstep
@@ -178,6 +177,7 @@ Done = Callable[[], bool]
 class Wire:
     """What the master and the loop need of a bus."""
 
+    clock: Clock
     send: Send
     blind_ns = 0  # how long at most the frames that come in now have waited to be taken in
     stalled_ns = 0  # how long in all frames were not taken in, pauses of the cycle left out
@@ -185,10 +185,6 @@ class Wire:
     def __init__(self) -> None:
         self.receive: Callable[[Frame], None] = lambda frame: None  # where incoming frames go; set by the master
         self.is_node_gone: Done = lambda: False  # whether a node will not answer any more; set by the session
-
-    @property
-    def clock(self) -> Clock:
-        """The time of the bus."""
 
     def wait(self, done: Done, seconds: float) -> bool:
         """Let frames come in until `done()`; False when it took longer than `seconds`."""
