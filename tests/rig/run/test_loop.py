@@ -7,9 +7,9 @@ from math import isnan
 import pytest
 
 from rig.network import codec
-from rig.network.clock import VirtualClock, WallClock
+from rig.network.clock import VirtualClock
 from rig.network.frame import Frame
-from rig.network.link import EmbeddedWire, Link, LinkWire
+from rig.network.link import Link, LinkWire
 from rig.network.master import Master
 from rig.recorder import Signals, Timing
 from rig.run.loop import CycleInput, CycleLoop
@@ -202,22 +202,6 @@ def test_a_node_that_is_gone_does_not_hold_up_lockstep_for_long() -> None:
     before = clock.now()
     wire.wait_for_answers(0, lambda: False)
     assert clock.now() - before == pytest.approx(0.2e9, rel=0.01)
-
-
-def test_clocks() -> None:
-    virtual, wall = VirtualClock(), WallClock()
-    virtual.sleep_until(5)
-    virtual.sleep_until(3)
-    assert virtual.now() == 5
-    wall.sleep_until(-5)
-    wall.sleep_until(2 * MS)
-    assert wall.now() >= 2 * MS
-
-
-def test_the_embedded_wire_waits_in_its_own_time() -> None:
-    wire = EmbeddedWire(VirtualClock(), [])
-    assert not wire.wait(lambda: False, 0.25) and wire.clock.now() == 250 * MS
-    assert wire.wait(lambda: wire.clock.now() >= 300 * MS, 1.0) and wire.clock.now() == 300 * MS
 
 
 def test_response_and_work_are_measured_from_sync_to_reception() -> None:

@@ -49,27 +49,22 @@ def failures(outcome: Outcome) -> set[str]:
     return {check.name for check in outcome.checks if check.kind == "protocol" and not check.passed}
 
 
-@pytest.mark.parametrize(("make", "name"), [
-    (variants.CycleLate, NUMBER), (variants.StaleNumber, NUMBER), (variants.StuckNumber, NUMBER),
-    (variants.OldCurrent, DELAY), (variants.NoOutput, DELAY), (variants.Saturated, DELAY),
-    (variants.WrongSign, GAIN), (variants.GainLow, GAIN), (variants.GainHigh, GAIN),
-    (variants.OneOfFifty, MISSING),
-    (variants.IgnoresControl, IDLE), (variants.IgnoresSwitchOff, IDLE),
-    (variants.AlwaysActive, STATUS), (variants.NeverReady, STATUS), (variants.SlowStatus, STATUS),
-    (variants.NoHeartbeat, HEARTBEAT), (variants.HalfTheHeartbeats, HEARTBEAT),
-    (variants.NotANumber, LIMIT), (variants.Leaks, RESET), (variants.StrangeEmcy, EMCY),
-])  # fmt: skip
-def test_a_faulty_controller_fails_while_it_holds_a_position(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                                             make: type[Variant], name: str) -> None:
-    outcome = play_with(make, tmp_path, monkeypatch)
-    assert name in failures(outcome) and outcome.status == 1
-
-
-@pytest.mark.parametrize(("make", "name"), [(variants.Frozen, FROZEN), (variants.FrozenCurrent, FROZEN),
-                                            (variants.BeyondLimit, LIMIT)])
-def test_what_shows_only_in_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: type[Variant],
-                                   name: str) -> None:
-    outcome = play_with(make, tmp_path, monkeypatch, MOVE)
+@pytest.mark.parametrize(("make", "name", "text"), [
+    *((make, name, HOLD) for make, name in (
+        (variants.CycleLate, NUMBER), (variants.StaleNumber, NUMBER), (variants.StuckNumber, NUMBER),
+        (variants.OldCurrent, DELAY), (variants.NoOutput, DELAY), (variants.Saturated, DELAY),
+        (variants.WrongSign, GAIN), (variants.GainLow, GAIN), (variants.GainHigh, GAIN),
+        (variants.OneOfFifty, MISSING),
+        (variants.IgnoresControl, IDLE), (variants.IgnoresSwitchOff, IDLE),
+        (variants.AlwaysActive, STATUS), (variants.NeverReady, STATUS), (variants.SlowStatus, STATUS),
+        (variants.NoHeartbeat, HEARTBEAT), (variants.HalfTheHeartbeats, HEARTBEAT),
+        (variants.NotANumber, LIMIT), (variants.Leaks, RESET), (variants.StrangeEmcy, EMCY))),
+    # what shows only in motion
+    (variants.Frozen, FROZEN, MOVE), (variants.FrozenCurrent, FROZEN, MOVE), (variants.BeyondLimit, LIMIT, MOVE),
+])
+def test_a_faulty_controller_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: type[Variant], name: str,
+                                   text: str) -> None:
+    outcome = play_with(make, tmp_path, monkeypatch, text)
     assert name in failures(outcome) and outcome.status == 1
 
 

@@ -198,8 +198,8 @@ def require_equal_runs(where: str, name: str, tmp_path: Path) -> None:
     rows = [table(tmp_path / folder, fields) for folder in "ab"]
     assert rows[0] == rows[1] and len(rows[0]) >= 150
     kinds = {"phase", "section", "fault", "guard", "emcy", "safe_state", "abort", "recovered"}
-    events = [[(event.t, event.kind, event.text) for event in one.events
-               if event.kind in kinds and event.t >= 0 and "(after the run)" not in event.text] for one in (here, there)]
+    events = [[(event.t, event.kind, event.text) for event in one.events if event.kind in kinds and event.t >= 0
+               and "(after the run)" not in event.text] for one in (here, there)]
     # That a short drive frame is whole again is said by the services of the plant, perhaps a cycle later.
     assert events[0] == events[1] or name == "corrupted"
 
@@ -318,51 +318,38 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     assert min(lost) <= 500
 
 
-@pytest.mark.parametrize(("name", "source"), [("controller", "node 2 controller"), ("plant", "node 3 plant")])
-def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, source: str) -> None:
-    """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state."""
-    where = spec("udp_multicast")
-    (tmp_path / "long.toml").write_text(LONG)
-    process = started("run", tmp_path / "long.toml", "--bus", where, "--out", tmp_path, "--json")
-    await_main(where, process)
-    victims = [node for node in nodes_on(where)
-               if name.encode() in Path(f"/proc/{node}/cmdline").read_bytes().split(b"\0") and node != process.pid]
-    for victim in victims:
-        os.kill(victim, signal.SIGKILL)
-    said = finished(process)
-    cause = said.json["cause"]
-    assert len(victims) == 1 and (said.status, said.json["verdict"]) == (1, "ABORTED")
-    assert (cause["source"], cause["kind"]) == (source, "stopped") and "SIGKILL" in cause["text"]
-    assert gone(where) and said.json["timing"]["cycles"] < 60_000
-
-
+@pytest.mark.parametrize("is_external", [False, True])
 @pytest.mark.parametrize(("name", "source", "row"), [("controller", "node 2 controller", "cor"),
                                                     ("plant", "node 3 plant", "xj")])
-def test_an_external_node_that_dies_is_named_before_others_miss_it(tmp_path: Path, name: str, source: str,
-                                                                   row: str) -> None:
-    """Nobody tells the rig that it has ended, and in lockstep a cycle waits long for a node that is late.
+def test_a_node_that_dies_is_named_and_the_run_ends(tmp_path: Path, name: str, source: str, row: str,
+                                                    is_external: bool) -> None:
+    """In lockstep every cycle without answers would wait; the sequence has a minute to go, and wants the safe state.
 
-    The first cycle without an answer waits; then the node is known to be gone, and no other cycle waits. Without that
-    knowledge three cycles would wait until the other node reports missing frames, and clean-up would wait after them.
+    Nobody tells the rig that an external node has ended. The first cycle without an answer waits; then the node is
+    known to be gone, and no other cycle waits. Without that knowledge three cycles would wait until the other node
+    reports missing frames, and clean-up would wait after them.
     """
     where = spec("udp_multicast")
     (tmp_path / "long.toml").write_text(LONG)
-    nodes = {each: started("node", each, "--bus", where) for each in ("plant", "controller")}
-    try:
-        for node in nodes.values():
-            assert node.stdout is not None and where in node.stdout.readline()
-        process = started("run", tmp_path / "long.toml", "--bus", where, "--controller", "external", "--plant",
-                          "external", "--out", tmp_path, "--json")
-        await_main(where, process)
-        nodes[name].kill()
-        said = finished(process)
-    finally:
-        for node in nodes.values():
-            node.kill()
-            finished(node)
+    words = ("--controller", "external", "--plant", "external") if is_external else ()
+    nodes = [started("node", each, "--bus", where) for each in ("plant", "controller") * is_external]
+    for node in (PLANT, CONTROLLER) * is_external:
+        wait_for_node(where, node)
+    process = started("run", tmp_path / "long.toml", "--bus", where, *words, "--out", tmp_path, "--json")
+    await_main(where, process)
+    (victim,) = (node for node in nodes_on(where) if node != process.pid
+                 and name.encode() in Path(f"/proc/{node}/cmdline").read_bytes().split(b"\0"))
+    os.kill(victim, signal.SIGKILL)
+    said = finished(process)
+    for each in nodes:
+        each.kill()
+        finished(each)
     cause, trace = said.json["cause"], Trace.read(tmp_path, all=True)
-    assert (said.status, said.json["verdict"]) == (1, "ABORTED")
-    assert (cause["source"], cause["kind"]) == (source, "stopped")
+    assert (said.status, said.json["verdict"]) == (1, "ABORTED") and said.json["timing"]["cycles"] < 60_000
+    assert (cause["source"], cause["kind"]) == (source, "stopped") and gone(where)
+    if not is_external:
+        assert "SIGKILL" in cause["text"]
+        return
     silence = re.search(r"no heartbeat for (\d+\.?\d*)", cause["text"])
     assert silence and float(silence[1]) >= 2
     assert f"{source} is silent" in said.json["consequences"][0]["text"]

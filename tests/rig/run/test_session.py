@@ -186,25 +186,25 @@ def play_with_intruder(folder: Path, frames: list[tuple[int, bytes]]) -> Session
     return play_in_parts(job(), folder, wire, NodeProcesses())
 
 
-class KilledPlant(Emulator):
-    """A plant whose process is killed after 0.3 s: it neither hears nor sends anything from then on."""
+def make_killed_plant(send: Send) -> Emulator:
+    """A plant whose process is killed 0.3 s after its first SYNC: it neither hears nor sends anything from then on."""
+    plant, syncs = Emulator(send), list[int]()
+    receive, tick = plant.receive, plant.tick
 
-    def __init__(self, send: Send) -> None:
-        super().__init__(send)
-        self.begun_ns = -1
+    def is_alive(t_ns: int) -> bool:
+        return not syncs or t_ns < syncs[0] + 300_000_000
 
-    def receive(self, frame: Frame) -> None:
-        if self.begun_ns < 0 and frame.cob_id == 0x080:
-            self.begun_ns = frame.t_ns
-        if not self.is_dead(frame.t_ns):
-            super().receive(frame)
+    def hear(frame: Frame) -> None:
+        syncs.extend([frame.t_ns] * (frame.cob_id == 0x080))
+        if is_alive(frame.t_ns):
+            receive(frame)
 
-    def tick(self, t_ns: int) -> None:
-        if not self.is_dead(t_ns):
-            super().tick(t_ns)
+    def work(t_ns: int) -> None:
+        if is_alive(t_ns):
+            tick(t_ns)
 
-    def is_dead(self, t_ns: int) -> bool:
-        return 0 <= self.begun_ns <= t_ns - 300_000_000
+    plant.receive, plant.tick = hear, work  # type: ignore[method-assign]
+    return plant
 
 
 class SlowEnd(NodeProcesses):
@@ -242,7 +242,7 @@ def test_a_process_that_takes_its_time_to_end_is_the_first_cause_all_the_same(tm
 
         session._choose_cleanup = begin_cleanup  # type: ignore[method-assign, assignment]
 
-    wire = EmbeddedWire(VirtualClock(), [KilledPlant, Firmware])
+    wire = EmbeddedWire(VirtualClock(), [make_killed_plant, Firmware])
     session = play_in_parts(job("protocol = { probe = false }\n" + SHORT), tmp_path, wire, processes, note_cleanup)
     assert session.safety.aborted.startswith("node 2 controller 0x8250")
     assert session.nodes.gone[3] == "its process was ended by SIGKILL"
