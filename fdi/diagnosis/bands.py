@@ -65,7 +65,7 @@ class StepBand(NamedTuple):
 
     def compute_centre(self, friction: float, known: Floats) -> tuple[Floats, Floats]:
         """Mean and standard deviation, (K,) each, with `friction` N, between the amounts `known` (F,) N."""
-        weights = _interpolation_weights(friction, known)
+        weights = np.array([np.interp(friction, known, row) for row in np.eye(len(known))])
         return self.healthy + weights @ self.shift, weights @ self.spread
 
 
@@ -132,11 +132,6 @@ class Bands:
         judged = np.abs(step.middle) > BAND_FAULT_CLEARANCE_SD * spread
         middle = np.maximum(self.middle_share * np.abs(step.middle), BAND_NEAREST_LIMIT_SD * spread)
         return middle, np.maximum(self.most_share * np.abs(step.most), middle), judged
-
-
-def _interpolation_weights(friction: float, known: Floats) -> Floats:
-    """Weights (F,) of linear interpolation at `friction` between the amounts `known`, constant beyond the ends."""
-    return np.array([np.interp(friction, known, row) for row in np.eye(len(known))])
 
 
 # ---------------------------------------------------------------------------------------------------------------------

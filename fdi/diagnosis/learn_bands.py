@@ -441,9 +441,8 @@ def _sample_parameters(rng: np.random.Generator, model: Model, tolerance: Mappin
     table = np.tile([model[name] for name in names], (NARROW, 1))
     for name, size in tolerance.items():
         table[:, names.index(name)] += size * rng.standard_normal(NARROW)
-    if np.isfinite(kind.clogging):
-        table[:, names.index(CLOGGING.parameter)] = kind.clogging
-    if np.isfinite(kind.friction):
-        table[:, names.index(FRICTION.parameter)] = kind.friction
-        table[:, names.index(DYNAMIC)] = kind.friction * kind.sliding
+    for name, value in ((CLOGGING.parameter, kind.clogging), (FRICTION.parameter, kind.friction),
+                        (DYNAMIC, kind.friction * kind.sliding)):
+        if np.isfinite(value):
+            table[:, names.index(name)] = value
     return limit_dynamic_friction(names, table)

@@ -73,17 +73,21 @@ class Precursor(NamedTuple):
     @property
     def departure(self) -> float:
         """Distance from the healthy mean, in healthy standard deviations."""
-        return (self.value - self.healthy) / self.noise if self.noise > 0.0 else math.nan
+        return (self.value - self.healthy) / self._scatter
 
     @property
     def clogging_ratio(self) -> float:
         """Signal to noise: what Kintas 0.25 adds, in healthy standard deviations."""
-        return self.clogging / self.noise if self.noise > 0.0 else math.nan
+        return self.clogging / self._scatter
 
     @property
     def friction_ratio(self) -> float:
         """Signal to noise: what FSS 35 N adds, in healthy standard deviations."""
-        return self.friction / self.noise if self.noise > 0.0 else math.nan
+        return self.friction / self._scatter
+
+    @property
+    def _scatter(self) -> float:
+        return self.noise if self.noise > 0.0 else math.nan
 
 
 def measure_precursors(source: Trace, bands: Bands | None = None) -> dict[str, Precursor]:

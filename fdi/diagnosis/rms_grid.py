@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.faults import CLOGGING, FRICTION, STATIC_OVER_DYNAMIC
 from fdi.estimation.replay import has_known_start, read_cycles
 from fdi.thresholds import ANCHOR_RATE
-from fdi.trace.sections import Section, find_sections
+from fdi.trace.sections import find_sections
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model
@@ -95,7 +95,9 @@ def search_grid(trace: Trace, model: Model | None = None, kintas: Floats = KINTA
     if drive not in DRIVES:
         raise InputError("grid", "drive", f"one of {', '.join(DRIVES)}")
     parts = find_sections(trace.com, trace.period)
-    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := _select_rows(trace, parts, kind)).any()}
+    kinds = np.repeat([s.kind for s in parts], [s.stop - s.start for s in parts])
+    measured = ~np.isnan(trace.mask_unusable("xj"))
+    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := (kinds == kind) & measured).any()}
     if not rows:
         raise InputError("trace", "com", "steps or ramps, for the RMS grid")
     values = np.stack(np.meshgrid(kintas, fss, indexing="ij"), -1).reshape(-1, 2)
@@ -122,14 +124,6 @@ def _follow_valley(joint: Map, kintas: Floats, fss: Floats, points: int = 13) ->
     floor = fss[joint.rms.argmin(axis=1)]
     across = np.maximum(floor[:, None] + apart * np.linspace(-1.0, 1.0, points), 0.0)
     return np.column_stack([np.repeat(kintas, points), across.reshape(-1)])
-
-
-def _select_rows(trace: Trace, parts: list[Section], kind: str) -> Flags:
-    """Measured rows of the sections of a kind."""
-    chosen = np.zeros(len(trace), bool)
-    for s in parts:
-        chosen[s.start:s.stop] |= s.kind == kind
-    return chosen & ~np.isnan(trace.mask_unusable("xj"))
 
 
 def _compute_maps(trace: Trace, model: Model, values: Floats, drive: str, sliding: float, rows: dict[str, Flags]

@@ -17,6 +17,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from fdi.discovery.runs import Source, hash_columns, read_source
 from fdi.estimation.likelihood import Free
 from fdi.estimation.replay import SAME_PERIOD, hold_inputs, match_period, prepare_trace
@@ -113,11 +115,8 @@ def _parse_range(name: str, width: Any, model: Model, where: object) -> Range:
             raise InputError(where, field, f"a range within {possible_low:g} .. {possible_high:g} {q.unit}")
     else:
         raise InputError(where, field, f"a factor above 1, or a range [low, high] in {q.unit}, not {width!r}")
-    if low <= value <= high:
-        centre = value
-    else:
-        centre = math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high)
-    return Range(name, centre, low, high, q.unit)
+    middle = math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high)
+    return Range(name, value if low <= value <= high else middle, low, high, q.unit)
 
 
 def _is_number(x: object) -> bool:
@@ -207,7 +206,8 @@ def prepare_runs(model: Model, ranges: Sequence[Range], traces: Sequence[Trace],
     shared = [s for s in OUTPUTS if all(s in t.signals for t in traces[:fitted]) and (signals is None or s in signals)]
     if not shared:
         raise InputError(sources[0].file, ", ".join(signals or OUTPUTS), "a signal that every run to fit has")
-    widest = _widen_model(model, ranges)
+    limits = ("jack.travel", "spool.travel", "supply.pressure", "controller.current_limit")
+    widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
     prepared = [_prepare(t, widest, [s for s in shared if s in t.signals] or shared, source)
                 for t, source in zip(traces, sources, strict=True)]
     model = match_period(model, prepared[0], SAME_PERIOD)
@@ -233,16 +233,6 @@ def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source)
     try:
         return prepare_trace(trace, model, outputs, source.file)
     except InputError as error:
-        if "a signal that changes" in error.expected and _is_still(trace):  # a run at rest says little, but is one
+        if "a signal that changes" in error.expected and np.ptp(trace.com) == 0.0:  # at rest: says little, but is a run
             return hold_inputs(trace, outputs, source.file)
         raise
-
-
-def _is_still(trace: Trace) -> bool:
-    return bool(trace.com.max() == trace.com.min())
-
-
-def _widen_model(model: Model, ranges: Sequence[Range]) -> Model:
-    """The model with the largest travel, pressure and current that are possible, by which recordings are checked."""
-    limits = ("jack.travel", "spool.travel", "supply.pressure", "controller.current_limit")
-    return replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})

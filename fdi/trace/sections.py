@@ -42,7 +42,8 @@ def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
     Straight lines are found greedily within the resolution of the bus; what is not straight for 0.15 s is dynamic.
     Missing rows (NaN) continue the last demand.
     """
-    com = _fill_command(command)
+    com = np.asarray(command, float)
+    com = np.nan_to_num(com[np.maximum.accumulate(np.where(np.isnan(com), 0, np.arange(len(com))))])
     shortest_time = 0.15  # s; a sine of 0.05 Hz and 1 mm leaves its tangent by RESOLUTION within this time
     shortest = max(3, round(shortest_time / period))
     out: list[Section] = []
@@ -59,13 +60,6 @@ def find_sections(command: Floats, period: float = 1e-3) -> list[Section]:
         else:
             out.append(Section(kind, start, stop, float(before), float(com[stop - 1]), rate))
     return _merge_short_parts(out, shortest)
-
-
-def _fill_command(command: Floats) -> Floats:
-    com = np.asarray(command, float)
-    index = np.where(np.isnan(com), 0, np.arange(len(com)))
-    filled: Floats = np.nan_to_num(com[np.maximum.accumulate(index)])
-    return filled
 
 
 def _find_lines(com: Floats) -> list[tuple[int, int, float]]:

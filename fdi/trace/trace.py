@@ -334,7 +334,10 @@ def _from_log(log: Log, everything: bool) -> Trace:
                         | {"phase": phase[kept].astype(float)})
     grid["t"] = np.round((np.arange(len(grid["xj"])) + (cycle[kept][0] - cycle[first])) * period, 9)
     filled = hold_last(grid.pop("phase"))
-    return _make_trace(grid, period, rows, phase=filled.astype(int), provenance=_collect_provenance(log, run),
+    more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
+            for key, value in record.items()}  # as `verdict.status`
+    said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
+    return _make_trace(grid, period, rows, phase=filled.astype(int), provenance={"source": log.path.name, **said},
                        units=dict(UNITS) | log.read_units("/signals"), attachments=log.attachments, notes=tuple(notes),
                        sensors=read_sensors(log.path, run),
                        timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
@@ -386,14 +389,6 @@ def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.
     if not 1e-6 <= period <= 3600.0:  # nor NaN
         raise InputError(log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {str(said)!r}")
     return period
-
-
-def _collect_provenance(log: Log, run: Mapping[str, str]) -> dict[str, str]:
-    """The record `run` as it is; other metadata records with their name in front (`verdict.status`)."""
-    more = {f"{name}.{key}": value for name, record in log.metadata.items() if name != "run"
-            for key, value in record.items()}
-    said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
-    return {"source": log.path.name, **said}
 
 
 def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float], float]:

@@ -283,7 +283,8 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
     if method == "samples":
         return _place_nearest(samples, rows, 0.5 * period), "nearest sample"
     apart = f"{1e3 * samples.period:.4g} ms apart"
-    if method == "hold" or (method == "auto" and cycle_part and _is_stepwise(samples)):
+    is_stepwise = len(samples.x) > 10 and float(np.mean(np.diff(samples.x) == 0.0)) > 0.5  # most repeat the one before
+    if method == "hold" or (method == "auto" and cycle_part and is_stepwise):
         return _hold(samples, rows), f"last sample, {apart}"
     if ratio > 1.5 and low_pass is not False:
         return _interpolate(_filter(samples, ratio), rows), f"low-pass filtered, straight lines between samples {apart}"
@@ -330,11 +331,6 @@ def _place_nearest(samples: Samples, rows: Floats, reach: float) -> Floats:
     after = np.clip(np.searchsorted(samples.t, rows), 1, len(samples.t) - 1)
     nearest = np.where(rows - samples.t[after - 1] <= samples.t[after] - rows, after - 1, after)
     return np.where(np.abs(samples.t[nearest] - rows) <= reach, samples.x[nearest], math.nan)
-
-
-def _is_stepwise(samples: Samples) -> bool:
-    """Whether most samples repeat the one before."""
-    return len(samples.x) > 10 and float(np.mean(np.diff(samples.x) == 0.0)) > 0.5
 
 
 def _hold(samples: Samples, rows: Floats) -> Floats:
