@@ -110,7 +110,7 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
             search.learn_noise(tried[0])
             base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
             tried = sorted(best, key=lambda h: h.cost) + tried[4:]
-            levels[0] = [search.refit_base(base, tried[:1])]
+            levels[0] = [search.refit_base(base, tried[0])]
         done = search.reaches_floor(tried[0])
         if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
             # no second effect is missing, but stops that the fit of the first one missed
@@ -256,7 +256,7 @@ def _doubt_small_gain(search: Search, base: Hypothesis, close: list[Hypothesis],
         close = [h for h in close if shows_effect(search.model, h)]
     if not close or measure_gain(base, close[0]) >= GAIN_DOUBTFUL:
         return base, close
-    base = search.finish_hypothesis(search.refit_base(base, close[:1]), LONG)
+    base = search.finish_hypothesis(search.refit_base(base, close[0]), LONG)
     base = search.leave_out_effects(base, close[0])
     return base, [] if depth == 1 and measure_gain(base, close[0]) <= GAIN_SEEN else close
 

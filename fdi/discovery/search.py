@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from fdi.estimation.unknowns import (
     complete_model,
     list_all_unknowns,
     list_effect_unknowns,
+    name_sine,
     silence_readings,
     turn_amplitudes_positive,
 )
@@ -142,10 +143,8 @@ class Search:
         """The model without a further effect, its tolerances fitted."""
         free = list_all_unknowns(self.model)
 
-        def fit_tolerances(ease: bool) -> Fit:
-            return fit_unknowns(self.problem, free, self.find_eased_start(free) if ease else None)
-
-        fits = self.map_parallel(fit_tolerances, (False, True))
+        fits = self.map_parallel(
+            lambda ease: fit_unknowns(self.problem, free, self.find_eased_start(free) if ease else None), (False, True))
         first = self.judge_fit((), min(fits, key=lambda f: f.cost))
         if first.is_at_floor:
             return first
@@ -163,46 +162,40 @@ class Search:
 
     def retry_from(self, h: Hypothesis, starts: Iterable[Floats]) -> Hypothesis:
         """The hypothesis from further starts (p,), if one of them ends lower: stick-slip has many valleys."""
-        def fit_from(start: Floats) -> Fit:
-            return fit_unknowns(self.problem, h.fit.free, start)
-
-        for other in self.map_parallel(fit_from, starts):
+        free = h.fit.free
+        for other in self.map_parallel(lambda start: fit_unknowns(self.problem, free, start), starts):
             if other.cost < h.cost - 1.0:
                 h = self.judge_fit(h.effects, other)
         return h
 
-    def refit_base(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis:
-        """The base fitted again from where fits with an effect have left its parameters.
+    def refit_base(self, base: Hypothesis, h: Hypothesis) -> Hypothesis:
+        """The base fitted again from where a fit with an effect has left its parameters.
 
         What an effect gains is then not what the base's own fit had left lying about.
         """
-        return self.retry_from(base, self._place_base(base, tried))
+        return self.retry_from(base, [_place_base(base, h)])
 
     def leave_out_effects(self, base: Hypothesis, h: Hypothesis) -> Hypothesis:
         """The base with its unknowns where another hypothesis has them, or as it is if that leaves more.
 
         Near its end a fit steps over ridges by luck: what is left there without the effect is not the effect's gain.
         """
-        (start,) = self._place_base(base, [h])
-        other = self.judge_fit((), linearise(self.fine or self.problem, base.fit.free, start))
-        return min(base, other, key=lambda each: each.cost)
+        left = linearise(self.fine or self.problem, base.fit.free, _place_base(base, h))
+        return min(base, self.judge_fit((), left), key=lambda each: each.cost)
 
-    def _place_base(self, base: Hypothesis, tried: Sequence[Hypothesis]) -> list[Floats]:
-        """The base's unknowns, (p,) each, where fits with an effect have left them; at 0 those at a bound."""
-        starts = []
-        for h in tried:
-            values = h.fit.values
-            starts.append(np.array([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
-                                    for f in base.fit.free]))
-        return starts
+    def list_further_effects(self, present: Sequence[str]) -> list[str]:
+        """The effects of the search that may stand beside these."""
+        excluded = {name for e in present for name in CATALOGUE[e].excludes}
+        return [e for e in self.effects if e not in present and e not in excluded
+                and not set(CATALOGUE[e].excludes) & set(present)]
 
     def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
-        effects = [e for e in self.effects if e not in start.effects and not self._is_excluded(e, start.effects)]
+        effects = self.list_further_effects(start.effects)
         prospects = scan_effects(self.problem, start.fit, effects, self.workers)
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
             nominal = linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free)))
-            prospects = _merge_prospects(prospects, scan_effects(self.problem, nominal, effects, self.workers))
+            prospects = _keep_best([*prospects, *scan_effects(self.problem, nominal, effects, self.workers)])
         worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
         fits = list(zip([p.effect for p in worth], self.map_parallel(self._begin_fit, worth), strict=True))
         for rounds, kept in RACE:
@@ -224,11 +217,10 @@ class Search:
         there. With more noise the tolerances stay near a healthy unit, and an effect is judged by the course of the
         signals. The best two effects that have been `tried` are fitted in any case.
         """
-        effects = [e for e in self.effects if e not in start.effects and not self._is_excluded(e, start.effects)]
         loud = scale_noise(self.problem, EASED[0])
         own = np.where([np.isfinite(f.prior) for f in start.fit.free], 0.0, start.fit.x)
         begun = fit_unknowns(loud, start.fit.free, own, 4)
-        prospects = scan_effects(loud, begun, effects, self.workers)
+        prospects = scan_effects(loud, begun, self.list_further_effects(start.effects), self.workers)
         known = {h.effects[-1] for h in tried[:2]}
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
         starts = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
@@ -244,7 +236,7 @@ class Search:
         done = [self.judge_fit((*start.effects, effect), fit) for effect, fit in fits]
         return sorted(done, key=lambda h: h.cost)
 
-    def search_widely(self, h: Hypothesis, seed: int = 0) -> Hypothesis:
+    def search_widely(self, h: Hypothesis) -> Hypothesis:
         """A hypothesis, or where a population ends that begins at a unit with its effects and no other deviation.
 
         Stick-slip makes the cost rough, and two effects share many local minima (`fdi.estimation.fit`).
@@ -253,12 +245,11 @@ class Search:
         has_prior = np.isfinite([f.prior for f in free])
         home = np.where(has_prior, 0.0, h.fit.x)
 
-        def descend(problem: Problem, fit: Fit, rounds: int, factor: float) -> Fit:
-            return fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds)
-
         begun = fit_unknowns(scale_noise(self.problem, 100.0), free, home, 4)
         width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
-        end = follow_population(self.problem, begun, np.diag(width**2), VALLEY_STAGES, seed, descend)
+        end = follow_population(
+            self.problem, begun, np.diag(width**2), VALLEY_STAGES, 0,
+            lambda problem, fit, rounds, factor: fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds))
         other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
         return min(h, other, key=lambda each: each.cost + each.repeat_cost)
 
@@ -296,9 +287,6 @@ class Search:
         prior = np.array([f.prior**-2 for f in p.free])
         costs = compute_misfit(self.problem.compute_white_residuals(p.free, starts)) + (starts**2) @ prior
         return linearise(self.problem, p.free, starts[int(np.argmin(costs))])
-
-    def _is_excluded(self, effect: str, present: Sequence[str]) -> bool:
-        return any(effect in CATALOGUE[e].excludes or e in CATALOGUE[effect].excludes for e in present)
 
     def judge_fit(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats."""
@@ -451,12 +439,11 @@ def _measure_rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
     return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(signals, residuals, strict=True)}
 
 
-def _merge_prospects(a: Sequence[Prospect], b: Sequence[Prospect]) -> list[Prospect]:
-    best = {p.effect: p for p in a}
-    for p in b:
-        if p.effect not in best or p.cost < best[p.effect].cost:
-            best[p.effect] = p
-    return sorted(best.values(), key=lambda p: p.cost)
+def _place_base(base: Hypothesis, h: Hypothesis) -> Floats:
+    """The base's unknowns, (p,), where a fit with an effect has left them; at 0 those at a bound."""
+    values = h.fit.values
+    return np.array([(values[f.name] - f.centre) / f.scale if f.low < values[f.name] < f.high else 0.0
+                     for f in base.fit.free])
 
 
 Start = Mapping[str, float]
@@ -503,18 +490,15 @@ def scan_effects(problem: Problem, fit: Fit, effects: Iterable[str], workers: in
     take up what they can. Further passes try sizes around the best start, closer each time, and the last one
     frequencies.
     """
-    effects = list(effects)
     first = [(name, start, along) for name in effects for along in ((False, True) if name in GOES_WITH else (False,))
              for start in (*CATALOGUE[name].starts, *find_tones(problem, fit, name))]
-    best = _pick_best(simulate_starts(problem, fit, first, workers))
+    best = _keep_best(simulate_starts(problem, fit, first, workers))
     for factors, count in zip(ZOOM, LOOKED_AT, strict=True):
-        promising = sorted(best.values(), key=lambda t: t.cost)[:count]
-        near = [(t.effect, start, t.along) for t in promising for start in _list_starts_around(problem, t, factors)]
-        best = _pick_best([*best.values(), *simulate_starts(problem, fit, near, workers)])
-    promising = sorted(best.values(), key=lambda t: t.cost)[:LOOKED_AT[-1]]
-    beside = [(t.effect, start, t.along) for t in promising for start in _list_lines_beside(problem, t)]
-    best = _pick_best([*best.values(), *simulate_starts(problem, fit, beside, workers)])
-    return sorted((_make_prospect(problem, fit, t) for t in best.values()), key=lambda p: p.cost)
+        near = [(t.effect, start, t.along) for t in best[:count] for start in _list_starts_around(problem, t, factors)]
+        best = _keep_best([*best, *simulate_starts(problem, fit, near, workers)])
+    beside = [(t.effect, start, t.along) for t in best[:LOOKED_AT[-1]] for start in _list_lines_beside(problem, t)]
+    best = _keep_best([*best, *simulate_starts(problem, fit, beside, workers)])
+    return [_make_prospect(problem, fit, t) for t in best]
 
 
 def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
@@ -551,7 +535,7 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     that answer has a line where the effect has its frequency. The lines that stand out most from what is around, in all
     signals together, are tried, at four phases as the answer may lag, and larger as what is fast is weakened.
     """
-    entry, named = CATALOGUE[effect], _name_sine(effect)
+    entry, named = CATALOGUE[effect], name_sine(effect)
     if named is None:
         return []
     size, tone, phase = named
@@ -587,7 +571,7 @@ def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
     A line in what a wrong fit leaves stands a little beside the effect's own frequency. A fit gets there only from
     less than half a turn away: it does not leave the line that it begins in.
     """
-    named = _name_sine(t.effect)
+    named = name_sine(t.effect)
     if named is None:
         return []
     _, tone, phase = named
@@ -600,16 +584,6 @@ def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
     return [{**t.start, tone: float(max(t.start[tone] + change, low)),
              phase: float(t.start[phase] - middle * change + eighth * 0.25 * np.pi)}
             for change in changes for eighth in range(8)]
-
-
-def _name_sine(effect: str) -> tuple[str, str, str] | None:
-    """Names of the amplitude, the frequency and the phase of an effect that has them."""
-    entry = CATALOGUE[effect]
-    named = {entry.parameters[n].unit: n for n in entry.fitted}
-    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
-    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
-        return None
-    return size, named["Hz"], named["rad"]
 
 
 def _find_longest_piece(problem: Problem) -> Part:
@@ -625,12 +599,15 @@ def _measure_prominence(spectra: Floats, width: int) -> Floats:
     return out
 
 
-def _pick_best(trials: Iterable[Trial]) -> dict[str, Trial]:
-    best: dict[str, Trial] = {}
-    for t in trials:
-        if t.effect not in best or t.cost < best[t.effect].cost:
-            best[t.effect] = t
-    return best
+E = TypeVar("E", Trial, Prospect)
+
+
+def _keep_best(tried: Iterable[E]) -> list[E]:
+    """The best of each effect, best first."""
+    best: dict[str, E] = {}
+    for each in sorted(tried, key=lambda t: t.cost):
+        best.setdefault(each.effect, each)
+    return list(best.values())
 
 
 def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Start, bool]], workers: int
@@ -643,15 +620,14 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
     begun = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
     at = [problem.list_values(fit.free, x) | dict(start) for x, (_, start, _) in zip(begun, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
-    steep = prepare_slope(fit)
+    absorb_shift = _make_absorber(fit)
 
     def run_trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whiten_residuals(problem.subtract_measurements(problem.predict_outputs(names, rows[part])))
         found = []
         for i, r in zip(part, white, strict=True):
             effect, start, goes_along = starts[i]
-            cost, x = absorb_shift(fit, steep, r, set(start), begun[i])
-            found.append(Trial(effect, start, cost, x, goes_along))
+            found.append(Trial(effect, start, *absorb_shift(r, start, begun[i]), goes_along))
         return found
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
@@ -668,42 +644,32 @@ def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str,
     return np.clip(x, low, high)
 
 
-class Slope(NamedTuple):
-    """A fit's Jacobian as the scan needs it: whole, thinned, and what is known of the unknowns."""
+def _make_absorber(fit: Fit) -> Callable[[Floats, Iterable[str], Floats], tuple[float, Floats]]:
+    """A function that lets a fit's unknowns take up what they can of a whitened residual.
 
-    whole: Floats  # (p, s * n)
-    thin: Floats  # (p, s, n / SCAN_STRIDE)
-    prior: Floats  # (p,)
-    low: Floats  # (p,)
-    high: Floats  # (p,)
-
-
-def prepare_slope(fit: Fit) -> Slope:
-    """Prepared once for many residuals."""
-    low, high = scaled_bounds(fit.free)
-    return Slope(fit.jacobian.reshape(len(fit.x), -1), np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE]),
-                 np.array([f.prior**-2 for f in fit.free]), low, high)
-
-
-def absorb_shift(fit: Fit, s: Slope, white: Floats, held: set[str], begun: Floats) -> tuple[float, Floats]:
-    """Cost of a whitened residual (s, n) after the fit's unknowns, but for those `held`, have shifted linearly.
-
-    `begun`: the unknowns, (p,), at which the residual was simulated.
-
-    Twice, as what can be fitted is known only after the first time; not at all where that is worse than to stay.
+    Of a residual (s, n), simulated at the unknowns `begun`, (p,), it gives the cost after they have shifted linearly,
+    but for those `held`, and where they are then.
     """
-    move = np.array([f.name not in held for f in fit.free])
-    prior = np.where(move, s.prior, 1e30)  # what is held does not move
-    flat, left, x = s.thin.reshape(len(begun), -1), white, begun
-    few = white[:, ::SCAN_STRIDE].reshape(-1)
-    for _ in range(2):
-        heavy = (SCAN_STRIDE * s.thin * compute_weights(left)[:, ::SCAN_STRIDE]).reshape(flat.shape)
-        hessian = heavy @ flat.T + np.diag(prior + 1e-9)
-        gradient = heavy @ few + s.prior * begun * move
-        x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), s.low, s.high), begun)
-        left = white + ((x - begun) @ s.whole).reshape(white.shape)
-    costs = compute_misfit(np.array([left, white])) + [(at * move) ** 2 @ s.prior for at in (x, begun)]
-    return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), begun)
+    low, high = scaled_bounds(fit.free)
+    whole, priors = fit.jacobian.reshape(len(fit.x), -1), np.array([f.prior**-2 for f in fit.free])
+    thin = np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE])
+
+    def absorb_shift(white: Floats, held: Iterable[str], begun: Floats) -> tuple[float, Floats]:
+        """Twice, as what can be fitted is known only after the first time; not at all where to stay is better."""
+        move = np.array([f.name not in held for f in fit.free])
+        prior = np.where(move, priors, 1e30)  # what is held does not move
+        flat, left, x = thin.reshape(len(begun), -1), white, begun
+        few = white[:, ::SCAN_STRIDE].reshape(-1)
+        for _ in range(2):
+            heavy = (SCAN_STRIDE * thin * compute_weights(left)[:, ::SCAN_STRIDE]).reshape(flat.shape)
+            hessian = heavy @ flat.T + np.diag(prior + 1e-9)
+            gradient = heavy @ few + priors * begun * move
+            x = np.where(move, np.clip(begun - cho_solve(cho_factor(hessian), gradient), low, high), begun)
+            left = white + ((x - begun) @ whole).reshape(white.shape)
+        costs = compute_misfit(np.array([left, white])) + [(at * move) ** 2 @ priors for at in (x, begun)]
+        return (float(costs[0]), x) if costs[0] <= costs[1] else (float(costs[1]), begun)
+
+    return absorb_shift
 
 
 NULL_STRIDE = 3
@@ -713,14 +679,11 @@ class Sensitivity(NamedTuple):
     """What effects would change, beyond what the fit's own unknowns can make up for."""
 
     names: tuple[str, ...]  # the effect of each direction
-    sizes: tuple[float, ...]  # of its first fitted parameter, as distance from the off value
-    gains: Floats  # (d,) squared length of each direction, whitened
     gram: Floats  # (d, d) cosines between directions
 
 
 def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
     """Directions of the effects' starts at the fit, in whitened residuals, the fit's unknowns projected out."""
-    usual = problem.model.nominal
     starts = [(e, s) for e in effects for s in CATALOGUE[e].starts if CATALOGUE[e].port not in ("command", "reading")]
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
     held = [fit.values.get(n, problem.model.values[n]) for n in names]
@@ -732,12 +695,8 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), -1) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
     left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
-    gains = np.einsum("ij,ij->i", left, left)
-    length = np.sqrt(np.maximum(gains, 1e-300))
-    sizes = tuple(abs(s[CATALOGUE[e].fitted[0]] - CATALOGUE[e].off.get(CATALOGUE[e].fitted[0],
-                                                                       usual.get(CATALOGUE[e].fitted[0], 0.0)))
-                  for e, s in starts)
-    return Sensitivity(tuple(e for e, _ in starts), sizes, gains, (left @ left.T) / np.outer(length, length))
+    length = np.sqrt(np.maximum(np.einsum("ij,ij->i", left, left), 1e-300))
+    return Sensitivity(tuple(e for e, _ in starts), (left @ left.T) / np.outer(length, length))
 
 
 def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:

@@ -58,16 +58,23 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
     return tuple(free)
 
 
+def name_sine(effect: str) -> tuple[str, str, str] | None:
+    """Names of the amplitude, the frequency and the phase of an effect that has them."""
+    entry = CATALOGUE[effect]
+    named = {entry.parameters[n].unit: n for n in entry.fitted}
+    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
+    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
+        return None
+    return size, named["Hz"], named["rad"]
+
+
 def turn_amplitudes_positive(free: Sequence[Free], x: Floats) -> Floats:
     """Scaled unknowns, (p,), of the same sines with amplitudes that are not negative and phases within half a turn."""
     x, place = x.copy(), {f.name: k for k, f in enumerate(free)}
-    for effect in CATALOGUE.values():
-        units = {name: effect.parameters[name].unit for name in effect.fitted}
-        sizes = [name for name, unit in units.items() if unit not in ("Hz", "rad")]
-        if not {"Hz", "rad"} <= set(units.values()) or len(sizes) != 1 or sizes[0] not in place:
+    for sine in map(name_sine, CATALOGUE):
+        if sine is None or sine[0] not in place:
             continue
-        size = place[sizes[0]]
-        angle = place[next(name for name, unit in units.items() if unit == "rad")]
+        size, angle = place[sine[0]], place[sine[2]]
         amplitude, phase = (free[k].centre + free[k].scale * x[k] for k in (size, angle))
         phase += np.pi * (amplitude < 0.0)
         x[size] = (abs(amplitude) - free[size].centre) / free[size].scale

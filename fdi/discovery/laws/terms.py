@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
+from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -21,13 +22,10 @@ from fdi.estimation.fit import Value
 from fdi.output import write_text
 from plant.effects import CATALOGUE, Effect, effect
 
-# The states in a formula, and what they are in a law; `way` is the distance since the ram's last reversal, m.
-STATES = {"position": "s.jack_position", "speed": "s.jack_speed", "pressure": "s.pressure",
-          "spool": "s.spool_position", "spool_speed": "s.spool_speed", "current": "u.current", "time": "u.t",
-          "way": "way"}
-
-UNITS = {"position": "m", "speed": "m/s", "pressure": "Pa", "spool": "m", "spool_speed": "m/s", "current": "A",
-         "time": "s", "way": "m"}
+# The states in a formula: what they are in a law, and their units; `way` is the distance since the last reversal.
+STATES = {"position": ("s.jack_position", "m"), "speed": ("s.jack_speed", "m/s"), "pressure": ("s.pressure", "Pa"),
+          "spool": ("s.spool_position", "m"), "spool_speed": ("s.spool_speed", "m/s"), "current": ("u.current", "A"),
+          "time": ("u.t", "s"), "way": ("way", "m")}
 
 # The ways in which a term enters its balance: the balance, what the factor is multiplied by there, in words.
 PARTS = {"load": ("force", "1", "a force against extension"),
@@ -49,7 +47,7 @@ class Shape(NamedTuple):
     @property
     def unit(self) -> str:
         """Unit of the parameter."""
-        return "Hz" if self.kind == "frequency" else UNITS[self.state]
+        return "Hz" if self.kind == "frequency" else STATES[self.state][1]
 
 
 class Term(NamedTuple):
@@ -184,16 +182,6 @@ def find_states(term: Term) -> list[str]:
 # Where the terms of a balance act; a law of forces alone acts at `load`.
 PORTS = {"force": "jack_drag", "flow": "valve", "current": "current"}
 
-IMPORTS = """from math import exp, pi, sin, sqrt, tanh
-from typing import Annotated, NamedTuple
-
-from plant.effects import effect
-from plant.quantity import Quantity
-from plant.state import Drag, Line
-
-
-"""
-
 
 def write_law_file(path: str | Path, terms: Sequence[Term], found: Mapping[str, Value], reason: str) -> dict[str, str]:
     """Write a law as an effect file; the names of its effects, by balance.
@@ -207,39 +195,31 @@ def write_law_file(path: str | Path, terms: Sequence[Term], found: Mapping[str, 
     Raises:
         InputError: a place that cannot be written.
     """
-    names = _name_effects(terms)
-    lines = [f"Found by rig explain: {describe_formula(terms)}.", ""]
-    for term in terms:
-        v = found[term.name]
-        lines.append(f"{term.name}: {term.words}, {v.value:.4g} {v.unit} (95 %: {v.low:.4g} to {v.high:.4g}).")
-    text = "\n".join([*lines, "", f"{reason[0].upper()}{reason[1:]}."]) + "\n"
+    known = CATALOGUE.list_all()
+    names = {place: next(name for number in count(1)  # that no other effect has
+                         if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in known)
+             for place in dict.fromkeys(term.place for term in terms)}
+    sizes = [f"{t.name}: {t.words}, {v.value:.4g} {v.unit} (95 %: {v.low:.4g} to {v.high:.4g})."
+             for t, v in ((t, found[t.name]) for t in terms)]
+    text = "\n".join([f"Found by rig explain: {describe_formula(terms)}.", "", *sizes, "",
+                      f"{reason[0].upper()}{reason[1:]}."]) + "\n"
     values = {name: v.value for name, v in found.items()}
     write_text(path, write_effects(names, terms, values, text), "--write-effect")
     return names
 
 
-def _name_effects(terms: Sequence[Term]) -> dict[str, str]:
-    """Names of a law's effects, by balance, that no other effect has."""
-    known, names = CATALOGUE.list_all(), {}
-    for place in dict.fromkeys(term.place for term in terms):
-        free = [name for number in range(1, 100)
-                if (name := f"missing_{place}" + (f"_{number}" if number > 1 else "")) not in known]
-        names[place] = free[0]
-    return names
-
-
-def write_effects(names: Mapping[str, str], terms: Sequence[Term], values: Mapping[str, float], text: str) -> str:
+def write_effects(names: Mapping[str, str], terms: Sequence[Term], values: Mapping[str, float] | None, text: str
+                  ) -> str:
     """The source of a file with a law: one effect for each balance that it has terms of.
 
     Args:
         names: of the effects, by balance.
         terms: of the law.
-        values: what was found, by field.
+        values: what was found, by field; without it nothing is fitted and every field is zero or one.
         text: docstring of the file.
     """
-    laws = [write_law(name, own := [t for t in terms if t.place == place], values, describe_terms(own))
-            for place, name in names.items()]
-    source = "\n\n".join(laws)
+    source = "\n\n".join(write_law(name, [t for t in terms if t.place == place], values)
+                         for place, name in names.items())
     used = set(re.findall(r"[A-Za-z]+", re.sub(r'"[^"]*"', "", source)))
     functions = [f for f in ("exp", "pi", "sin", "sqrt", "tanh") if f in used]
     records = [r for r in ("Drag", "Line") if r in used]
@@ -250,22 +230,15 @@ def write_effects(names: Mapping[str, str], terms: Sequence[Term], values: Mappi
     return f'"""{text}"""\n' + "\n".join(head) + "\n\n\n" + source
 
 
-def describe_terms(terms: Sequence[Term]) -> str:
-    """The terms in a sentence."""
-    words = " and ".join(t.words for t in terms)
-    return words[0].upper() + words[1:] + "."
-
-
-def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | None = None, text: str = "") -> str:
+def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | None) -> str:
     """The source of one effect: its group of parameters and its law, without the imports of a file.
 
     Args:
         name: of the effect.
         terms: of one balance.
-        values: what was found, by field; without it nothing is fitted and every field is zero or one.
-        text: docstring of the law.
+        values: as for `write_effects`.
     """
-    place = terms[0].place
+    place, words = terms[0].place, " and ".join(term.words for term in terms)
     group = "".join(word.title() for word in name.split("_"))
     memory = any("way" in find_states(term) for term in terms)
     lines = [f"class {group}(NamedTuple):", *(_format_field(f, unit, term, values) for term in terms
@@ -281,13 +254,13 @@ def write_law(name: str, terms: Sequence[Term], values: Mapping[str, float] | No
         starts = f",\n        starts=(({found},),)"
     lines += [f'@effect("{"load" if is_load else port}", {group}{f", memory={group}Way" if memory else ""},',
               f'        law="{format_formula(terms)}"{starts})',
-              f"def {name}(x, {'m, ' if memory else ''}s, u, p):", f'    """{text or "Terms of a law."}"""',
+              f"def {name}(x, {'m, ' if memory else ''}s, u, p):", f'    """{words[0].upper()}{words[1:]}."""',
               f"    g = p.{name}"]
     if memory:
         lines += ["    moves = s.jack_speed != 0.0",
                   "    side = (1.0 if s.jack_speed > 0.0 else -1.0) if moves else m.side",
                   "    way = (m.way if side == m.side else 0.0) + u.h * abs(s.jack_speed)"]
-    lines += [f"    {state} = {where}" for state, where in STATES.items()
+    lines += [f"    {state} = {where}" for state, (where, _) in STATES.items()
               if state != "way" and any(state in find_states(term) for term in terms)]
     parts = list(dict.fromkeys(term.part for term in terms))
     for part in parts:
@@ -404,10 +377,7 @@ def _build_library() -> dict[str, Effect]:
     """The effects, once in a process."""
     module = ModuleType("fdi.discovery.laws.library_of_terms")
     sys.modules[module.__name__] = module  # where the annotations are looked up
-    imports = IMPORTS.replace("from plant.effects import effect\n", "")
-    source = imports + "\n\n\n".join(
-        write_law(name, [term for term in TERMS if term.place == place]) for place, name in LIBRARY.items())
     module.__dict__["effect"] = partial(effect, searched_in=("none",))
-    code = compile(source, f"<{module.__name__}>", "exec", dont_inherit=True)
-    exec(code, module.__dict__)
+    source = write_effects(LIBRARY, TERMS, None, "All terms.").replace("from plant.effects import effect\n", "")
+    exec(compile(source, f"<{module.__name__}>", "exec", dont_inherit=True), module.__dict__)
     return {name: CATALOGUE.special.pop(name) for name in LIBRARY.values()}

@@ -91,7 +91,7 @@ def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> N
 
 def _independent(effects: int) -> Sensitivity:
     names = tuple(f"e{i}" for i in range(effects))
-    return Sensitivity(names, (1.0,) * effects, np.full(effects, 100.0), np.eye(effects))
+    return Sensitivity(names, np.eye(effects))
 
 
 def test_the_p_value_is_that_of_the_best_of_all_candidates() -> None:
