@@ -208,7 +208,7 @@ class Answer:
 
 def assess_explanation(e: Explanation, seed: int) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
-    hand = _list_firmware_marks(e)
+    hand = [p for p in e.marks.prints if CATALOGUE[p.effect].firmware]
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
     if hand:
         unit = e.marks.resolution
@@ -281,10 +281,6 @@ def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
         fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in held.items())
         return "fails on the held-out run" if fails else "less likely"
     return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.is_at_floor else "no"
-
-
-def _list_firmware_marks(e: Explanation) -> list[Fingerprint]:
-    return [p for p in e.marks.prints if CATALOGUE[p.effect].firmware]
 
 
 def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:

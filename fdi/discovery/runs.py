@@ -50,7 +50,6 @@ def read_runs(model: Model, trace: str, repeats: Sequence[str] = (), holdout: st
     """
     files = [trace, *repeats, *([holdout] if holdout else [])]
     sources = [read_source(file) for file in files]
-    _check_distinct(sources, len(repeats))
     return _prepare_runs(model, [Trace.read(file) for file in files], sources, len(repeats), signals)
 
 
@@ -63,19 +62,22 @@ def collect_runs(model: Model, trace: Trace, repeats: Sequence[Trace] = (), hold
     """
     traces = [trace, *repeats, *([holdout] if holdout is not None else [])]
     sources = [Source(t.provenance.get("source", "trace"), hash_columns(t)) for t in traces]
-    _check_distinct(sources, len(repeats))
     return _prepare_runs(model, traces, sources, len(repeats), signals)
 
 
 def _prepare_runs(model: Model, traces: Sequence[Trace], sources: Sequence[Source], repeats: int,
                   signals: Sequence[str] | None) -> Runs:
     """The runs of a search: the one to explain, so many repeats, and a held-out one if there is one more."""
-    chosen, names = _choose_signals(signals), [s.file for s in sources]
-    est = _prepare_run(traces[0], model, chosen, names[0])
+    _check_distinct(sources, repeats)
+    names = [s.file for s in sources]
+    est = _prepare_run(traces[0], model, signals, names[0])
     model = match_period(model, est, SAME_PERIOD)
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + repeats))
     unseen = _prepare_holdout(est, traces[-1], model, names[0], names[-1]) if len(traces) > 1 + repeats else None
-    doubt = _check_repeats(est, others, model) if model.plant == "eha" else ""
+    doubt = ""
+    if others and model.plant == "eha":  # an error of the model is the same in all of them, so it does not matter here
+        first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
+        doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model))
     return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *([doubt] if doubt else [])))
 
 
@@ -97,13 +99,6 @@ def read_source(file: str) -> Source:
         raise InputError(file, "", f"a trace that can be read ({error.strerror})") from error
 
 
-def _choose_signals(signals: Sequence[str] | None) -> tuple[str, ...] | None:
-    for name in signals or ():
-        if name not in OUTPUTS:
-            raise InputError("--signals", name, f"some of {','.join(OUTPUTS)}")
-    return tuple(s for s in OUTPUTS if s in signals) if signals is not None else None
-
-
 def _check_distinct(sources: Sequence[Source], repeats: int) -> None:
     """Refuse a run that stands in for itself: it would prove whatever is asked of it."""
     seen: dict[str, str] = {}
@@ -118,7 +113,7 @@ def _check_distinct(sources: Sequence[Source], repeats: int) -> None:
 def _prepare_run(trace: Trace, model: Model, outputs: Sequence[str] | None, source: str) -> Trace:
     """A run as fits use it; the checks of ranges and rates are those of the reference model alone."""
     if model.plant != "eha":
-        return hold_inputs(trace, outputs or None, source)
+        return hold_inputs(trace, outputs, source)
     return prepare_trace(trace, model, outputs, source)
 
 
@@ -143,14 +138,3 @@ def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source
     if match_period(model, unseen, SAME_PERIOD)["controller.period"] != period:
         raise InputError(source, "t", f"rows {period:g} s apart, as in {fitted}")
     return unseen
-
-
-def _check_repeats(trace: Trace, repeats: Sequence[Trace], model: Model) -> str:
-    """What `describe_doubtful_repeats` says of prepared repeats on the rows of a prepared trace.
-
-    An error of the model is the same in all of them, so it does not matter here.
-    """
-    if not repeats:
-        return ""
-    first, *others = (compute_residuals(run, replay_current(run, model)) for run in (trace, *repeats))
-    return describe_doubtful_repeats(find_floors(first, others, trace.period), sensor_floors(trace, model))

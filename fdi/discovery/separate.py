@@ -10,8 +10,6 @@ import numpy as np
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import fit_unknowns
-from fdi.estimation.likelihood import Problem
-from fdi.estimation.noise import Noise
 from fdi.estimation.replay import hold_inputs
 from fdi.thresholds import MISFIT_DISCRIMINATES
 from fdi.trace.signals import OUTPUTS
@@ -41,26 +39,20 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
     own = search.problem.trace
-    for more in _list_sensor_sets(own.outputs):
+    missing = tuple(s for s in OUTPUTS if s not in own.outputs)
+    for more in dict.fromkeys([*((s,) for s in missing), missing] if missing else []):
         left = min(_measure_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES:
             return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
     best = None
-    for words, command, play in list_commands(search.problem.model.values["controller.period"]):
+    for words, command, play in list_commands():
         left = min(_measure_misfit(search, a, b, _simulate_command(search, a, play, own.outputs)) for a, b in pairs)
         if left > MISFIT_DISCRIMINATES and (best is None or left > best.misfit):
             best = Separation(names, words, command, left)
     return best
 
 
-def _list_sensor_sets(there: Sequence[str]) -> list[tuple[str, ...]]:
-    missing = tuple(s for s in OUTPUTS if s not in there)
-    if len(missing) > 1:
-        return [*((s,) for s in missing), missing]
-    return [missing] if missing else []
-
-
-def list_commands(period: float) -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
+def list_commands() -> list[tuple[str, dict[str, Any], Callable[[Floats], tuple[Floats, Floats]]]]:
     """Commands to try, in words, as segments of a sequence, and as functions of time giving demand m and load N."""
     def sine(amplitude: float, hertz: float, load: float = 0.0) -> Callable[[Floats], tuple[Floats, Floats]]:
         return lambda t: (amplitude * np.sin(2.0 * np.pi * hertz * t), np.full_like(t, load))
@@ -91,9 +83,8 @@ def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Tr
     names = [f.name for f in h.fit.free]
     predicted = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
     own = search.problem.trace
-    xj, p12, xs = predicted
-    return replace(own, outputs=tuple(s for s in OUTPUTS if s in signals), xj=xj, p12=p12, xs=xs,
-                   usable=np.ones(len(own), bool))
+    return replace(own, outputs=tuple(s for s in OUTPUTS if s in signals), usable=np.ones(len(own), bool),
+                   **dict(zip(OUTPUTS, predicted, strict=True)))
 
 
 def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
@@ -111,8 +102,6 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
 
 def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:
     """What `wrong` leaves of what `truth` predicts, noise aside, -2 log likelihood."""
-    known = dict(zip(search.problem.trace.outputs, search.noise, strict=True))
-    noise: tuple[Noise, ...] = tuple(known.get(s) or search.sensors[s]
-                                     for s in seen.outputs)
-    problem: Problem = replace(search.problem, trace=seen, noise=noise, also=())
+    noise = search.sensors | dict(zip(search.problem.trace.outputs, search.noise, strict=True))
+    problem = replace(search.problem, trace=seen, noise=tuple(noise[s] for s in seen.outputs), also=())
     return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, rounds=3).misfit

@@ -46,9 +46,7 @@ class ModelUpdate:
     @property
     def floor(self) -> Mapping[str, float]:
         """Noise floor of each signal, SI; empty where nothing was ever fitted."""
-        if self.provenance.floor or self.refit is None:
-            return self.provenance.floor or {}
-        return self.refit.floor
+        return self.provenance.floor or {}
 
     def compute_intervals(self) -> dict[str, Value]:
         """95 % intervals of everything that was fitted, SI."""
@@ -301,35 +299,36 @@ def _with_intervals(lines: Iterable[str], intervals: Mapping[str, Value]) -> Ite
 
 def _format_provenance(p: Provenance) -> list[str]:
     """The lines of [provenance]."""
-    lines = ["[provenance]", f"software = {_quote_text(p.software)}", f"history = {_format_list(p.history)}",
-             f"effects = {_format_list(p.effects)}"]
-    lines += [f"effect_files = {_format_list(p.effect_files)}"] if p.effect_files else []
-    lines += [f"signals = {_format_list(p.signals)}"] if p.signals else []
-    for name, run in (("trace", p.trace), ("holdout", p.holdout)):
-        lines += [f"{name} = {_quote_text(run.file)}", f"{name}_sha256 = {_quote_text(run.sha256)}"] if run else []
-    lines += [f"repeats = {_format_list(r.file for r in p.repeats)}",
-              f"repeats_sha256 = {_format_list(r.sha256 for r in p.repeats)}"] if p.repeats else []
-    lines += [f"floor = {_format_inline_table(p.floor)}"] if p.floor else []
+    runs = {"trace": p.trace, "holdout": p.holdout}
+    said = {"software": p.software, "history": p.history, "effects": p.effects}
+    more = {"effect_files": p.effect_files, "signals": p.signals,
+            **{name + end: value for name, run in runs.items() if run
+               for end, value in (("", run.file), ("_sha256", run.sha256))},
+            "repeats": [r.file for r in p.repeats], "repeats_sha256": [r.sha256 for r in p.repeats], "floor": p.floor}
+    lines = ["[provenance]", *_format_values(said | {name: value for name, value in more.items() if value})]
     if p.before:
         lines += ["", "[provenance.before]", *(f"{_quote_text(name)} = {value!r}" for name, value in p.before.items())]
     if p.identification:
-        lines += ["", "[provenance.identification]"]
-        lines += [f"{name} = {_quote_text(x) if isinstance(x, str) else _format_list(x)}"
-                  for name, x in p.identification.items()]
+        lines += ["", "[provenance.identification]", *_format_values(p.identification)]
     for row in p.ledger:
-        lines += ["", "[[provenance.ledger]]", *([f"effect = {_quote_text(row.effect)}"] if row.effect else []),
-                  *(["removed = true"] if row.removed else []), f"error = {_format_inline_table(row.error)}",
-                  *([f"holdout = {_format_inline_table(row.holdout)}"] if row.holdout else [])]
+        known = {"effect": row.effect, "removed": row.removed, "error": row.error, "holdout": row.holdout}
+        lines += ["", "[[provenance.ledger]]",
+                  *_format_values({name: value for name, value in known.items() if value or name == "error"})]
     return lines
+
+
+def _format_values(values: Mapping[str, Any]) -> list[str]:
+    """Lines of TOML of a truth, texts, lists of texts, and tables of numbers."""
+    return [f"{name} = {_format_value(value)}" for name, value in values.items()]
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{name} = {float(f'{x:.6g}')!r}" for name, x in value.items()) + " }"
+    if isinstance(value, str):
+        return _quote_text(value)
+    return "true" if value is True else "[" + ", ".join(map(_quote_text, value)) + "]"
 
 
 def _quote_text(word: str) -> str:
     return json.dumps(word, ensure_ascii=False).replace("\x7f", "\\u007f")  # a JSON text is TOML but for this
-
-
-def _format_list(words: Iterable[str]) -> str:
-    return "[" + ", ".join(map(_quote_text, words)) + "]"
-
-
-def _format_inline_table(numbers: Mapping[str, float]) -> str:
-    return "{ " + ", ".join(f"{name} = {float(f'{x:.6g}')!r}" for name, x in numbers.items()) + " }"

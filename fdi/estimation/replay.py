@@ -348,18 +348,8 @@ def hold_inputs(trace: Trace, outputs: Sequence[str] | None = None, source: obje
     Raises:
         InputError: too few rows, no Com, XJ or Cor, or a chosen signal that was not measured.
     """
-    measured = [name for name in OUTPUTS if name in trace.signals]
-    chosen = measured if outputs is None else [name for name in OUTPUTS if name in outputs]
-    for name in chosen:
-        if name not in measured:
-            raise InputError(source, name, f"a measured signal (it has {', '.join(measured) or 'none'})")
-    for name in ("com", "xj", "cor"):
-        if name not in trace.signals:
-            raise InputError(source, name, "a measured column")
-    if len(trace) < FEWEST_ROWS:
-        raise InputError(source, "t", f"at least {FEWEST_ROWS} cycles, not {len(trace)}")
     return replace(trace, cor=hold_last(trace.cor), load=hold_last(trace.load), com=hold_last(trace.com),
-                   incomplete=_find_incomplete(trace), outputs=tuple(chosen))
+                   incomplete=_find_incomplete(trace), outputs=_choose_outputs(trace, outputs, source))
 
 
 def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:

@@ -181,7 +181,7 @@ def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Pa
 def test_a_trace_that_cannot_tell_is_refused_in_one_line() -> None:
     columns = {k: v[:50] for k, v in _recorded({}).__dict__.items() if k in ("com", "xj", "cor")}
     short = Trace.from_columns(columns, 1e-3, {})
-    with pytest.raises(InputError, match="at least 200 cycles"):
+    with pytest.raises(InputError, match="at least 200 rows"):
         hold_inputs(short)
     with pytest.raises(InputError, match="measured signal"):
         trace = _recorded({})
