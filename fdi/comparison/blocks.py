@@ -30,7 +30,6 @@ from fdi.thresholds import (
     FINEST_COMB,
     NOISY_SENSOR_RATIO,
     SHAPE_TIE_GAIN,
-    SPOOL_FITS_RATIO,
 )
 from fdi.trace.sensor_dynamics import find_comb, is_rounding_left, measure_resolution
 from fdi.trace.trace import Flags, Floats, Trace, bridge_gaps, hold_last, rms, shift_rows
@@ -56,16 +55,6 @@ class Balance(NamedTuple):
     gain: float  # by which the ram moves further than the flow says, as a fraction
     speed: Floats  # m/s, from the flow
     position: Floats  # m, as the flow adds it up
-
-
-class Split(NamedTuple):
-    """Flow against sensor: RMS of `way`, and how much of it each of them leaves unexplained, m."""
-
-    error: float
-    flow: float
-    sensor: float
-    both: float
-    winner: str  # "flow", "sensor", "either"
 
 
 def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
@@ -140,11 +129,12 @@ def _find_resolved(speed: Floats, period: float) -> Flags:
     return apart <= most_apart * float(np.median(apart)) / 0.6745
 
 
-def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, noisy: bool = False
-                          ) -> Split:
-    """How well an error of the flow and one of the sensor describe `b.way`; xs m, p12 Pa, (n,), as in the balance.
+def share_error(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float, is_noisy: bool
+                ) -> tuple[float, float]:
+    """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains.
 
-    `noisy`: the sensed position changes from sample to sample by more than its noise, as no flow can make it.
+    At fault is whichever error describes `b.way` better; xs m, p12 Pa, (n,), as in the balance. `is_noisy`: the sensed
+    position changes from sample to sample by more than its noise, as no flow can make it.
 
     The descriptions are least-squares fits of a few shapes of each kind. None of them is made of the sensed position,
     whose noise is in the residual itself.
@@ -161,13 +151,14 @@ def split_flow_and_sensor(trace: Trace, b: Balance, xs: Floats, p12: Floats, flo
         """Twice the log likelihood by which `one` describes worse than `other`."""
         return effective * math.log(max(one, 1e-3 * floor) ** 2 / max(other, 1e-3 * floor) ** 2)
 
+    whole = error / floor
     gain_suffices = measure_evidence(gain, both) < SHAPE_TIE_GAIN + len(columns)
-    tie = gain_suffices or abs(measure_evidence(rate, place)) < SHAPE_TIE_GAIN
-    if tie:
-        winner = "sensor" if noisy else "either"
-    else:
-        winner = "flow" if rate < place else "sensor"
-    return Split(error, rate, place, both, winner)
+    is_tie = gain_suffices or abs(measure_evidence(rate, place)) < SHAPE_TIE_GAIN
+    if whole**2 - 1.0 < BLOCK_EXCESS_LEAST or (is_tie and not is_noisy):
+        return whole, whole
+    if not is_tie and rate < place:
+        return whole, math.sqrt(1.0 + max(0.0, rate**2 - both**2) / floor**2)
+    return math.sqrt(1.0 + max(0.0, place**2 - both**2) / floor**2), whole
 
 
 def _measure_remainders(y: Floats, columns: list[Floats], first: int
@@ -208,32 +199,20 @@ def apply_play(x: Floats, width: float) -> Floats:
     return np.array(out)
 
 
-def share_error(found: Split, floor: float) -> tuple[float, float]:
-    """Ratios of flow and sensor to the floor, m: the one at fault carries all, the other what it alone explains."""
-    whole = found.error / floor
-    if whole**2 - 1.0 < BLOCK_EXCESS_LEAST:
-        return whole, whole
-    alone_flow = math.sqrt(1.0 + max(0.0, found.sensor**2 - found.both**2) / floor**2)
-    alone_sensor = math.sqrt(1.0 + max(0.0, found.flow**2 - found.both**2) / floor**2)
-    if found.winner == "either":
-        return whole, whole
-    return (whole, alone_sensor) if found.winner == "flow" else (alone_flow, whole)
-
-
 class Jack(NamedTuple):
-    """Ratios to their floors of the parts that flow and force decide."""
+    """Ratios to their floors of the parts that flow and force decide; None where they cannot be told."""
 
-    flow: float
-    force: float | None
-    sensor: float
-    gain: float  # by which the ram moves further than the flow says, as a fraction
+    flow: float | None = None
+    force: float | None = None
+    sensor: float | None = None
+    gain: float | None = None  # by which the ram moves further than the flow says, as a fraction
 
 
 def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, int, Columns]],
-               level: Mapping[str, float]) -> Jack | None:
+               level: Mapping[str, float]) -> Jack:
     """The jack and the sensor of a trace; repeats with their shift in rows, `run` and theirs the replays they go with.
 
-    None if too few rows hang together.
+    Nothing is told where too few rows hang together.
 
     The floor comes from the repeats, as everywhere; without them the noise `level` of each signal, SI, is put in once
     more, and what that changes is what noise does.
@@ -251,15 +230,15 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     known = {name: getattr(trace, name) if name in trace.outputs else run[name] for name in ("xs", "p12")}
     xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known.values())
     if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor.get("way", 0.0) > 0.0:
-        return None
-    noisy = ("xj" in level
-             and floor_from_data(trace.mask_unusable("xj")).value > NOISY_SENSOR_RATIO * level["xj"])
-    flow, sensor = share_error(split_flow_and_sensor(trace, b, xs, p12, floor["way"], noisy), floor["way"])
+        return Jack()
+    is_noisy = ("xj" in level
+                and floor_from_data(trace.mask_unusable("xj")).value > NOISY_SENSOR_RATIO * level["xj"])
+    flow, sensor = share_error(trace, b, xs, p12, floor["way"], is_noisy)
     flow = flow if "xs" in trace.outputs else max(flow, sensor)
     most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
     is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
-    told = is_enough and floor.get("force", 0.0) > 0.0
-    return Jack(flow, rms(b.force) / floor["force"] if told else None, sensor, b.gain)
+    is_told = is_enough and floor.get("force", 0.0) > 0.0
+    return Jack(flow, rms(b.force) / floor["force"] if is_told else None, sensor, b.gain)
 
 
 def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
@@ -267,23 +246,6 @@ def add_noise(trace: Trace, level: Mapping[str, float]) -> Trace:
     rng = np.random.default_rng(0)
     noisy = {name: trace.column(name) + size * rng.standard_normal(len(trace)) for name, size in level.items()}
     return replace(trace, **noisy)  # type: ignore[arg-type]
-
-
-def collect_block_ratios(signal: Mapping[str, float], flow: float | None, force: float | None, sensor: float | None,
-                         controller: float | None, spool: bool = True) -> dict[str, float | None]:
-    """The ratio of each block, None where nothing measured can tell; `signal` holds the ratios of the open replay.
-
-    Where the spool is as the model says, an error of P12 in the replay is the jack's too: it sees standstill and
-    reversals, which the balance of forces leaves out. Without a measured spool the servovalve is judged with its
-    metering edges, as current to flow, and the jack by its forces alone; a sensor cannot be told from a valve then.
-    """
-    if not spool:
-        return {"controller": controller, "servovalve": flow, "jack": force, "sensor": None}
-    parts = [x for x in (flow, force) if x is not None]
-    if parts and "p12" in signal and signal.get("xs", math.inf) < SPOOL_FITS_RATIO:
-        parts.append(signal["p12"])
-    return {"controller": controller, "servovalve": signal.get("xs"), "jack": max(parts) if parts else None,
-            "sensor": sensor}
 
 
 class ControllerBlock(NamedTuple):

@@ -53,10 +53,11 @@ from fdi.thresholds import (
     SECTION_ERROR_SD,
     SIGNAL_ERROR_RATIO,
     SOLVER_HIDES_RATIO,
+    SPOOL_FITS_RATIO,
     UNDECIDED_SHARE,
 )
 from fdi.trace.signals import SIGNALS
-from fdi.trace.trace import Flags, Floats, Trace, rms
+from fdi.trace.trace import Floats, Trace, rms
 from plant.model import Model
 
 BALANCED = "eha"  # the plant whose metering edges and ram the balances of `plant.forced` are
@@ -129,8 +130,11 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("repeats", 2 / STAGES)
     runs = [(other, replay_current(other.trace, model, replay.steps)) for other in others]
     theirs = [align_columns(compute_residuals(other.trace, run), other.late, len(trace)) for other, run in runs]
-    floor = _widen_by_guess(noise, replay) | find_floors(replay.residual, theirs, trace.period)
-    judged = {name: np.where(_find_undecided(replay), np.nan, r) for name, r in replay.residual.items()}
+    # without repeats, the floor holds what a current that was not recorded leaves open
+    widened = {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
+    floor = widened | find_floors(replay.residual, theirs, trace.period)
+    left_out = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
+    judged = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
     closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
     table = {name: _measure_signal(name, r, floor[name], noise[name], closed[name], replay)
@@ -155,27 +159,12 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
                        *_list_notes(floor, replay, trace)))
 
 
-def _widen_by_guess(noise: Mapping[str, Floor], replay: Replay) -> dict[str, Floor]:
-    """The floor with what a current that was not recorded leaves open."""
-    return {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
-
-
-def _find_undecided(replay: Replay) -> Flags:
-    """Rows that hang on a knife's edge, unless that is half the trace."""
-    out: Flags = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
-    return out
-
-
 def _measure_signal(name: str, residual: Floats, floor: Floor, noise: Floor, closed: Floats,
                     replay: Replay) -> SignalError:
-    limit = SIGNAL_ERROR_RATIO + 3 * _ratio_spread(floor, int((~np.isnan(residual)).sum()))
+    samples = int((~np.isnan(residual)).sum())
+    ratio_spread = 1.0 / math.sqrt(max(1.0, samples * floor.freedom))  # of two RMS values of so many samples each
     return SignalError(name, SIGNALS[name].unit, rms(residual), floor, noise.value, rms(closed),
-                       replay.solver_error[name], limit)
-
-
-def _ratio_spread(floor: Floor, samples: int) -> float:
-    """Standard deviation of a ratio of two RMS values of so many samples each."""
-    return 1.0 / math.sqrt(max(1.0, samples * floor.freedom))
+                       replay.solver_error[name], SIGNAL_ERROR_RATIO + 3 * ratio_spread)
 
 
 def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace, ControllerBlock]:
@@ -205,26 +194,34 @@ def _describe_cycles(n: int) -> str:
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Repeat, Columns]],
                   table: Mapping[str, SignalError], found: ControllerBlock,
                   noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
-    """Ratios of the blocks, and the parts of the jack's."""
+    """Ratios of the blocks, None where nothing measured can tell, and the parts of the jack's.
+
+    Where the spool is as the model says, an error of P12 in the replay is the jack's too: it sees standstill and
+    reversals, which the balance of forces leaves out. Without a measured spool the servovalve is judged with its
+    metering edges, as current to flow, and the jack by its forces alone; a sensor cannot be told from a valve then.
+    """
     signal = {name: s.ratio for name, s in table.items()}
     pairs = [(other.trace, other.late, theirs) for other, theirs in repeats]
     level = {"xj": simulate_reading_noise(model, trace.xj)} | {name: f.value for name, f in noise.items()}
-    told = model.plant == BALANCED and {"p12", "xs"} & set(trace.outputs)
+    j = blocks.Jack()
     # the balances of flow and force take the measured signals as the true ones
-    j = blocks.judge_jack(trace, model, run, pairs, level) if told and not trace.filtered else None
-    answered = found.ratio if model.kind.controller else None
-    if j is None:
-        ratios = blocks.collect_block_ratios(signal, None, None, None, answered)
-        return ratios, {"flow": None, "force": None, "gain": None}
-    ratios = blocks.collect_block_ratios(signal, j.flow, j.force, j.sensor, answered, "xs" in trace.outputs)
-    return ratios, {"flow": j.flow, "force": j.force, "gain": j.gain}
+    if model.plant == BALANCED and {"p12", "xs"} & set(trace.outputs) and not trace.filtered:
+        j = blocks.judge_jack(trace, model, run, pairs, level)
+    parts = {"flow": j.flow, "force": j.force, "gain": j.gain}
+    ratios = {"controller": found.ratio if model.kind.controller else None, "servovalve": j.flow, "jack": j.force,
+              "sensor": None}
+    if "xs" in trace.outputs:
+        known = [x for x in (j.flow, j.force) if x is not None]
+        if known and "p12" in signal and signal["xs"] < SPOOL_FITS_RATIO:
+            known.append(signal["p12"])
+        ratios |= {"servovalve": signal["xs"], "jack": max(known, default=None), "sensor": j.sensor}
+    return ratios, parts
 
 
 def _list_blocks_above(ratios: Mapping[str, float | None]) -> tuple[str, ...]:
-    def limit(name: str) -> float:
-        return CONTROLLER_ERROR_RATIO if name == "controller" else BLOCK_ERROR_RATIO
-
-    over = [(ratio, name) for name, ratio in ratios.items() if ratio is not None and ratio > limit(name)]
+    limits = {"controller": CONTROLLER_ERROR_RATIO}
+    over = [(ratio, name) for name, ratio in ratios.items()
+            if ratio is not None and ratio > limits.get(name, BLOCK_ERROR_RATIO)]
     return tuple(name for _, name in sorted(over, reverse=True))
 
 
@@ -237,11 +234,8 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
     above = [s for s in table.values() if s.ratio > s.limit]
     least = min((s.floor.freedom for s in table.values()), default=1.0)
 
-    def is_above(p: Place) -> bool:
-        samples = max(1.0, 2 * least * (p.t1 - p.t0) / period)
-        return p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(samples)
-
-    local = [p for p in sections if is_above(p)]
+    local = [p for p in sections if p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(
+        max(1.0, 2 * least * (p.t1 - p.t0) / period))]
     if not (above or local or _list_blocks_above(ratios)):
         apart = _list_signals_apart({name: s.floor for name, s in table.items()})
         if apart and not doubtful:

@@ -70,8 +70,7 @@ def describe_motion(trace: Trace, model: Columns) -> Motion:
     size = max(5, round(SMOOTH / trace.period) | 1)
     v = differentiate(x, size, 1) / trace.period
     a = differentiate(x, 2 * size + 1, 2) / trace.period**2
-    sign = np.where(np.abs(v) > REVERSES, np.sign(v), np.nan)
-    sign = hold_last(sign)
+    sign = hold_last(np.where(np.abs(v) > REVERSES, np.sign(v), np.nan))
     turns = np.flatnonzero((np.diff(sign) != 0.0) & (sign[:-1] != 0.0)) + 1
     last = np.full(len(x), -(10**9))
     last[turns] = turns
@@ -83,12 +82,10 @@ def describe_motion(trace: Trace, model: Columns) -> Motion:
 def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
     """Squared error over squared floor, mean of the signals, (n,); 1 on average where only noise is left."""
     parts = [(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0]
-    with np.errstate(invalid="ignore"):
-        stack = np.array(parts)
-        there = ~np.isnan(stack)
-        total = np.where(there, stack, 0.0).sum(axis=0)
-        out: Floats = np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)
-    return out
+    stack = np.array(parts)
+    there = ~np.isnan(stack)
+    total = np.where(there, stack, 0.0).sum(axis=0)
+    return np.where(there.any(axis=0), total / np.maximum(there.sum(axis=0), 1), np.nan)
 
 
 def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
@@ -132,20 +129,20 @@ def find_condition(z2: Floats, m: Motion, limit: float) -> str:
 
 def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
     speed, far, hard = np.abs(m.v), np.abs(m.x), np.abs(m.a)
-    out = [(f"ram faster than {_format_speed(s)}", speed > s) for s in SPEEDS]
-    out += [(f"ram slower than {_format_speed(s)}", speed < s) for s in SPEEDS[:4]]
-    out += [(f"ram further than {1e3 * x:g} mm from the middle", far > x) for x in PLACES]
-    out += [(f"within {1e3 * x:g} mm of the middle", far < x) for x in PLACES[:3]]
-    out += [(f"ram accelerates by more than {a:g} m/s2", hard > a) for a in RATES]
-    out += [(f"within {1e3 * d:g} ms after a reversal", m.reversed_for < d) for d in DELAYS]
-    out += [("ram extends", m.v > REVERSES), ("ram retracts", m.v < -REVERSES)]
-    out += [("XJ positive", m.x > PLACES[0]), ("XJ negative", m.x < -PLACES[0])]
-    out.append(("current at its limit", np.abs(m.cor) > 0.99 * limit))
-    out += [(f"|P12| above {1e-5 * p:g} bar", np.abs(m.p12) > p) for p in PRESSURES]
-    out += [("P12 positive", m.p12 > PRESSURES[0]), ("P12 negative", m.p12 < -PRESSURES[0])]
-    out += [(f"spool within {1e6 * x:g} um of its null", np.abs(m.xs) < x) for x in OPENINGS]
-    out += [(f"spool more than {1e6 * x:g} um from its null", np.abs(m.xs) > x) for x in OPENINGS]
-    return out
+    return [
+        *((f"ram faster than {_format_speed(s)}", speed > s) for s in SPEEDS),
+        *((f"ram slower than {_format_speed(s)}", speed < s) for s in SPEEDS[:4]),
+        *((f"ram further than {1e3 * x:g} mm from the middle", far > x) for x in PLACES),
+        *((f"within {1e3 * x:g} mm of the middle", far < x) for x in PLACES[:3]),
+        *((f"ram accelerates by more than {a:g} m/s2", hard > a) for a in RATES),
+        *((f"within {1e3 * d:g} ms after a reversal", m.reversed_for < d) for d in DELAYS),
+        ("ram extends", m.v > REVERSES), ("ram retracts", m.v < -REVERSES),
+        ("XJ positive", m.x > PLACES[0]), ("XJ negative", m.x < -PLACES[0]),
+        ("current at its limit", np.abs(m.cor) > 0.99 * limit),
+        *((f"|P12| above {1e-5 * p:g} bar", np.abs(m.p12) > p) for p in PRESSURES),
+        ("P12 positive", m.p12 > PRESSURES[0]), ("P12 negative", m.p12 < -PRESSURES[0]),
+        *((f"spool within {1e6 * x:g} um of its null", np.abs(m.xs) < x) for x in OPENINGS),
+        *((f"spool more than {1e6 * x:g} um from its null", np.abs(m.xs) > x) for x in OPENINGS)]
 
 
 def _format_speed(s: float) -> str:
@@ -377,7 +374,8 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
         floor: noise floor of each signal, > 0, in the unit of its residual.
         fewest: rows that a cell needs.
     """
-    position = _fill(trace.xj)
+    known = np.flatnonzero(~np.isnan(trace.xj))
+    position = np.interp(np.arange(len(trace)), known, trace.xj[known])
     speed = np.abs(position[np.minimum(np.arange(len(position)) + 10, len(position) - 1)]
                    - position[np.maximum(np.arange(len(position)) - 10, 0)]) / (20 * trace.period)
     width = 2 * round(0.25 / trace.period) + 1
@@ -391,17 +389,12 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
         return None
     ratio = {}
     for name, r in residual.items():
-        known = ~np.isnan(r)
-        count = np.bincount(cells[known], minlength=size).reshape(shape)
-        square = np.bincount(cells[known], r[known] ** 2, minlength=size).reshape(shape)
+        there = ~np.isnan(r)
+        count = np.bincount(cells[there], minlength=size).reshape(shape)
+        square = np.bincount(cells[there], r[there] ** 2, minlength=size).reshape(shape)
         ratio[name] = np.where(enough & (count > 0), np.sqrt(square / np.maximum(count, 1)) / floor[name], np.nan)
     down, across = (slice(np.flatnonzero(enough.any(axis))[0], np.flatnonzero(enough.any(axis))[-1] + 1)
                     for axis in (1, 0))
     return DeviationMap(np.array(CELL_SPEEDS[across.start:across.stop + 1]),
                         np.array(AMPLITUDES[down.start:down.stop + 1]),
                         {name: r[down, across] for name, r in ratio.items()}, rows[down, across])
-
-
-def _fill(position: Floats) -> Floats:
-    known = np.flatnonzero(~np.isnan(position))
-    return np.interp(np.arange(len(position)), known, position[known])

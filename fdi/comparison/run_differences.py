@@ -304,11 +304,8 @@ def match_checks(checks_of_runs: Sequence[Sequence[Check]]) -> list[MatchedCheck
     tables = [_number_checks(checks) for checks in checks_of_runs]
     keys = dict.fromkeys(key for table in tables for key in table)
     return [MatchedCheck(key[0], tuple(table.get(key) for table in tables),
-                         len({_judge(table.get(key)) for table in tables if table}) > 1) for key in keys]
-
-
-def _judge(check: Check | None) -> bool | None:
-    return None if check is None else check.passed
+                         len({table[key].passed if key in table else None
+                              for table in tables if table}) > 1) for key in keys]
 
 
 def _number_checks(checks: Sequence[Check]) -> dict[tuple[str, int], Check]:
