@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.estimation.noise import find_floors, floor_from_data
-from fdi.estimation.replay import BRIDGED_ROWS, Columns, align_columns, differentiate
+from fdi.estimation.replay import BRIDGED_ROWS, Columns, align_columns, differentiate, extend_flags
 from fdi.thresholds import (
     BLOCK_EXCESS_LEAST,
     CONTROLLER_ERROR_RATIO,
@@ -72,7 +72,7 @@ def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
     sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
     lag = count_span_rows(trace.period)
     way = difference_over(trace.xj - sensed, lag)
-    way[_flag_within(bad, lag)] = np.nan
+    way[extend_flags(bad, lag)] = np.nan
     dx = difference_over(xj, lag)
     there = ~np.isnan(way) & ~np.isnan(dx)
     power = float(np.sum(dx[there] ** 2))
@@ -98,11 +98,6 @@ def difference_over(x: Floats, rows: int) -> Floats:
     return out
 
 
-def _flag_within(bad: Flags, rows: int) -> Flags:
-    total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(bad)])
-    return total[rows + 1:] > total[:-rows - 1]
-
-
 def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats, speed: Floats) -> Floats:
     takes, _, dynamic = compute_force_balance(model, xj, speed, p12, trace.load)
     size = max(1, round(MEAN / trace.period)) | 1
@@ -112,10 +107,10 @@ def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats,
     seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
     direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
     direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
-    turned = _flag_within(np.diff(direction, prepend=direction[0]) != 0.0, size)
+    turned = extend_flags(np.diff(direction, prepend=direction[0]) != 0.0, size)
     turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
     pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > OWN["force"] * model["jack.area"]
-    turned |= _flag_within(pushed, size)  # a step of the known load: the speed changes within a sample
+    turned |= extend_flags(pushed, size)  # a step of the known load: the speed changes within a sample
     out: Floats = p12 - (takes + direction * dynamic) / model["jack.area"]
     return np.where((direction == 0.0) | turned, np.nan, out)
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.special import kolmogi, ndtri
 
-from fdi.estimation.noise import solve_yule_walker
 from fdi.estimation.replay import Columns, differentiate
 from fdi.thresholds import CONDITION_DENSITY, CONDITION_EXCESS_LEAST, CONDITION_SHARE, RESIDUAL_TEST_CONFIDENCE
 from fdi.trace.sections import describe_section, find_sections
@@ -215,7 +214,9 @@ def fit_whitener(x: Floats) -> Floats:
     whitening_order = 40  # of the filter that makes noise white: two periods of 50 Hz hum at 1 kHz
     covariance = correlate(x, x, 0, whitening_order) / len(x)
     covariance[0] *= 1 + 1e-9  # a pure sine has no inverse
-    weights = solve_yule_walker(covariance, by_elimination=True)
+    lags = np.arange(whitening_order)
+    # by elimination: Levinson's recursion loses digits where the equations are nearly singular, as for a sine
+    weights = np.linalg.solve(covariance[np.abs(lags[:, None] - lags)], covariance[1:])
     return np.concatenate([WHITE, -weights])
 
 

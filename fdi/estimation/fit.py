@@ -66,8 +66,7 @@ def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
         k = int(np.argmin(costs))
         gained = now.cost - float(costs[k])
         if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
-            final = _move_fit(problem, now, trials[k]) if gained > 0.0 else now
-            return replace(final, converged=True)
+            return replace(replay_fit(problem, now, trials[k]) if gained > 0.0 else now, converged=True)
         now = linearise(problem, now.free, trials[k], _choose_widths(now.free, hessian))
     return now
 
@@ -87,13 +86,13 @@ def linearise(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | 
     return Fit(free, x, held + float(x**2 @ _prior_weights(free)), held, covariance, residuals[0], white[0], jacobian)
 
 
-def _move_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
-    """The fit at `x`, close enough to keep its Jacobian."""
+def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
+    """The fit at `x` (p,) with what `problem` leaves there; its Jacobian and covariance stay as they are."""
     residuals = problem.compute_residuals(fit.free, x[None])
     white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white)[0])
-    return Fit(fit.free, x, held + float(x**2 @ _prior_weights(fit.free)), held, fit.covariance, residuals[0], white[0],
-               fit.jacobian)
+    return replace(fit, x=x, cost=held + float(x**2 @ _prior_weights(fit.free)), misfit=held, residuals=residuals[0],
+                   white=white[0])
 
 
 def _prior_weights(free: Sequence[Free]) -> Floats:

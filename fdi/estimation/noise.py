@@ -203,21 +203,13 @@ def find_hum_lines(runs: Sequence[Floats], period: float) -> list[tuple[float, f
     power = np.zeros(grid.shape)
     fewest_hum_windows = 10  # fewer give no spectrum to compare lines in
     for r in runs:
-        loud = _measure_loudness(r)
+        loud = np.mean(_cut_windows(r, WINDOW) ** 2, axis=1)
         if np.isfinite(loud).sum() < fewest_hum_windows or not grid.size:
             return []
         rows = loud <= np.nanquantile(loud, 0.5)
         power += np.abs(_fit_phasors(r, rows, grid.ravel(), period).reshape(grid.shape)) ** 2 / 2.0 / len(runs)
     line, beside = power[:, 0], power[:, 1:].mean(axis=1)
     return [(f, float(a - b)) for f, a, b in zip(mains, line, beside, strict=True) if a > HUM_LINE_RATIO * b > 0.0]
-
-
-def _measure_loudness(x: Floats) -> Floats:
-    pieces = _cut_windows(x, WINDOW)
-    if not len(pieces):
-        return np.empty(0)
-    out: Floats = np.mean(pieces**2, axis=1)
-    return out
 
 
 def _fit_phasors(x: Floats, rows: Flags, frequencies: Floats, period: float) -> NDArray[np.complex128]:
@@ -286,26 +278,13 @@ def add_rounding(noise: Noise, step: float) -> Noise:
 
 def measure_level(difference: Floats, block: int = WINDOW) -> float:
     """Standard deviation of noise, (n,), in which now and then something else happens: the median block's."""
-    n = len(difference) // block * block
-    if n == 0:
+    blocks = _cut_windows(difference, block)
+    if not len(blocks):
         return float(np.nanstd(difference))
-    blocks = difference[:n].reshape(-1, block)
     with np.errstate(invalid="ignore"):
         variance = np.nanmean(blocks**2, axis=1)
     mean_over_median = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
     return float(np.sqrt(np.nanmedian(variance) * mean_over_median))
-
-
-def solve_yule_walker(covariance: Floats, by_elimination: bool = False) -> Floats:
-    """Coefficients (p,) of the autoregressive model that has an autocovariance (p + 1,) at lags 0..p.
-
-    Levinson's recursion is fast, but loses digits where the equations are nearly singular: the autocovariance of a
-    sine, as a command may be, is solved `by_elimination`.
-    """
-    if by_elimination:
-        lags = np.arange(len(covariance) - 1)
-        return np.asarray(np.linalg.solve(covariance[np.abs(lags[:, None] - lags)], covariance[1:]), np.float64)
-    return np.asarray(solve_toeplitz(covariance[:-1], covariance[1:]), np.float64)
 
 
 def fit_noise(residual: Floats, order: int = 40) -> Noise:
@@ -323,7 +302,7 @@ def fit_noise(residual: Floats, order: int = 40) -> Noise:
     covariance *= sigma**2 / covariance[0]
     best, cost = white_noise(float(np.sqrt(covariance[0]))), 0.0
     for p in range(1, order + 1):
-        a = solve_yule_walker(covariance[:p + 1])
+        a = solve_toeplitz(covariance[:p], covariance[1:p + 1])  # the equations of Yule and Walker
         variance = covariance[0] - a @ covariance[1:p + 1]
         gain = n * np.log(covariance[0] / variance) - NOISE_COEFFICIENT_GAIN * p
         if gain > cost:

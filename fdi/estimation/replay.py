@@ -109,8 +109,9 @@ def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, fl
 def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str, float]
                                  ) -> tuple[Columns, Flags, dict[str, float]]:
     """The replay, the rows that hang on a knife's edge, and by how much a guessed current moves it elsewhere, RMS."""
-    values = vary_frictions(model)
-    lanes = Lanes(model.replace(WITHOUT_NOISE), list_frictions(model), REPLAY_STEPS)
+    names = [name for name in FRICTIONS if name in model.values]
+    values = vary_frictions(names, model.values)
+    lanes = Lanes(model.replace(WITHOUT_NOISE), names, REPLAY_STEPS)
     position = trace.unlagged_position if has_known_start(trace) else None
     turns = [replay_in_turns(lanes, values, trace, position, ANCHOR_RATE)]
     turns += [replay_in_turns(lanes, values[:1], replace(trace, cor=current), position, ANCHOR_RATE)
@@ -169,18 +170,11 @@ def compute_residuals(trace: Trace, model: Columns) -> Columns:
     return {name: trace.mask_unusable(name) - model[name] for name in trace.outputs}
 
 
-def list_frictions(model: Model) -> tuple[str, ...]:
-    """The friction levels that the model's plant has."""
-    return tuple(name for name in FRICTIONS if name in model.values)
-
-
-def vary_frictions(model: Model) -> Floats:
-    """(m, frictions) values: the model's, and each level a little higher and lower; dynamic stays below static."""
-    names = list_frictions(model)
-    base = np.array([model[name] for name in names])
-    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))
-    values = np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)])
-    return limit_dynamic_friction(names, values)
+def vary_frictions(names: Sequence[str], values: Mapping[str, float]) -> Floats:
+    """Rows (m, p) of the named parameters: as they are, and with each friction level a little higher and lower."""
+    base = np.array([values[name] for name in names])
+    shifts = FRICTION_UNCERTAINTY * np.eye(len(names))[[name in FRICTIONS for name in names]]
+    return limit_dynamic_friction(names, np.concatenate([base[None], base * (1 + shifts), base * (1 - shifts)]))
 
 
 def find_large_windows(moved: Floats, floor: float, window: int = WINDOW) -> Flags:
@@ -204,17 +198,9 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
         fit: the values to replay.
         floor: of each signal, SI; smaller changes do not count.
     """
-    frictions = list_frictions(problem.model)
-    names = [f.name for f in fit.free]
-    names += [name for name in frictions if name not in names]
     values = {**problem.model.values, **fit.values}
-    base = np.array([values[name] for name in names])
-    moved = [base.copy() for _ in range(2 * len(frictions))]
-    for k, name in enumerate(frictions):
-        at = names.index(name)
-        moved[2 * k][at] *= 1.0 + FRICTION_UNCERTAINTY
-        moved[2 * k + 1][at] *= 1.0 - FRICTION_UNCERTAINTY
-    runs = problem.predict_outputs(names, limit_dynamic_friction(names, np.array([base, *moved])))
+    names = list(dict.fromkeys([*(f.name for f in fit.free), *(name for name in FRICTIONS if name in values)]))
+    runs = problem.predict_outputs(names, vary_frictions(names, values))
     changes = np.abs(runs[1:] - runs[0])
     undecided = np.zeros(runs.shape[2], bool)
     for i, signal in enumerate(problem.trace.outputs):
@@ -294,20 +280,14 @@ def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatt
         best = int(np.argmin(costs + (tried**2).sum(axis=1)))
         x, now = tried[best], found[best]
     if whole is not trace:
-        trace, now = whole, _replay_scaled(lanes, limit_dynamic_friction(list(known), base + x * size), whole, scale)
+        trace = whole
+        now = compute_scaled_residuals(x[None])[0]
     rows = now.reshape(len(scale), -1)
     ratio = {name: rms(np.where(np.isnan(y), np.nan, r))
              for name, r, y in zip(trace.outputs, rows, trace.measurements, strict=True)}
     error = {name: ratio[name] * floor[name] for name in ratio}
     moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
     return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)
-
-
-def _replay_scaled(lanes: Lanes, values: Floats, trace: Trace, scale: Floats) -> Floats:
-    """Residuals (signals, n) of one run in floors."""
-    out = replay_lanes(lanes, values[None], trace)[0].T[trace.output_columns]
-    left: Floats = np.nan_to_num((trace.measurements - out) / scale)
-    return left
 
 
 FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
@@ -503,7 +483,7 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
     missing = np.isnan(rows.cor)
     change = np.abs(hold_next(rows.cor) - hold_last(rows.cor))
     unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.cor)))
-    usable = rows.usable & ~_extend_flags(unknown, round(recovery / rows.period))
+    usable = rows.usable & ~extend_flags(unknown, round(recovery / rows.period))
     notes = []
     lost = int(np.isnan(trace.cor).sum())
     if lost:
@@ -534,12 +514,10 @@ def _fill_demand(com: Floats, step: float = 2e-4) -> Floats:
     return np.where(missing & (np.abs(behind - before) > step), before, line)
 
 
-def _extend_flags(flagged: Flags, rows: int) -> Flags:
+def extend_flags(flagged: Flags, rows: int) -> Flags:
     """The flagged rows, and so many after each."""
-    edges = np.cumsum(flagged)
-    before = np.concatenate([np.zeros(min(rows, len(edges)), int), edges[:-rows]]) if rows else edges
-    out: Flags = (edges - before) > 0
-    return out | flagged
+    total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(flagged)])
+    return total[rows + 1:] > total[:-rows - 1]
 
 
 def _find_frozen(x: Floats, mover: Floats, longest: int = 200, moved: float = 1e-3, jump: float = 5.0) -> Flags:

@@ -9,14 +9,14 @@ where a trial replay confirms it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, step_within_bounds
+from fdi.estimation.fit import DAMPINGS, Fit, cut_at_bounds, replay_fit, step_within_bounds
 from fdi.estimation.likelihood import (
     Free,
     Problem,
@@ -135,7 +135,8 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
         return [], np.empty((len(x), 0))
     low, high = scaled_bounds(free)
     names = {f.name for f in free}
-    every = [each for each in _list_directions_at(problem, free, x) if next(iter(each.powers)) in names]
+    at = {**problem.model.values, **problem.list_values(free, x)}
+    every = [each for each in list_directions(problem, at) if next(iter(each.powers)) in names]
     if not every:
         return [], np.empty((len(x), 0))
     trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in every]
@@ -147,10 +148,6 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
     ways = _list_tangents(free, x, held)
     apart = _find_independent(ways)
     return [held[k] for k in apart], ways[apart].T
-
-
-def _list_directions_at(problem: Problem, free: Sequence[Free], x: Floats) -> list[Direction]:
-    return list_directions(problem, {**problem.model.values, **problem.list_values(free, x)})
 
 
 def _list_tangents(free: Sequence[Free], x: Floats, directions: Sequence[Direction]) -> Floats:
@@ -211,13 +208,8 @@ def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> 
                 break
         else:
             break
-    residuals = problem.compute_residuals(free, x[None])
-    white = problem.whiten_residuals(residuals)
-    held = float(compute_misfit(white)[0])
-    cost = held + float(x**2 @ prior)
-    if cost >= found.cost:
-        return found
-    return replace(found, x=x, cost=cost, misfit=held, residuals=residuals[0], white=white[0])
+    moved = replay_fit(problem, found, x)
+    return moved if moved.cost < found.cost else found
 
 
 def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
@@ -381,26 +373,23 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     slopes = slopes or problem
     now = relax_fit(problem, fit, find_tangents(slopes, fit.free, fit.x)[0])
     if now is fit:  # its residuals may be those of other steps, another noise or another place
-        now = replay_fit(problem, fit)
+        now = replay_fit(problem, fit, fit.x)
     _, flat = find_tangents(slopes, now.free, now.x)
-    idle = 0
-    for _ in range(rounds):
-        here = linearise_along(problem, now, slopes, flat)
-        there = take_best_step(problem, here)
-        idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
-        now = there
-        stage.finish_step()
-        if idle >= PATIENCE:
-            break
+    now = take_steps(problem, now, lambda fit: linearise_along(problem, fit, slopes, flat), rounds, stage)
     return replace(relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0]), converged=True)
 
 
-def replay_fit(problem: Problem, fit: Fit) -> Fit:
-    """The fit with the residuals, the misfit and the cost that `problem` has at its unknowns."""
-    residuals = problem.compute_residuals(fit.free, fit.x[None])
-    white = problem.whiten_residuals(residuals)
-    held = float(compute_misfit(white)[0])
-    return replace(fit, cost=_add_prior(fit, held), misfit=held, residuals=residuals[0], white=white[0])
+def take_steps(problem: Problem, now: Fit, linearise: Callable[[Fit], Fit], rounds: int, stage: Stage) -> Fit:
+    """A fit after so many rounds of damped Gauss-Newton steps, fewer if `PATIENCE` of them gain nothing."""
+    idle = 0
+    for _ in range(rounds):
+        here = linearise(now)
+        now = take_best_step(problem, here)
+        idle = idle + 1 if here.cost - now.cost < CONVERGED_GAIN else 0
+        stage.finish_step()
+        if idle >= PATIENCE:
+            break
+    return now
 
 
 def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -> Fit:
@@ -454,20 +443,14 @@ def take_best_step(problem: Problem, fit: Fit) -> Fit:
 
 
 def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE) -> Fit:
-    """A fit after so many rounds of damped Gauss-Newton steps, fewer if some of them gain nothing.
+    """A fit after so many rounds of steps across the valley, then moved along it to where the priors want it.
 
     `flat` (p, k) are the directions that the data do not see. `stage` takes a step with each round.
     """
-    now, idle = begun, 0
-    for _ in range(rounds):
-        here = linearise_across(problem, now.free, now.x, now.covariance, flat)
-        there = take_best_step(problem, here)
-        idle = idle + 1 if here.cost - there.cost < CONVERGED_GAIN else 0
-        now = replace(there, covariance=here.covariance)
-        stage.finish_step()
-        if idle >= PATIENCE:
-            break
-    return replace(relax_along(now, flat), converged=True)
+    def linearise(fit: Fit) -> Fit:
+        return linearise_across(problem, fit.free, fit.x, fit.covariance, flat)
+
+    return replace(relax_along(take_steps(problem, begun, linearise, rounds, stage), flat), converged=True)
 
 
 def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covariance: Floats, flat: Floats) -> Fit:
