@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from fdi.estimation.fit import Fit, fit_unknowns
-from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds
+from fdi.estimation.likelihood import Problem, compute_misfit, compute_weights, scaled_bounds, weigh_priors
 from fdi.estimation.unidentifiable import VISCOSITY, list_powers, scale_together
 from fdi.thresholds import GAIN_DETECTED
 from fdi.trace.trace import Floats
@@ -103,7 +103,7 @@ class VirtualTest:
         self.simulated = replace(self.problem, steps=SIMULATED_STEPS, _lanes={})
         self.fit, self.names = fit, [f.name for f in fit.free]
         self.slope = fit.jacobian[:, :, :len(problem.trace)]
-        self.prior = np.array([f.prior**-2 for f in fit.free])
+        self.prior = weigh_priors(fit.free)
         self.bounds = scaled_bounds(fit.free)
 
     def measure_gains(self, ways: Sequence[Direction], sizes: Sequence[float]) -> list[float]:

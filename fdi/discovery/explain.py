@@ -400,7 +400,12 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
     if comb and not is_recorder and "quantisation" not in model.effects:
         sizes = {"quantisation.lsb": (step, step - comb.doubt, step + comb.doubt)}
         prints.append(Fingerprint("quantisation", sizes, step / FINEST_COMB, 0.0))
-    error, firmware = find_firmware_marks(model, traces, resolution)
+    error, firmware = 0.0, list[Fingerprint]()
+    if model.kind.controller:
+        error = _measure_rms(model, traces) / resolution
+        tried = [_fit_size(model, traces, name, error, resolution) for name, e in CATALOGUE.items()
+                 if e.firmware and name not in model.effects and len(e.fitted) == 1 and error > FIRMWARE_DIFFERS]
+        firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
     return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]))
 
 
@@ -417,26 +422,8 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 
 def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
     """Cor of the model's controller on the measured com and XJ, minus the measured Cor: (n,) A, NaN where missing."""
-    firmware = tuple(e for e in model.effects if CATALOGUE[e].firmware)
-    own = replace(model, effects=firmware)
-    measured: Floats = np.where(trace.incomplete, np.nan, trace.cor)
-    return compute_answers(own, trace.com, hold_last(trace.position)) - measured
-
-
-def find_firmware_marks(model: Model, traces: Sequence[Trace], unit: float) -> tuple[float, list[Fingerprint]]:
-    """RMS of Cor against the model's firmware over `unit` A, and the firmware effects that explain it, best first.
-
-    Of a plant whose controller is not known, neither.
-    """
-    if not model.kind.controller:
-        return 0.0, []
-    before = _measure_rms(model, traces) / unit
-    found = []
-    if before > FIRMWARE_DIFFERS:
-        for name, entry in CATALOGUE.items():
-            if entry.firmware and name not in model.effects and len(entry.fitted) == 1:
-                found.append(_fit_size(model, traces, name, before, unit))
-    return before, sorted((f for f in found if f.after < 0.7 * before), key=lambda f: f.after)
+    own = replace(model, effects=tuple(e for e in model.effects if CATALOGUE[e].firmware))
+    return compute_answers(own, trace.com, hold_last(trace.position)) - np.where(trace.incomplete, np.nan, trace.cor)
 
 
 def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
@@ -450,13 +437,9 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, u
     usual = [abs(s[parameter]) for s in entry.starts]
     low, high = np.log(min(usual) / 10.0), np.log(max(usual) * 10.0)
     ready = model.with_effects([name])
-
-    def measure_error(size: float) -> float:
-        return _measure_rms(ready.replace({parameter: float(np.exp(size))}), traces) / unit
-
     for _ in range(6):  # each time closer around the best size
         sizes = np.linspace(low, high, SIZES)
-        errors = [measure_error(s) for s in sizes]
+        errors = [_measure_rms(ready.replace({parameter: float(np.exp(s))}), traces) / unit for s in sizes]
         k = int(np.argmin(errors))
         low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
     value = float(np.exp(sizes[k]))

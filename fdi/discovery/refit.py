@@ -9,7 +9,7 @@ import numpy as np
 from fdi.discovery.explain import find_marks, measure_gain
 from fdi.discovery.search import Hypothesis, Prospect, Search, WholeRuns, choose_search_excerpt, scan_effects
 from fdi.estimation.fit import Fit, continue_fit, linearise
-from fdi.estimation.likelihood import Free, compute_misfit, limit_friction_values
+from fdi.estimation.likelihood import limit_friction_values, place_in_healthy_unit
 from fdi.estimation.long_recordings import can_be_cut, cut_excerpt
 from fdi.estimation.unidentifiable import finish_fit
 from fdi.estimation.unknowns import (
@@ -22,7 +22,7 @@ from fdi.estimation.unknowns import (
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import GAIN_SEEN, WHITE_SQUARE_POOR
-from fdi.trace.trace import Flags, Trace
+from fdi.trace.trace import Trace
 from plant.effects import CATALOGUE
 from plant.errors import InputError
 from plant.lanes import list_kernel_variants
@@ -125,7 +125,7 @@ def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesi
     slopes = replace(search.problem, steps=coarse, _lanes={})
     last = finish_fit(search.problem, chain[-1].fit, LAST_FIT_ROUNDS, slopes, search.stage)
     if last.misfit > WHITE_SQUARE_POOR * np.count_nonzero(last.white):
-        again = replace(last, x=np.where(_have_priors(last.free), 0.0, last.x))
+        again = replace(last, x=place_in_healthy_unit(last.free, last.x))
         last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes, search.stage),
                    key=lambda fit: fit.cost)
     done = [search.judge_fit(chain[-1].effects, last)]
@@ -144,10 +144,8 @@ def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
     there = dict(zip([f.name for f in other.free], other.x, strict=True))
     own = zip(fit.free, fit.x, strict=True)
     moved = np.array([there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own])
-    prior = np.array([f.prior**-2 for f in fit.free])
     trials = np.array([fit.x, moved])
-    costs = compute_misfit(search.problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
-    return replace(fit, x=trials[int(np.argmin(costs))])
+    return replace(fit, x=trials[int(np.argmin(search.problem.compute_costs(fit.free, trials)))])
 
 
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
@@ -193,14 +191,14 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     If these do not reach the floor, from the effect's own sizes too: a scan believes what a bad fit tells it.
     """
     fit = before.fit
-    healthy = linearise(search.problem, fit.free, np.where(_have_priors(fit.free), 0.0, fit.x))
+    healthy = linearise(search.problem, fit.free, place_in_healthy_unit(fit.free, fit.x))
     found = [*scan_effects(search.problem, fit, [name]), *scan_effects(search.problem, healthy, [name])]
     best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
     if best.is_at_floor:
         return best
     free, sizes = best.fit.free, CATALOGUE[name].starts
     x = np.array([[(size[f.name] - f.centre) / f.scale if f.name in size else float(v)
-                   for f, v in zip(free, np.where(_have_priors(free), 0.0, best.fit.x), strict=True)]
+                   for f, v in zip(free, place_in_healthy_unit(free, best.fit.x), strict=True)]
                   for size in sizes])
     other = _fit_best(search, [linearise(search.problem, free, row) for row in x])
     return search.judge_fit(best.effects, other) if other.cost < best.cost else best
@@ -218,14 +216,9 @@ def _begin_fits(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
 
     A fit that had to do without a large effect has put it into the tolerances: that may be a wrong basin.
     """
-    starts = [x for p in prospects for x in (p.x, np.where(_have_priors(p.free), 0.0, p.x))]
+    starts = [x for p in prospects for x in (p.x, place_in_healthy_unit(p.free, p.x))]
     fits = [linearise(search.problem, prospects[0].free, x) for x in starts]
     return sorted(fits, key=lambda f: f.cost)[:2]
-
-
-def _have_priors(free: Sequence[Free]) -> Flags:
-    """Of which unknowns it is known where a healthy unit has them."""
-    return np.array([np.isfinite(f.prior) for f in free])
 
 
 def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dict[str, tuple[float, float, float]]:

@@ -19,9 +19,11 @@ from fdi.estimation.likelihood import (
     Problem,
     compute_misfit,
     compute_weights,
+    place_in_healthy_unit,
     scale_noise,
     scaled_bounds,
     span_all_rows,
+    weigh_priors,
 )
 from fdi.estimation.long_recordings import Excerpt, Judgement, choose_excerpt, is_long, judge_on_all
 from fdi.estimation.noise import Noise
@@ -218,8 +220,7 @@ class Search:
         signals. The best two effects that have been `tried` are fitted in any case.
         """
         loud = scale_noise(self.problem, EASED[0])
-        own = np.where([np.isfinite(f.prior) for f in start.fit.free], 0.0, start.fit.x)
-        begun = fit_unknowns(loud, start.fit.free, own, 4)
+        begun = fit_unknowns(loud, start.fit.free, place_in_healthy_unit(start.fit.free, start.fit.x), 4)
         prospects = scan_effects(loud, begun, self.list_further_effects(start.effects), self.workers)
         known = {h.effects[-1] for h in tried[:2]}
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
@@ -227,8 +228,7 @@ class Search:
                   if rank < fitted or p.effect in known]
 
         def begin_eased(p: Prospect) -> tuple[str, Fit]:
-            has_prior = np.array([np.isfinite(f.prior) for f in p.free])
-            x = self.find_eased_start(p.free, np.where(has_prior, 0.0, p.x))
+            x = self.find_eased_start(p.free, place_in_healthy_unit(p.free, p.x))
             return p.effect, fit_unknowns(self.problem, p.free, x, 3)
 
         fits = sorted(self.map_parallel(begin_eased, starts), key=lambda each: each[1].cost)
@@ -284,9 +284,7 @@ class Search:
         """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
         own = np.isin([f.name for f in p.free], CATALOGUE[p.effect].fitted)
         starts = np.array([p.x, np.where(own, p.x, 0.0)])
-        prior = np.array([f.prior**-2 for f in p.free])
-        costs = compute_misfit(self.problem.compute_white_residuals(p.free, starts)) + (starts**2) @ prior
-        return linearise(self.problem, p.free, starts[int(np.argmin(costs))])
+        return linearise(self.problem, p.free, starts[int(np.argmin(self.problem.compute_costs(p.free, starts)))])
 
     def judge_fit(self, effects: tuple[str, ...], found: Fit) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats."""
@@ -381,10 +379,8 @@ class Search:
         """
         if not h.is_poor and not h.is_far:
             return h
-        free, prior = h.fit.free, np.array([f.prior**-2 for f in h.fit.free])
-        here = float(compute_misfit(self.problem.compute_white_residuals(free, h.fit.x[None]))[0] + h.fit.x**2 @ prior)
-        other = fit_unknowns(self.problem, free, np.where(prior > 0.0, 0.0, h.fit.x), rounds)
-        if other.cost > here + GAIN_DOUBTFUL:
+        other = fit_unknowns(self.problem, h.fit.free, place_in_healthy_unit(h.fit.free, h.fit.x), rounds)
+        if other.cost > self.problem.compute_costs(h.fit.free, h.fit.x[None])[0] + GAIN_DOUBTFUL:
             return h
         again = self.finish_hypothesis(self.judge_fit(h.effects, other))
         return min(h, again, key=lambda each: each.cost)
@@ -513,19 +509,10 @@ def _make_prospect(problem: Problem, fit: Fit, t: Trial) -> Prospect:
 
 def _list_starts_around(problem: Problem, t: Trial, factors: Sequence[float]) -> list[dict[str, float]]:
     """Starts around a trial's: the parameters of one unit, which belong together, times each factor."""
-    free = list_effect_unknowns(CATALOGUE[t.effect], problem.model)
-    units = list(dict.fromkeys(CATALOGUE[t.effect].parameters[u.name].unit for u in free))
-    starts = []
-    for unit in units:
-        if unit in ("Hz", "rad"):
-            continue
-        for factor in factors:
-            new = dict(t.start)
-            for u in free:
-                if CATALOGUE[t.effect].parameters[u.name].unit == unit:
-                    new[u.name] = min(max(u.centre + factor * (t.start[u.name] - u.centre), u.low), u.high)
-            starts.append(new)
-    return starts
+    free, meaning = list_effect_unknowns(CATALOGUE[t.effect], problem.model), CATALOGUE[t.effect].parameters
+    units = dict.fromkeys(meaning[u.name].unit for u in free if meaning[u.name].unit not in ("Hz", "rad"))
+    return [{**t.start, **{u.name: min(max(u.centre + factor * (t.start[u.name] - u.centre), u.low), u.high)
+                           for u in free if meaning[u.name].unit == unit}} for unit in units for factor in factors]
 
 
 def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]]:
@@ -651,7 +638,7 @@ def _make_absorber(fit: Fit) -> Callable[[Floats, Iterable[str], Floats], tuple[
     but for those `held`, and where they are then.
     """
     low, high = scaled_bounds(fit.free)
-    whole, priors = fit.jacobian.reshape(len(fit.x), -1), np.array([f.prior**-2 for f in fit.free])
+    whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
     thin = np.ascontiguousarray(fit.jacobian[:, :, ::SCAN_STRIDE])
 
     def absorb_shift(white: Floats, held: Iterable[str], begun: Floats) -> tuple[float, Floats]:

@@ -3,12 +3,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_weights, scale_noise, scaled_bounds
+from fdi.estimation.likelihood import (
+    Free,
+    Problem,
+    compute_misfit,
+    compute_weights,
+    scale_noise,
+    scaled_bounds,
+    weigh_priors,
+)
 from fdi.thresholds import CONVERGED_GAIN, CONVERGED_SHARE
 from fdi.trace.trace import Floats
 
@@ -61,8 +70,7 @@ def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     for _ in range(rounds):
         gradient, hessian = form_normal_equations(now)
         trials = np.array([step_within_bounds(now, hessian, gradient, damping) for damping in DAMPINGS])
-        white = problem.compute_white_residuals(now.free, trials)
-        costs = compute_misfit(white) + (trials**2) @ _prior_weights(now.free)
+        costs = problem.compute_costs(now.free, trials)
         k = int(np.argmin(costs))
         gained = now.cost - float(costs[k])
         if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
@@ -83,7 +91,7 @@ def linearise(problem: Problem, free: Sequence[Free], x: Floats, step: Floats | 
     jacobian = (white[1:] - white[0]) / (signs * step)[:, None, None]
     held = float(compute_misfit(white[:1])[0])
     covariance = _compute_covariance(free, jacobian, white[0])
-    return Fit(free, x, held + float(x**2 @ _prior_weights(free)), held, covariance, residuals[0], white[0], jacobian)
+    return Fit(free, x, held + float(x**2 @ weigh_priors(free)), held, covariance, residuals[0], white[0], jacobian)
 
 
 def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
@@ -91,18 +99,14 @@ def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
     residuals = problem.compute_residuals(fit.free, x[None])
     white = problem.whiten_residuals(residuals)
     held = float(compute_misfit(white)[0])
-    return replace(fit, x=x, cost=held + float(x**2 @ _prior_weights(fit.free)), misfit=held, residuals=residuals[0],
+    return replace(fit, x=x, cost=held + float(x**2 @ weigh_priors(fit.free)), misfit=held, residuals=residuals[0],
                    white=white[0])
-
-
-def _prior_weights(free: Sequence[Free]) -> Floats:
-    return np.array([f.prior**-2 for f in free])
 
 
 def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
     """Gradient (p,) and Gauss-Newton Hessian (p, p) of half the cost."""
     heavy = fit.jacobian * compute_weights(fit.white)
-    prior = _prior_weights(fit.free)
+    prior = weigh_priors(fit.free)
     flat = fit.jacobian.reshape(len(fit.x), -1)
     heavy = heavy.reshape(len(fit.x), -1)
     return heavy @ fit.white.reshape(-1) + prior * fit.x, heavy @ flat.T + np.diag(prior)
@@ -110,7 +114,7 @@ def form_normal_equations(fit: Fit) -> tuple[Floats, Floats]:
 
 def _compute_covariance(free: Sequence[Free], jacobian: Floats, white: Floats) -> Floats:
     flat = (jacobian * np.sqrt(compute_weights(white))).reshape(len(free), -1)
-    return np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(_prior_weights(free))), np.float64)
+    return np.asarray(np.linalg.pinv(flat @ flat.T + np.diag(weigh_priors(free))), np.float64)
 
 
 def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
@@ -220,14 +224,8 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     """The fit at the best trial of a population that begins at it with the covariance `spread` (p, p); its covariance
     is that of the last trials.
     """
-    prior = np.array([f.prior**-2 for f in fit.free])
-    low, high = scaled_bounds(fit.free)
-
-    def measure_costs(trials: Floats) -> Floats:
-        costs: Floats = compute_misfit(problem.compute_white_residuals(fit.free, trials)) + trials**2 @ prior
-        return costs
-
-    end = evolve_population(measure_costs, fit.x, spread, low, high, generations, seed)
+    end = evolve_population(partial(problem.compute_costs, fit.free), fit.x, spread, *scaled_bounds(fit.free),
+                            generations, seed)
     return replace(fit, x=end.x, cost=end.cost, covariance=end.covariance)
 
 

@@ -46,6 +46,16 @@ def scaled_bounds(free: Sequence[Free]) -> tuple[Floats, Floats]:
     return low, high
 
 
+def weigh_priors(free: Sequence[Free]) -> Floats:
+    """Weights, (p,), of the squares of scaled unknowns: 0 where nothing is known of one beforehand."""
+    return np.array([f.prior**-2 for f in free])
+
+
+def place_in_healthy_unit(free: Sequence[Free], x: Floats) -> Floats:
+    """Scaled unknowns, (p,), with those at their centres of which it is known where a healthy unit has them."""
+    return np.where([np.isfinite(f.prior) for f in free], 0.0, x)
+
+
 def limit_dynamic_friction(names: Sequence[str], values: Floats) -> Floats:
     """Values (.., p) of named parameters, changed in place: dynamic friction is at most the static friction."""
     for body in ("jack", "spool"):
@@ -107,6 +117,10 @@ class Problem:
     def compute_white_residuals(self, free: Sequence[Free], x: Floats) -> Floats:
         """The same, whitened: (m, s, n), 0 where not measured."""
         return self.whiten_residuals(self.compute_residuals(free, x))
+
+    def compute_costs(self, free: Sequence[Free], x: Floats) -> Floats:
+        """-2 log likelihood with priors, (m,), of scaled unknowns `x` (m, p)."""
+        return compute_misfit(self.compute_white_residuals(free, x)) + x**2 @ weigh_priors(free)
 
     def list_values(self, free: Sequence[Free], x: Floats) -> dict[str, float]:
         """Parameters by name, SI units, of scaled unknowns `x` (p,), as the model takes them."""

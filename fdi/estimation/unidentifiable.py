@@ -24,6 +24,7 @@ from fdi.estimation.likelihood import (
     compute_weights,
     limit_dynamic_friction,
     scaled_bounds,
+    weigh_priors,
 )
 from fdi.progress import NO_STAGE, Stage
 from fdi.thresholds import CONVERGED_GAIN, FLAT_DIRECTION_MISFIT, PRIORS_KNOW_MORE_MISFIT
@@ -194,7 +195,7 @@ def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> 
     free, x = found.free, found.x
     if not directions:
         return found
-    prior = np.array([f.prior**-2 for f in free])
+    prior = weigh_priors(free)
     low, high = scaled_bounds(free)
     for _ in range(6):  # Gauss-Newton on the priors alone, along the curved directions
         ways = _list_tangents(free, x, directions).T
@@ -222,11 +223,8 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. `scaled` are parameters that are not logarithms,
     with their powers in each of `FLAT`.
     """
-    law = problem.model["filter.law"]
-    load = next((f.value(float(v)) for f, v in zip(free, x, strict=True) if f.name == LOAD), 0.0)
     at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
-    said = [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else
-            {**flat, LOAD: load} if "jack.area" in flat else flat for flat in FLAT]
+    said = [{**flat, LOAD: at.get(LOAD, 0.0)} if "jack.area" in flat else flat for flat in list_powers(problem)]
     said = [{**flat, **{name: power * at[name] for name, power in more.items() if name in at}}
             for flat, more in zip(said, scaled, strict=True)]
     every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
@@ -276,7 +274,7 @@ def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
 
 def relax_along(found: Fit, flat: Floats) -> Fit:
     """The fit moved along the flat directions to where the priors want it, within the bounds: no residual changes."""
-    prior = np.array([f.prior**-2 for f in found.free])
+    prior = weigh_priors(found.free)
     low, high = scaled_bounds(found.free)
     x = found.x
     for _ in range(len(flat.T) + 1):
@@ -408,14 +406,14 @@ def linearise_along(problem: Problem, now: Fit, slopes: Problem, flat: Floats) -
     steep = np.asarray(np.linalg.pinv(moves), np.float64) @ differences.reshape(len(x), -1)
     jacobian = remove_slope(steep.reshape(len(x), *now.white.shape), flat)
     heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
-    hessian = heavy @ jacobian.reshape(len(x), -1).T + np.diag([f.prior**-2 for f in now.free])
+    hessian = heavy @ jacobian.reshape(len(x), -1).T + np.diag(weigh_priors(now.free))
     known = invert_hessian(hessian)
     return replace(now, cost=_add_prior(now, now.misfit), covariance=known, jacobian=jacobian)
 
 
 def _add_prior(fit: Fit, misfit: float) -> float:
     """The cost of a fit with this misfit."""
-    return misfit + float(fit.x @ np.diag([f.prior**-2 for f in fit.free]) @ fit.x)
+    return misfit + float(fit.x @ np.diag(weigh_priors(fit.free)) @ fit.x)
 
 
 def _find_principal(covariance: Floats) -> Floats:
@@ -427,7 +425,7 @@ def _find_principal(covariance: Floats) -> Floats:
 
 def take_best_step(problem: Problem, fit: Fit) -> Fit:
     """The best of some damped Gauss-Newton steps; the fit itself if none gains."""
-    prior = np.diag([f.prior**-2 for f in fit.free])
+    prior = np.diag(weigh_priors(fit.free))
     flat, heavy = (j.reshape(len(fit.x), -1) for j in (fit.jacobian, fit.jacobian * compute_weights(fit.white)))
     gradient, hessian = heavy @ fit.white.reshape(-1) + prior @ fit.x, heavy @ flat.T + prior
     trials = np.array([step_within_bounds(fit, hessian, gradient, damping) for damping in DAMPINGS])
@@ -466,7 +464,7 @@ def linearise_across(problem: Problem, free: Sequence[Free], x: Floats, covarian
     white = problem.whiten_residuals(residuals := problem.compute_residuals(free, np.vstack([x, x + moves])))
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
     jacobian = (inverse.T @ steep).reshape(len(free), *white[0].shape)
-    prior = np.diag([f.prior**-2 for f in free])
+    prior = np.diag(weigh_priors(free))
     flat_rows = jacobian.reshape(len(free), -1)
     heavy = (jacobian * compute_weights(white[0])).reshape(len(free), -1)
     held = float(compute_misfit(white[:1])[0])

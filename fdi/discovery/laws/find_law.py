@@ -21,7 +21,7 @@ from fdi.discovery.laws.terms import LIBRARY, PARTS, TERMS, Term, find_states, n
 from fdi.discovery.residual_pattern import ACCELERATION_WINDOW, CREEP, EDGE, Balance, States, compute_balances
 from fdi.discovery.search import Hypothesis, Search, simulate_starts
 from fdi.estimation.fit import Fit, Value, continue_fit, form_normal_equations, linearise, step_within_bounds
-from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms
+from fdi.estimation.likelihood import Free, Problem, compute_misfit, compute_typical_rms, place_in_healthy_unit
 from fdi.estimation.unknowns import silence_readings
 from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
@@ -259,8 +259,8 @@ class _Worker:
 
         Tolerances that have moved to make up for what is missing hide it: proposals come from the healthy unit too.
         """
-        known = np.array([np.isfinite(f.prior) for f in now.fit.free])
-        healthy = linearise(self.problem(now.terms), now.fit.free, np.where(known, 0.0, now.fit.x))
+        x = place_in_healthy_unit(now.fit.free, now.fit.x)
+        healthy = linearise(self.problem(now.terms), now.fit.free, x)
         ranked = [each for fit in (now.fit, healthy) for each in self.rank_terms(now.terms, fit)]
         best: dict[str, _Ranked] = {}
         for each in sorted(ranked, key=lambda r: r.cost):
