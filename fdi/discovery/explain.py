@@ -1,4 +1,33 @@
-"""Which physical effect is missing from a model: the verdict, with its evidence and its doubt."""
+"""Which physical effect is missing from a model: the verdict, with its evidence and its doubt.
+
+The decision procedure, stage by stage in the order of their action; each acts only where its gate lets it. Costs and
+gains are in -2 log likelihood; floors are those of the worst signal. docs/explain.md has the table with the values of
+the thresholds.
+
+| stage | acts if | what it does |
+|---|---|---|
+| marks | Cor differs by more than {FIRMWARE_DIFFERS:g} roundings, or all positions are multiples of one step | names the effect of the firmware or the converter |
+| base | always | fits the tolerances; learns the noise if at most {RESIDUAL_IS_NOISE:g} floors are left |
+| first effect | always | fits the eight effects that promise to gain more than {GAIN_WORTH_A_FIT:g}, in stages, the best two to the end |
+| noise | the base leaves more than noise | learns the noise under the best first effect; fits the base and the best four again |
+| second effect | the first leaves more than noise and gains more than {GAIN_SEEN:g} | fits the four most promising effects beside each of the best two |
+| third effect | so does the second, which also removes {FURTHER_EFFECT_SHARE:g} of the excess cost, and leaves at most {ERROR_PARTLY_EXPLAINED:g} of the excess on the held-out run | the same |
+| finer steps | the best leaves at most {RESIDUAL_IS_NEAR_NOISE:g} floors | asks whether 20 steps a cycle leave only noise |
+| missed stops | that holds for the first effect, and the second gains at most {GAIN_SEEN:g} | fits the first again with a population; no second effect is missing |
+| more noise | the best leaves more than noise, or its tolerances have a mean square above {TOLERANCE_SQUARE_FAR:g} | searches again from a nominal unit with 30 and 6 times the noise |
+| other valleys | two effects remove {FURTHER_EFFECT_SHARE:g} of the excess cost and still leave more than noise | fits the best two pairs again with a population |
+| number of effects | always | keeps the effects that gain more than {GAIN_SEEN:g}, of several only those whose removal costs more than {GAIN_CONVINCES:g} |
+| last fits | always | finishes the base and the best four with finer steps, on the repeats too; begins again those of the best two that leave a mean square above {WHITE_SQUARE_POOR:g} or have far tolerances |
+| intervals | the base leaves only noise | drops effects whose 95 % interval holds the off value |
+| small gain | the gain is below {GAIN_DOUBTFUL:g} | fits the base again from there; drops a single effect that then gains at most {GAIN_SEEN:g} |
+| solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
+| whole recording | only an excerpt was fitted | judges on all rows |
+| held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
+| verdict | always | see below |
+| wave | the verdict is PARTLY, and a wave along the stroke explains more | names no effect |
+| hidden effects | only noise is left | names those that would gain less than {GAIN_DETECTED:g} at any usual size |
+| law | the verdict is PARTLY or UNEXPLAINED | looks for a law, and describes the residual |
+"""  # noqa: E501
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence

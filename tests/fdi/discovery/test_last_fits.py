@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from noisy_traces import record_plant
 
+from fdi import thresholds
 from fdi.discovery.explain import Marks, decide_verdict, shows_effect
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation.fit import linearise
@@ -75,3 +78,9 @@ def test_an_explanation_that_needs_tolerances_of_no_healthy_unit_is_doubted(is_f
     base, best = make((), 9000.0, False), make(("coil_lag", "filter_clogging"), 1000.0, is_far)
     found = decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6})
     assert found == (verdict, ("coil_lag", "filter_clogging"))
+
+
+def test_the_page_shows_the_decision_procedure_of_the_code() -> None:
+    stages = [line for line in str(import_module("fdi.discovery.explain").__doc__).splitlines() if line[:1] == "|"]
+    table = "\n".join(stages).format(**vars(thresholds))
+    assert len(stages) > 20 and table in (Path(__file__).parents[3] / "docs/explain.md").read_text()
