@@ -6,11 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdi.comparison.run_differences import compare_runs, find_offset, match_checks
+from fdi.comparison.run_differences import (
+    RunDifferences,
+    RunPair,
+    SignalDifference,
+    compare_runs,
+    find_offset,
+    match_checks,
+)
 from fdi.report.diff_report import build_diff_report
 from fdi.report.html import render_html
 from fdi.report.terminal import format_report
-from fdi.trace.trace import Check, Trace
+from fdi.trace.trace import PER_ROW, Check, Trace
 
 ROWS = 4000
 NOISE = 2e-6  # m rms
@@ -27,80 +34,73 @@ def make_run(seed: int = 0, period: float = 1e-3, start: float = 0.0, bump: floa
     return Trace.from_columns(columns, period, {})
 
 
+def compare_two(other: Trace, first: Trace | None = None
+                ) -> tuple[RunDifferences, RunPair, dict[str, SignalDifference]]:
+    """A run against the reference (default: that of seed 0), and how each signal differs."""
+    found = compare_runs(["a", "b"], [make_run() if first is None else first, other])
+    return found, found.pairs[0], {s.name: s for s in found.pairs[0].signals}
+
+
 def test_equal_runs_are_the_same_to_the_last_digit() -> None:
-    found = compare_runs(["a", "b"], [make_run(), make_run()])
-    assert found.verdict == "SAME" and {s.name for s in found.pairs[0].signals} == {"xj", "p12", "cor"}
-    assert all(s.is_equal and s.rms == 0.0 for s in found.pairs[0].signals)
+    found, _, signals = compare_two(make_run())
+    assert found.verdict == "SAME" and set(signals) == {"xj", "p12", "cor"}
+    assert all(s.is_equal and s.rms == 0.0 for s in signals.values())
     assert "every sample is equal" in build_diff_report(found).sentence
 
 
-def test_noise_of_another_seed_is_the_same() -> None:
-    found = compare_runs(["a", "b"], [make_run(0), make_run(1)])
-    (pair,) = found.pairs
-    xj = next(s for s in pair.signals if s.name == "xj")
+def test_noise_of_another_seed_is_the_same_and_a_bump_is_found_with_its_size_sign_and_time() -> None:
+    found, _, signals = compare_two(make_run(1))
+    xj = signals["xj"]
     assert found.verdict == "SAME" and not xj.is_equal and 0.9 < xj.ratio < 1.1
     assert xj.rms == pytest.approx(np.sqrt(2) * NOISE, rel=0.05) and xj.noise == pytest.approx((NOISE, NOISE), rel=0.05)
     assert xj.calm_share == pytest.approx(0.954, abs=0.02)
-
-
-def test_a_bump_is_found_with_its_size_sign_and_time() -> None:
-    found = compare_runs(["a", "b"], [make_run(0), make_run(1, bump=-300e-6)])
-    xj = next(s for s in found.pairs[0].signals if s.name == "xj")
-    assert found.verdict == "DIFFERENT" and xj.t == pytest.approx(2.0, abs=0.01)
-    assert xj.largest == pytest.approx(-300e-6, rel=0.05) and not xj.is_within_noise
+    found, _, signals = compare_two(make_run(1, bump=-300e-6))
+    assert found.verdict == "DIFFERENT" and signals["xj"].t == pytest.approx(2.0, abs=0.01)
+    assert signals["xj"].largest == pytest.approx(-300e-6, rel=0.05) and not signals["xj"].is_within_noise
 
 
 @pytest.mark.parametrize("start", [12.345, -3.0])
 def test_runs_with_other_clocks_are_aligned_by_the_command(start: float) -> None:
-    found = compare_runs(["a", "b"], [make_run(0), make_run(1, start=start)])
-    pair = found.pairs[0]
+    found, pair, _ = compare_two(make_run(1, start=start))
     assert found.verdict == "SAME" and pair.offset == pytest.approx(-start) and len(pair.t) == ROWS
     assert any("aligned by the command" in note for note in pair.notes)
 
 
 def test_a_run_that_was_recorded_later_is_aligned_by_its_steps() -> None:
-    whole, late = make_run(0), make_run(1)
-    rows = slice(700, None)
-    late = replace(late, **{name: getattr(late, name)[rows] for name in (
-        "com", "xj", "cor", "p12", "xs", "load", "phase", "usable", "filled", "incomplete")},
-        t=late.t[rows] - late.t[700])
-    assert find_offset(whole, late) == pytest.approx(0.7)
-    assert compare_runs(["a", "b"], [whole, late]).verdict == "SAME"
+    late = make_run(1)
+    rows = {name: getattr(late, name)[700:] for name in PER_ROW}
+    late = replace(late, **rows | {"t": late.t[700:] - late.t[700]})
+    assert find_offset(make_run(0), late) == pytest.approx(0.7)
+    assert compare_two(late)[0].verdict == "SAME"
 
 
 @pytest.mark.parametrize("is_first", [True, False])
 def test_a_slower_run_is_compared_in_its_own_rows(is_first: bool) -> None:
-    runs = [make_run(0), make_run(1, period=2e-3, rows=ROWS // 2)]
-    pair = compare_runs(["a", "b"], runs if is_first else runs[::-1]).pairs[0]
+    runs = [make_run(1, period=2e-3, rows=ROWS // 2), make_run(0)]
+    _, pair, signals = compare_two(*runs if is_first else runs[::-1])
     assert pair.has_same_command and pair.t[1] - pair.t[0] == pytest.approx(2e-3)
-    assert any("rows every" in note for note in pair.notes) and all(s.is_within_noise for s in pair.signals)
+    assert any("rows every" in note for note in pair.notes) and all(s.is_within_noise for s in signals.values())
 
 
 def test_of_different_commands_only_equal_parts_are_compared() -> None:
     other = make_run(1)
     far = other.com + np.where(other.t > 2.5, 1e-3, 0.0)
-    found = compare_runs(["a", "b"], [make_run(0), replace(other, com=far, xj=other.xj + far - other.com)])
-    pair = found.pairs[0]
+    found, pair, signals = compare_two(replace(other, com=far, xj=other.xj + far - other.com))
     assert found.verdict == "DIFFERENT" and not pair.has_same_command and pair.common == pytest.approx(2.5, abs=0.01)
-    assert next(s for s in pair.signals if s.name == "xj").is_within_noise
+    assert signals["xj"].is_within_noise
     assert "elsewhere they differ" in build_diff_report(found).sentence
-
-
-def test_nothing_in_common_is_said() -> None:
-    other = make_run(1)
-    found = compare_runs(["a", "b"], [make_run(0), replace(other, com=other.com + 1.0)])
-    assert found.verdict == "DIFFERENT" and not found.pairs[0].signals
+    found, _, signals = compare_two(replace(other, com=other.com + 1.0))
+    assert found.verdict == "DIFFERENT" and not signals
     assert "no signal could be compared" in build_diff_report(found).sentence
     assert "<svg" not in render_html(build_diff_report(found))
 
 
 def test_missing_samples_signals_and_units_are_left_out() -> None:
     other = make_run(1)
-    holes = other.xj.copy()
-    holes[100:200] = np.nan
+    holes = np.where((np.arange(ROWS) >= 100) & (np.arange(ROWS) < 200), np.nan, other.xj)
     other = replace(other, xj=holes, p12=np.full(ROWS, np.nan), units={**other.units, "cor": "rad/s"})
-    pair = compare_runs(["a", "b"], [make_run(0), other]).pairs[0]
-    assert [s.name for s in pair.signals] == ["xj"] and pair.signals[0].samples == ROWS - 100
+    _, pair, signals = compare_two(other)
+    assert list(signals) == ["xj"] and signals["xj"].samples == ROWS - 100
     assert pair.not_compared == {"p12": "only A has it", "cor": "in A in A, in rad/s in B"}
 
 
@@ -117,10 +117,9 @@ def test_checks_are_matched_by_name_and_changes_are_marked() -> None:
 
 
 def test_a_changed_check_makes_runs_different() -> None:
-    first = replace(make_run(0), checks=(LIMITED,))
-    second = replace(make_run(0), checks=(LIMITED._replace(passed=False, value=12.0),))
-    found = compare_runs(["a", "b"], [first, second])
-    assert found.verdict == "DIFFERENT" and compare_runs(["a", "c"], [first, first]).verdict == "SAME"
+    first, second = (replace(make_run(0), checks=(LIMITED._replace(passed=passed),)) for passed in (True, False))
+    found, *_ = compare_two(second, first)
+    assert found.verdict == "DIFFERENT" and compare_two(first, first)[0].verdict == "SAME"
     text = format_report(build_diff_report(found), 80)
     assert "pass -> FAIL" in text and "changed" in text and max(map(len, text.splitlines()[2:])) <= 80
 

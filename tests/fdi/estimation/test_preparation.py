@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fdi.estimation.replay import (
     align_columns,
     align_repeat,
     find_repeat,
+    hold_inputs,
     match_period,
     read_cycles,
 )
@@ -60,8 +62,10 @@ def test_what_cannot_be_is_refused_in_a_line(changes: dict[str, np.ndarray], fie
 
 
 def test_too_short_and_times_in_ms() -> None:
-    with pytest.raises(InputError, match=f"at least {FEWEST_ROWS} rows, not 100"):
-        read_cycles(Trace.from_columns({name: x[:100] for name, x in columns().items()}, 1e-3, {}), MODEL)
+    short = Trace.from_columns({name: x[:100] for name, x in columns().items()}, 1e-3, {})
+    for prepare in (partial(read_cycles, model=MODEL), hold_inputs):
+        with pytest.raises(InputError, match=f"at least {FEWEST_ROWS} rows, not 100"):
+            prepare(short)
     with pytest.raises(InputError, match="times in s, one row a cycle; the rows are 1 s apart"):
         read_cycles(made(1.0, t=np.arange(13_500.0)), MODEL)
     with pytest.raises(InputError, match="some of xj,p12,xs"):
