@@ -72,30 +72,26 @@ class Plot(str):
         Raises:
             InputError: a path that cannot be written, a format that matplotlib does not know, or no plotly for .html.
         """
-        if Path(path).suffix in ("", ".svg"):
+        kind = Path(path).suffix
+        if kind in ("", ".svg"):
             write_text(path, str(self), "path")
-        elif Path(path).suffix == ".html":
+        elif kind == ".html":
             write_text(path, self.to_plotly().to_html(include_plotlyjs=True), "path")
         else:
-            _save_figure(self.figure, Path(path))
+            known = self.figure.canvas.get_supported_filetypes()
+            if kind[1:] not in known:
+                raise InputError("path", str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
+            try:
+                with write_whole(path) as part:
+                    self.figure.savefig(part, dpi=150)
+            except OSError as error:
+                raise InputError("path", str(path), f"a file that can be written ({error.strerror})") from error
 
     def _repr_svg_(self) -> str:
         return str(self)
 
     def __repr__(self) -> str:
         return f"<Plot: {shorten(self.caption, 90, placeholder=' ..')}>"
-
-
-def _save_figure(figure: MatplotlibFigure, path: Path, resolution: int = 150) -> None:
-    """Write a figure in the format of the suffix, `resolution` in dots per inch. Raises InputError."""
-    known = figure.canvas.get_supported_filetypes()
-    if path.suffix[1:] not in known:
-        raise InputError("path", str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
-    try:
-        with write_whole(path) as part:
-            figure.savefig(part, dpi=resolution)
-    except OSError as error:
-        raise InputError("path", str(path), f"a file that can be written ({error.strerror})") from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -285,7 +281,7 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
 
     measured = _load_trace(trace)
     comparison = compare_trace(measured, _load_model(model, trust), [_load_trace(r) for r in repeats], signals,
-                               source=_name_trace(trace))
+                               source=measured.provenance.get("source", "trace"))
     return ComparisonResult(build_comparison_report(comparison), comparison)
 
 
@@ -313,7 +309,7 @@ def explain(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     own_model = _load_model(model, trust)
     runs = _collect_runs(own_model, trace, repeats, holdout, signals)
     answer, pattern = explain_runs(runs, seed, effect_file)
-    report = build_explanation_report(answer, _name_trace(trace), own_model.name, runs.sources, pattern=pattern,
+    report = build_explanation_report(answer, runs.sources[0].file, own_model.name, runs.sources, pattern=pattern,
                                       notes=runs.notes)
     return ExplanationResult(report, answer)
 
@@ -400,8 +396,9 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
     from fdi.diagnosis.diagnosis import diagnose as diagnose_trace
     from fdi.report.diagnosis_report import build_diagnosis_report
 
-    known_bands = None if bands is None else load_bands(bands)
-    diagnosis = diagnose_trace(_load_trace(trace), _load_model(model, trust), known_bands, source=_name_trace(trace))
+    measured, known_bands = _load_trace(trace), None if bands is None else load_bands(bands)
+    diagnosis = diagnose_trace(measured, _load_model(model, trust), known_bands,
+                               source=measured.provenance.get("source", "trace"))
     return DiagnosisResult(build_diagnosis_report(diagnosis), diagnosis)
 
 
@@ -411,10 +408,6 @@ def _load_trace(trace: TraceOrPath) -> Trace:
         return trace
     found = Trace.read(trace)
     return replace(found, provenance={**found.provenance, "source": str(trace)})
-
-
-def _name_trace(trace: TraceOrPath) -> str:
-    return trace.provenance.get("source", "trace") if isinstance(trace, Trace) else str(trace)
 
 
 def _load_model(model: ModelOrPath, trust: bool) -> Model:
