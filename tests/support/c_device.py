@@ -10,7 +10,8 @@ import struct
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
 
 import pytest
 
@@ -96,108 +97,100 @@ def load_library() -> ctypes.CDLL:
     return loaded
 
 
-class _Calls:
-    """Calls of the library, and the Python errors that hooks raise in the middle of them: C lets none through."""
+class _Stack:
+    """A struct of the library and the calls on it.
 
-    def __init__(self) -> None:
+    A Python error that a hook raises in the middle of a call is raised after it: C lets none through.
+    """
+
+    def __init__(self, kind: str, send: Send) -> None:
+        self.library, self.kind = load_library(), kind
+        self.memory = ctypes.create_string_buffer(getattr(self.library, f"host_{kind}_size")())
+        self.output = _Output(_SendFunction(lambda _, cob_id, data, length: self.guard(
+            send, cob_id, bytes(data[:length]))), None)
         self._errors: list[BaseException] = []
 
     def guard(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a hook from C; its error is kept."""
         try:
             return function(*arguments)
-        except Exception as error:  # raised again by `finish`
+        except Exception as error:
             self._errors.append(error)
-            return None
 
-    def finish(self) -> None:
-        """Raise the first error of a hook."""
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call a function of the library on the struct."""
+        result = getattr(self.library, name)(self.memory, *arguments)
         if self._errors:
-            error, self._errors = self._errors[0], []
-            raise error
+            raise self._errors.pop()
+        return result
 
+    def receive(self, frame: Frame) -> None:
+        """See `Device.receive`."""
+        data = (ctypes.c_uint8 * 8)(*frame.data)
+        self.call(f"{self.kind}_receive", ctypes.byref(CFrame(frame.t_ns, frame.cob_id, len(frame.data), data)))
 
-def _make_output(calls: _Calls, send: Send) -> _Output:
-    def transmit(_: object, cob_id: int, data: Any, length: int) -> None:
-        calls.guard(send, cob_id, bytes(data[:length]))
-
-    return _Output(_SendFunction(transmit), None)
+    def tick(self, t_ns: int) -> None:
+        """See `Device.tick`."""
+        self.call(f"{self.kind}_tick", t_ns)
 
 
 class _View:
-    """The part of `rig.device.Device` that tests look at, of a `struct device` at an address."""
+    """The part of `rig.device.Device` that tests look at, of a struct that begins with a `struct device`."""
 
-    def __init__(self, address: int, node_id: int, od: Dictionary, calls: _Calls) -> None:
-        self.node_id, self.od = node_id, od
-        self.emcy = _Emcy(address, calls)
-        self.pdo = _Pdos(address)
-        self._lib, self._address, self._calls = load_library(), address, calls
+    def __init__(self, stack: _Stack, node_id: int, od: Dictionary) -> None:
+        self.node_id, self.od, self._stack = node_id, od, stack
+        self.receive, self.tick = stack.receive, stack.tick
+        self.emcy = _Emcy(stack)
+        self.pdo = SimpleNamespace(rpdos={n: _Rpdo(stack, n - 1) for n in (1, 2)})
         self._positions = {key: i for i, key in enumerate(sorted(od.entries))}
         self.domains: dict[tuple[int, int], bytes] = {}
 
     @property
     def state(self) -> NmtState:
         """NMT state."""
-        return NmtState(self._lib.host_state(ctypes.c_void_p(self._address)))
+        return NmtState(self._stack.call("host_state"))
 
     def read(self, index: int, sub: int = 0) -> Value:
         """See `Device.read`."""
         entry = self.od.entries[index, sub]
         if not entry.code:
             return self.domains.get((index, sub), entry.default)
-        size = struct.calcsize("<" + entry.code)
-        bits = self._lib.host_values(ctypes.c_void_p(self._address))[self._positions[index, sub]]
-        return cast(Value, struct.unpack("<" + entry.code, bits.to_bytes(8, "little")[:size])[0])
+        bits = self._stack.call("host_values")[self._positions[index, sub]].to_bytes(8, "little")
+        return cast(Value, struct.unpack_from("<" + entry.code, bits)[0])
 
     def write(self, index: int, sub: int, value: Value) -> None:
         """See `Device.write`."""
-        if (index, sub) not in self.od:
-            raise KeyError((index, sub))
         bits = int.from_bytes(struct.pack("<" + self.od.entries[index, sub].code, value), "little")
-        self._lib.host_values(ctypes.c_void_p(self._address))[self._positions[index, sub]] = bits
-        self._lib.device_configure(ctypes.c_void_p(self._address), index)
+        self._stack.call("host_values")[self._positions[index, sub]] = bits
+        self._stack.call("device_configure", index)
 
     def transmit(self, n: int) -> None:
         """See `Device.transmit`."""
-        self._lib.device_transmit(ctypes.c_void_p(self._address), n)
-        self._calls.finish()
+        self._stack.call("device_transmit", n)
 
 
-class _Emcy:
-    def __init__(self, address: int, calls: _Calls) -> None:
-        self._lib, self._address, self._calls = load_library(), ctypes.c_void_p(address), calls
+class _Emcy(NamedTuple):
+    stack: _Stack
 
     @property
     def active(self) -> list[int]:
-        codes = (self._lib.host_error_code(self._address, i) for i in range(16))
+        codes = (self.stack.call("host_error_code", i) for i in range(16))
         return [code for code in codes if code >= 0]
 
     def raise_error(self, code: int, register: int = 1, info: bytes = b"") -> None:
-        self._lib.host_raise(self._address, code, int(register), info, len(info))
-        self._calls.finish()
+        self.stack.call("host_raise", code, int(register), info, len(info))
 
     def clear(self, code: int = -1, info: bytes = b"") -> None:
-        self._lib.host_clear(self._address, code, info[0] if info else -1)
-        self._calls.finish()
+        self.stack.call("host_clear", code, info[0] if info else -1)
 
 
-class _Rpdo:
-    def __init__(self, address: int, position: int) -> None:
-        self._address, self._position = ctypes.c_void_p(address), position
+class _Rpdo(NamedTuple):
+    stack: _Stack
+    position: int
 
     @property
     def fresh(self) -> bool:
-        return bool(load_library().host_is_fresh(self._address, self._position))
-
-
-class _Pdos:
-    def __init__(self, address: int) -> None:
-        self.rpdos = {n: _Rpdo(address, n - 1) for n in (1, 2)}
-
-
-def _write_frame(frame: Frame) -> CFrame:
-    data = (ctypes.c_uint8 * 8)(*frame.data)
-    return CFrame(frame.t_ns, frame.cob_id, len(frame.data), data)
+        return bool(self.stack.call("host_is_fresh", self.position))
 
 
 def _make_object(key: tuple[int, int], entry: Entry) -> _Object:
@@ -216,72 +209,43 @@ class CDevice(_View):
     """`rig.device.Device` in C, with the object dictionary of any EDS."""
 
     def __init__(self, node_id: int, eds_path: Path, send: Send) -> None:
-        self.on_sync: Callable[[], None] = lambda: None
-        self.on_rpdo: Callable[[int], None] = lambda n: None
-        self.on_write: Callable[[int, int, bytes], None] = lambda index, sub, data: None
-        self.on_nmt: Callable[[NmtState, NmtState], None] = lambda old, new: None
-        self.on_sync_lost: Callable[[], None] = lambda: None
-        self.on_heartbeat_lost: Callable[[int], None] = lambda node: None
-        library, calls, od = load_library(), _Calls(), Dictionary(eds_path, node_id)
-        self._memory = ctypes.create_string_buffer(library.host_device_size())
-        super().__init__(ctypes.addressof(self._memory), node_id, od, calls)
+        for hook in ("on_sync", "on_rpdo", "on_nmt", "on_sync_lost", "on_heartbeat_lost", "on_write"):
+            setattr(self, hook, lambda *_: None)
+        stack, od = _Stack("device", send), Dictionary(eds_path, node_id)
+        super().__init__(stack, node_id, od)
         objects = [_make_object(key, od.entries[key]) for key in sorted(od.entries)]
-        self._objects = (_Object * len(objects))(*objects)
-        self._values = (ctypes.c_uint64 * len(objects))()
-        self._buffer = ctypes.create_string_buffer(DOMAIN_BYTES)
-        self._output = _make_output(calls, send)
+        self._kept = ((_Object * len(objects))(*objects), (ctypes.c_uint64 * len(objects))(),
+                      ctypes.create_string_buffer(DOMAIN_BYTES))
         self._hooks = _Hooks(
-            None, _Plain(lambda _: calls.guard(lambda: self.on_sync())),
-            _Numbered(lambda _, n: calls.guard(lambda: self.on_rpdo(n))),
-            _Write(self._write_object),
-            _Change(lambda _, old, new: calls.guard(lambda: self.on_nmt(NmtState(old), NmtState(new)))),
-            _Plain(lambda _: calls.guard(lambda: self.on_sync_lost())),
-            _Node(lambda _, node: calls.guard(lambda: self.on_heartbeat_lost(node))))  # fmt: skip
-        table = _Dictionary(self._objects, len(objects), self._values)
-        if not library.device_init(self._memory, node_id, table, self._output, self._hooks, self._buffer, DOMAIN_BYTES):
+            None, self._make_hook(_Plain, "on_sync"), self._make_hook(_Numbered, "on_rpdo"), _Write(self._write_object),
+            self._make_hook(_Change, "on_nmt", NmtState), self._make_hook(_Plain, "on_sync_lost"),
+            self._make_hook(_Node, "on_heartbeat_lost"))
+        table = _Dictionary(self._kept[0], len(objects), self._kept[1])
+        if not stack.call("device_init", node_id, table, stack.output, self._hooks, self._kept[2], DOMAIN_BYTES):
             Device(node_id, eds_path, send)  # must refuse it too, and says why
             raise AssertionError(f"the Python stack accepts {eds_path}")
+
+    def _make_hook(self, kind: Any, name: str, convert: Callable[[int], int] = int) -> Any:
+        return kind(lambda _, *numbers: self._stack.guard(lambda: getattr(self, name)(*map(convert, numbers))))
 
     def _write_object(self, _: object, index: int, sub: int, data: Any, length: int) -> int:
         value = ctypes.string_at(data, length)
         try:
-            self.on_write(index, sub, value)
+            self.on_write(index, sub, value)  # type: ignore[attr-defined]
         except SdoAbort as abort:
             return abort.code
         if not self.od.entries[index, sub].code:
             self.domains[index, sub] = value
         return 0
 
-    def receive(self, frame: Frame) -> None:
-        """See `Device.receive`."""
-        self._lib.device_receive(self._memory, ctypes.byref(_write_frame(frame)))
-        self._calls.finish()
 
-    def tick(self, t_ns: int) -> None:
-        """See `Device.tick`."""
-        self._lib.device_tick(self._memory, t_ns)
-        self._calls.finish()
-
-
-class CFirmware:
+class CFirmware(_Stack):
     """`rig.nodes.firmware.Firmware` in C; `gains` are written as the rig does before a start. No effects of a model."""
 
     def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
         assert model is None or not model.effects
-        library, self._calls = load_library(), _Calls()
-        self._memory = ctypes.create_string_buffer(library.host_controller_size())
-        self._output = _make_output(self._calls, send)
-        assert library.controller_init(self._memory, self._output)
-        self.device = _View(ctypes.addressof(self._memory), 2, Dictionary(EDS[2], 2), self._calls)
+        super().__init__("controller", send)
+        assert self.call("controller_init", self.output)
+        self.device = _View(self, 2, Dictionary(EDS[2], 2))
         for sub, value in enumerate(gains or (), 1):
             self.device.write(GAINS, sub, value)
-
-    def receive(self, frame: Frame) -> None:
-        """See `Firmware.receive`."""
-        load_library().controller_receive(self._memory, ctypes.byref(_write_frame(frame)))
-        self._calls.finish()
-
-    def tick(self, t_ns: int) -> None:
-        """See `Firmware.tick`."""
-        load_library().controller_tick(self._memory, t_ns)
-        self._calls.finish()
