@@ -18,7 +18,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from functools import partial
 from multiprocessing import connection, get_context
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from plant.errors import InputError, RigError
@@ -102,8 +102,8 @@ def _work_single_threaded(work: Callable[[Job], Result], job: Job) -> Result:
     return work(job)
 
 
-
 SECOND = 1_000_000_000  # ns
+UNLIMITED = 1e9  # s; no job takes so long
 
 
 @contextlib.contextmanager
@@ -210,7 +210,7 @@ def _import_distributed() -> Any:
 Row = dict[str, Any]
 
 
-class RowFile:
+class RowFile(contextlib.AbstractContextManager["RowFile"]):
     """A row file opened for appending, locked against other processes.
 
     `rows` are the rows of the file, in the order in which they were written, including those appended since.
@@ -231,15 +231,11 @@ class RowFile:
             self._file.close()
             raise InputError(path.parent, "", "a folder in which no other rig process is at work") from None
         self.rows = read_rows(path)
-        if not _ends_with_newline(path):
+        if path.read_bytes()[-1:] not in (b"", b"\n"):  # behind an incomplete line
             self._file.write("\n")
             self._file.flush()
 
-    def __enter__(self) -> RowFile:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-                 ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def append(self, row: Row) -> None:
@@ -261,18 +257,9 @@ def read_rows(path: Path) -> list[Row]:
     return [row for row in rows if isinstance(row, dict)]
 
 
-def _ends_with_newline(path: Path) -> bool:
-    """Whether the last line is complete; an empty file has no last line."""
-    with path.open("rb") as file:
-        if not file.seek(0, os.SEEK_END):
-            return True
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) == b"\n"
-
-
 def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], processes: int,
                      describe_failure: Callable[[Job, str], Result], attempts: int = 3,
-                     choose_limit: Callable[[Job], float] | None = None,
+                     choose_limit: Callable[[Job], float] = lambda _: UNLIMITED,
                      patience: float = 1.0) -> Iterator[tuple[Job, Result]]:
     """Each job with its result as soon as it is finished, in any order.
 
@@ -283,7 +270,6 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
         describe_failure: makes the result of a job from the job and the reason why it has none.
         attempts: a job that this many workers have died of has failed.
         choose_limit: the s that a job may take; the worker of one that takes longer is ended, and the job has failed.
-            None: no limit.
         patience: s that the workers together have to end their jobs when they are told to stop. Then they are killed
             with the processes that they started: compiled code may run for seconds before Python sees a signal.
 
@@ -295,42 +281,33 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
     workers: list[_Worker[Job]] = []
     clock = WallClock()
     try:
-        workers += [_Worker(work) for _ in range(min(processes, len(jobs)))]
-        while workers:
-            for worker in _find_overdue(workers, clock.now()):
-                workers.remove(worker)
-                worker.stop(patience)
-                assert worker.job is not None and choose_limit is not None
-                late = worker.job[0]
-                if waiting:
-                    workers.append(_Worker(work))
-                yield late, describe_failure(late, f"it took longer than {choose_limit(late):g} s")
-            for worker in _wait_for_messages(workers, clock.now()) if workers else []:
-                finished = worker.job
-                try:
-                    message = worker.receive()
-                except _WorkerDiedError:
+        while waiting or workers:
+            while waiting and len(workers) < processes:
+                workers.append(_Worker(work, *waiting.popleft()))
+            for worker in _wait_for_messages(workers, clock):
+                job, attempt = worker.job, worker.attempt
+                state, result = worker.receive()
+                if state in (_DONE, _RAISED) and waiting:
+                    worker.job, worker.attempt = waiting.popleft()
+                elif state != _STARTED:
                     workers.remove(worker)
-                    worker.stop()
-                    if finished is None:
-                        raise RigError("a worker process died while it was starting") from None
-                    job, attempt = finished
-                    if attempt < attempts:
-                        waiting.append((job, attempt + 1))
-                    else:
-                        yield job, describe_failure(job, describe_deaths(attempts, worker.process.exitcode))
-                    if waiting:
-                        workers.append(_Worker(work))
+                    worker.stop(patience if state == _LATE else 5.0)
+                if worker in workers:
+                    worker.start_job(clock.now() + round(1e9 * choose_limit(worker.job)))
+                if state == _STARTED:
                     continue
-                if waiting:
-                    job, attempt = waiting.popleft()
-                    limit = None if choose_limit is None else clock.now() + round(1e9 * choose_limit(job))
-                    worker.assign((job, attempt), limit)
-                else:
-                    workers.remove(worker)
-                    worker.stop()
-                if finished is not None:
-                    yield finished[0], message.unpack()
+                if state == _RAISED:
+                    raise result
+                if state == _DIED and not worker.is_started:
+                    raise RigError("a worker process died while it was starting")
+                if state == _DIED and attempt < attempts:
+                    waiting.append((job, attempt + 1))
+                    continue
+                if state == _DIED:
+                    result = describe_failure(job, describe_deaths(attempts, worker.process.exitcode))
+                elif state == _LATE:
+                    result = describe_failure(job, f"it took longer than {choose_limit(job):g} s")
+                yield job, result
     finally:
         for worker in workers:  # all at once: each may need its time to come to an end
             worker.ask_to_stop()
@@ -348,50 +325,38 @@ def describe_deaths(attempts: int, exit_code: int | None) -> str:
     return f"its process ended with status {exit_code}"
 
 
-class _Message(NamedTuple):
-    """What a worker sends: the result of its job, or the exception; neither when it has just started."""
-
-    result: Any = None
-    error: Exception | None = None
-
-    def unpack(self) -> Any:
-        """The result. Raises the exception if there is one."""
-        if self.error is not None:
-            raise self.error
-        return self.result
-
-
-class _WorkerDiedError(Exception):
-    """The process at the other end of a connection has ended."""
+_STARTED, _DONE, _RAISED, _DIED, _LATE = range(5)  # what becomes of a worker: the first three it says itself
 
 
 class _Worker(Generic[Job]):
-    """A worker process; `job` is the job it has, with the number of the attempt, or None when it has none."""
+    """A worker process with a job, and how many have tried this job with it."""
 
-    def __init__(self, work: Callable[[Job], Any]) -> None:
+    def __init__(self, work: Callable[[Job], Any], job: Job, attempt: int) -> None:
         context = get_context("spawn")
         self.connection, far_end = context.Pipe()
         self.process = context.Process(target=_serve_jobs, args=(far_end, work), daemon=True)
         with ignore_interrupts():
             self.process.start()
         far_end.close()
-        self.job: tuple[Job, int] | None = None
-        self.due_ns: int | None = None  # when its job must have ended
-        self.is_idle = False  # not before it has said that it has started
+        self.job, self.attempt = job, attempt
+        self.due_ns = round(1e9 * UNLIMITED)  # when its job must have ended
+        self.is_started = self.is_idle = False  # before it has said so
 
-    def assign(self, job: tuple[Job, int], due_ns: int | None) -> None:
-        """Give the worker a job and the number of the attempt, and the time when it must have ended."""
-        self.job, self.is_idle, self.due_ns = job, False, due_ns
+    def start_job(self, due_ns: int) -> None:
+        """Send the worker its job, which must have ended by that time."""
+        self.is_started, self.is_idle, self.due_ns = True, False, due_ns
         with contextlib.suppress(OSError):  # it has died since; `receive` will notice
-            self.connection.send(job[0])
+            self.connection.send(self.job)
 
-    def receive(self) -> _Message:
-        """The worker's message. Raises _WorkerDiedError."""
+    def receive(self) -> tuple[int, Any]:
+        """What has become of the worker, and the result or exception of its job."""
+        if not self.connection.poll():
+            return _LATE, None
         try:
-            message: _Message = self.connection.recv()
+            message: tuple[int, Any] = self.connection.recv()
         except (EOFError, OSError):
-            raise _WorkerDiedError from None
-        self.job, self.is_idle, self.due_ns = None, True, None
+            return _DIED, None
+        self.is_idle = True
         return message
 
     def ask_to_stop(self) -> None:
@@ -402,7 +367,7 @@ class _Worker(Generic[Job]):
         if not self.is_idle:
             self.process.terminate()
 
-    def stop(self, patience: float = 5.0) -> None:
+    def stop(self, patience: float) -> None:
         """End the process; after `patience` s it is killed, with the processes that it started."""
         self.ask_to_stop()
         self.process.join(patience)
@@ -423,31 +388,25 @@ def list_descendants(number: int) -> list[int]:
     return [*found, *(below for child in found for below in list_descendants(child))]
 
 
-def _find_overdue(workers: Sequence[_Worker[Job]], now_ns: int) -> list[_Worker[Job]]:
-    """The workers whose job has taken too long."""
-    return [worker for worker in workers
-            if worker.due_ns is not None and now_ns >= worker.due_ns and not worker.connection.poll()]
-
-
-def _wait_for_messages(workers: Sequence[_Worker[Job]], now_ns: int) -> list[_Worker[Job]]:
-    """The workers that have sent something or have died; none if a job takes too long before that."""
-    due = [worker.due_ns for worker in workers if worker.due_ns is not None]
-    seconds = max(0.0, 1e-9 * (min(due) - now_ns)) if due else None
-    ready = connection.wait([worker.connection for worker in workers], seconds)
-    return [worker for worker in workers if worker.connection in ready]
+def _wait_for_messages(workers: Sequence[_Worker[Job]], clock: WallClock) -> list[_Worker[Job]]:
+    """The workers that have sent something, have died or have taken too long."""
+    seconds = 1e-9 * (min(worker.due_ns for worker in workers) - clock.now())
+    ready = connection.wait([worker.connection for worker in workers], min(max(seconds, 0.0), 3600.0))
+    now = clock.now()
+    return [worker for worker in workers if worker.connection in ready or worker.due_ns <= now]
 
 
 def _serve_jobs(parent: Any, work: Callable[[Any], Any]) -> None:
     """The main function of a worker process: do the jobs that come until the parent closes the connection."""
     signal.signal(signal.SIGTERM, _exit_on_signal)
     with contextlib.suppress(EOFError, OSError):  # the parent has closed the connection, or is gone
-        parent.send(_Message())
+        parent.send((_STARTED, None))
         while True:
             job = parent.recv()
             try:
-                message = _Message(work(job))
+                message = _DONE, work(job)
             except Exception as error:
-                message = _Message(error=_make_picklable(error))
+                message = _RAISED, _make_picklable(error)
             parent.send(message)
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from plant.errors import InputError
@@ -21,53 +20,33 @@ MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
 PART = ".part"
 
 
-class CampaignFolder:
-    """A campaign's folder, opened for writing by one process at a time; `file` holds its rows.
+def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
+    """Open the rows of a campaign's folder for writing by one process at a time; an empty folder becomes its own.
 
     Raises:
         InputError: the folder belongs to another matrix or to something else, the code has changed since the campaign
             was started, another process is at work in it, or it cannot be written.
     """
-
-    def __init__(self, path: str | Path, matrix: Matrix, sources: str) -> None:
-        self.path = Path(path)
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._claim(matrix, sources)
-        except OSError as error:
-            raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
-        self.file = RowFile(self.path / ROWS)
-
-    def __enter__(self) -> CampaignFolder:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-                 ) -> None:
-        self.file.__exit__(kind, error, where)
-
-    def _claim(self, matrix: Matrix, sources: str) -> None:
-        """Make sure that the folder is this campaign's; an empty one becomes so."""
-        expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
-        if is_campaign_folder(self.path):
-            present = _read_campaign(self.path)
-            if present["matrix"] != expected["matrix"]:
-                changed = ", ".join(_list_differences(present["matrix"], expected["matrix"]))
-                raise InputError(self.path, "--out", f"a folder of this matrix, or a new one; it differs in {changed}")
+    folder = Path(path)
+    expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if is_campaign_folder(folder):
+            present = _read_campaign(folder)
+            changed = [key for key in {**present["matrix"], **expected["matrix"]}
+                       if present["matrix"].get(key) != expected["matrix"].get(key)]
+            if changed:
+                raise InputError(path, "--out", "a folder of this matrix, or a new one; it differs in "
+                                                f"{', '.join(changed)}")
             if present["code"] != sources:
-                raise InputError(self.path, "--out", "a new folder: the code has changed since this campaign was "
-                                                     "started")
-            return
-        if any(not file.name.endswith(PART) for file in self.path.iterdir()):
-            raise InputError(self.path, "--out", "an empty folder, or one of this campaign")
-        replace_file(self.path / MATRIX, (json.dumps(expected, indent=1) + "\n").encode())
-
-    def newest_rows(self) -> list[Row]:
-        """The newest row of each finished case, in the matrix's order."""
-        return _select_newest(self.file.rows)
-
-    def write_results(self) -> None:
-        """Write all rows so far to results.parquet."""
-        write_parquet(self.path / RESULTS, self.newest_rows(), _read_campaign(self.path))
+                raise InputError(path, "--out", "a new folder: the code has changed since this campaign was started")
+        elif any(not file.name.endswith(PART) for file in folder.iterdir()):
+            raise InputError(path, "--out", "an empty folder, or one of this campaign")
+        else:
+            replace_file(folder / MATRIX, (json.dumps(expected, indent=1) + "\n").encode())
+    except OSError as error:
+        raise InputError(path, "", f"a folder that can be written ({error.strerror})") from error
+    return RowFile(folder / ROWS)
 
 
 def is_campaign_folder(folder: str | Path) -> bool:
@@ -88,7 +67,7 @@ def read_campaign_rows(source: str | Path) -> list[Row]:
     """
     path = Path(source)
     if path.is_dir() and is_campaign_folder(path):
-        return _select_newest(read_rows(path / ROWS))
+        return select_newest(read_rows(path / ROWS))
     if path.suffix != ".parquet" or not path.is_file():
         raise InputError(source, "", f"the folder of a campaign, or its {RESULTS}")
     parquet = import_pyarrow()[1]
@@ -99,13 +78,13 @@ def read_campaign_rows(source: str | Path) -> list[Row]:
     return [{key: value for key, value in row.items() if value is not None} for row in rows]
 
 
-def write_parquet(path: Path, rows: Iterable[Row], metadata: Mapping[str, Any]) -> None:
-    """Replace a Parquet file by one with these rows; `metadata` goes into its schema, under "campaign"."""
+def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
+    """Replace results.parquet by one with the newest row of each case; the matrix goes into its schema."""
     pa, parquet = import_pyarrow()
-    rows = list(rows)
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
-    table = table.replace_schema_metadata({"campaign": json.dumps(metadata)})
+    path, newest = Path(folder) / RESULTS, select_newest(rows)
+    names = list(dict.fromkeys(name for row in newest for name in row))
+    table = pa.table({name: pa.array([row.get(name) for row in newest]) for name in names})
+    table = table.replace_schema_metadata({"campaign": json.dumps(_read_campaign(Path(folder)))})
     part = path.with_name(path.name + PART)
     parquet.write_table(table, part)
     part.replace(path)
@@ -147,12 +126,7 @@ def _read_campaign(folder: Path) -> dict[str, Any]:
         raise InputError(folder / MATRIX, "", f"the matrix of a campaign ({type(error).__name__})") from None
 
 
-def _select_newest(rows: Iterable[Row]) -> list[Row]:
+def select_newest(rows: Iterable[Row]) -> list[Row]:
     """The last row of each case, ordered by its number."""
     newest = {row["case"]: row for row in rows if "case" in row}
     return [newest[number] for number in sorted(newest)]
-
-
-def _list_differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The keys whose values differ."""
-    return [key for key in {**one, **other} if one.get(key) != other.get(key)]

@@ -19,7 +19,7 @@ from plant.errors import RigError
 from plant.model import parse_model
 from plant.threads import count_threads
 from rig.campaign.batch import Batch, BatchProgress, Row, Workers, run_batch
-from rig.campaign.folder import CampaignFolder, import_pyarrow
+from rig.campaign.folder import import_pyarrow, open_campaign, select_newest, write_results
 from rig.campaign.matrix import Case, Matrix
 from rig.campaign.units import simulate_case
 from rig.network.clock import WallClock
@@ -43,7 +43,7 @@ def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Ro
     try:
         trace = Trace.read(case.trace) if case.trace else simulate_case(case, spec, model)
         start = clock.now()
-        row |= {"status": OK, **load_judgement(spec["work"])(trace, model), "seconds": (clock.now() - start) * 1e-9}
+        row |= {"status": OK, **_load_judgement(spec)(trace, model), "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:
         row |= {"status": REFUSED, "reason": " ".join(str(error).split())}
     except Exception as error:
@@ -62,17 +62,12 @@ def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
                   "true_fss": case.sizes.get("spool_friction", model["spool.static_friction"])}
 
 
+def _load_judgement(spec: Mapping[str, Any]) -> Judgement:
+    return import_function(spec["work"], "--work", "a judgement")
+
+
 def _parse_healthy_model(spec: Mapping[str, Any]) -> Model:
     return parse_model(tomllib.loads(spec["model"]), "campaign")
-
-
-def load_judgement(name: str) -> Judgement:
-    """The judgement "module:function".
-
-    Raises:
-        InputError: there is no such function.
-    """
-    return import_function(name, "--work", "a judgement")
 
 
 def hash_campaign_sources() -> str:
@@ -138,15 +133,15 @@ def run_campaign(matrix: Matrix, folder: str | Path, workers: Workers,
             extra is not installed.
         RigError: the cluster is gone.
     """
-    load_judgement(matrix.spec["work"])
+    _load_judgement(matrix.spec)
     import_pyarrow()
     sources = hash_campaign_sources()
-    with CampaignFolder(folder, matrix, sources) as results:
+    with open_campaign(folder, matrix, sources) as file:
         try:
-            run_batch(plan_batch(matrix, sources, count, redo_failed), results.file, workers, report_progress)
+            run_batch(plan_batch(matrix, sources, count, redo_failed), file, workers, report_progress)
         finally:
-            results.write_results()
-        return results.newest_rows()
+            write_results(folder, file.rows)
+        return select_newest(file.rows)
 
 
 def plan_batch(matrix: Matrix, sources: str, count: int | None = None, redo_failed: bool = False) -> Batch:
@@ -156,12 +151,11 @@ def plan_batch(matrix: Matrix, sources: str, count: int | None = None, redo_fail
     def describe_failure(case: Case, reason: str) -> Row:
         return describe_case(case, shared) | {"reason": reason}
 
-    def is_failed(row: Row) -> bool:
-        return bool(row["status"] == FAILED)
-
-    def is_valid(row: Row) -> bool:
-        return not (redo_failed and is_failed(row))
-
     return Batch(jobs={case.number: case for case in matrix.cases[:count]},
                  work=partial(judge_case, spec=shared, expected_sources=sources), key="case",
-                 describe_failure=describe_failure, is_valid=is_valid, is_failed=is_failed)
+                 describe_failure=describe_failure, is_failed=_has_failed,
+                 is_valid=lambda row: not (redo_failed and _has_failed(row)))
+
+
+def _has_failed(row: Row) -> bool:
+    return bool(row["status"] == FAILED)

@@ -18,29 +18,45 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from fdi.prognosis.unit_trend import list_traces
-from plant.effects import Effect
-from plant.errors import InputError, suggest_name
+from plant.errors import InputError
 from plant.model import Model, find_effect
 from plant.parameters import parse_toml, parse_value, read_toml
+from rig.sequences.tables import Place, Range, build_dataclass
 from rig.sequences.timing import PERIOD
 
 OWN_SIMULATOR = "plant"
-SIGNALS = ("xj,p12,xs", "xj,p12", "xj")
 HEALTHY = "healthy"
-DEFAULTS: dict[str, Any] = {
-    "seeds": 20,  # runs of each size
-    "first": 0,  # seed of the first
-    "tolerance": [0.015],
-    "simulator": OWN_SIMULATOR,  # plant.simulate in 10 us steps, or "module:function"
-    "colour": 0.8,  # correlation of the position sensor's noise from one cycle to the next
-    "hum": 0.7e-6,  # m, of the mains on it
-    "signals": "xj,p12,xs",  # measured
-}
+Tolerance = Annotated[float, Range("1", low=0.0, high=0.2)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """The keys above the first [[case]]; a case may override seeds and tolerance."""
+
+    seeds: Annotated[int, Range("1", low=1)] = 20  # runs of each size
+    first: Annotated[int, Range("1", low=0)] = 0  # seed of the first
+    tolerance: Tolerance | tuple[Tolerance, ...] = (0.015,)
+    simulator: str = OWN_SIMULATOR  # plant.simulate in 10 us steps, or "module:function"
+    colour: Annotated[float, Range("1", low=0.0, high=0.99)] = 0.8  # correlation of xj's noise between cycles
+    hum: Annotated[float, Range("m", low=0.0, high=1e-3)] = 0.7e-6  # of the mains on the position sensor
+    signals: Literal["xj,p12,xs", "xj,p12", "xj"] = "xj,p12,xs"  # measured
+
+    def __post_init__(self) -> None:
+        if self.tolerance == ():
+            raise InputError("matrix", "tolerance", "at least one")
+        if self.simulator != OWN_SIMULATOR and ":" not in self.simulator:
+            raise InputError("matrix", "simulator", f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {self.simulator!r}")
+
+    def list_values(self) -> dict[str, Any]:
+        """JSON values, with a list of tolerances."""
+        given = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
+        return {**asdict(self), "tolerance": list(given)}
 
 
 class Case(NamedTuple):
@@ -80,86 +96,37 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
     Raises:
         InputError: an unknown key or effect, a value out of range, another plant than `eha`, or no case at all.
     """
+    place = Place(str(where))
     given = {key: value for key, value in tables.items() if key != "case"}
-    for key in given.keys() - DEFAULTS.keys():
-        raise InputError(where, key, f"one of {', '.join([*DEFAULTS, '[[case]]'])}{suggest_name(key, DEFAULTS)}")
-    common = {**DEFAULTS, **given}
-    _check_common(common, where)
-    _check_model(model)
-    blocks = tables.get("case", [])
-    if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
-        raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
-    parsed = [_parse_block(block, common, model, where) for block in blocks]
-    spec = {**common, "model": model.to_toml(), "work": work, "case": parsed}
-    return Matrix(spec, _expand_cases(spec))
-
-
-def _check_common(common: dict[str, Any], where: object) -> None:
-    """Check the keys that all cases share; numbers become floats. Raises InputError."""
-    common["tolerance"] = _check_tolerances(common["tolerance"], where)
-    common["colour"] = _check_number(where, "colour", common["colour"], 0.0, 0.99)
-    common["hum"] = _check_number(where, "hum", common["hum"], 0.0, 1e-3)
-    if common["simulator"] != OWN_SIMULATOR and ":" not in str(common["simulator"]):
-        raise InputError(where, "simulator", f"{OWN_SIMULATOR} or MODULE:FUNCTION, not {common['simulator']!r}")
-    if common["signals"] not in SIGNALS:
-        raise InputError(where, "signals", f"one of {'; '.join(SIGNALS)}, not {common['signals']!r}")
-    _check_count(where, "seeds", common["seeds"], 1)
-    _check_count(where, "first", common["first"], 0)
-
-
-def _check_model(model: Model) -> None:
-    """Accept only the plant and the period that the preflight check, its scatter and its noise are made for."""
+    settings = build_dataclass(Settings, given, place)
     if model.plant != "eha":
         raise InputError("--model", model.plant, "eha, whose preflight check this is")
     if model["controller.period"] != PERIOD:
         raise InputError("--set", "controller.period", f"{PERIOD:g} s, the cycle of the preflight check")
+    blocks = tables.get("case", [])
+    if not isinstance(blocks, list) or not blocks or not all(isinstance(block, Mapping) for block in blocks):
+        raise InputError(where, "case", "at least one [[case]] (an empty one is a healthy plant)")
+    parsed = [_parse_block(block, given, model, place) for block in blocks]
+    spec = {**settings.list_values(), "model": model.to_toml(), "work": work, "case": parsed}
+    return Matrix(spec, _expand_cases(spec))
 
 
-def _check_tolerances(value: Any, where: object) -> list[float]:
-    if value == []:
-        raise InputError(where, "tolerance", "at least one")
-    return [_check_number(where, "tolerance", x, 0.0, 0.2) for x in _as_list(value)]
-
-
-def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, where: object) -> dict[str, Any]:
+def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Model, place: Place) -> dict[str, Any]:
     """A [[case]] table with its defaults filled in. Raises InputError."""
+    own = {key: value for key, value in block.items() if key in ("seeds", "tolerance")}
+    settings = build_dataclass(Settings, {**common, **own}, place).list_values()
     sizes = {}
     for name, values in block.items():
-        if name in ("seeds", "tolerance"):
-            continue
-        effect = _find_sized_effect(name, model, where)
-        quantity = effect.parameters[effect.fitted[0]]
-        sizes[name] = [parse_value(where, name, quantity, value) for value in _as_list(values)]
-        if not sizes[name]:
-            raise InputError(where, name, "at least one size")
-    return {"seeds": _check_count(where, "seeds", block.get("seeds", common["seeds"]), 1), "sizes": sizes,
-            "tolerance": _check_tolerances(block.get("tolerance", common["tolerance"]), where)}
-
-
-def _find_sized_effect(name: str, model: Model, where: object) -> Effect:
-    try:
-        found = find_effect(name, model.plant)
-    except InputError as error:
-        raise InputError(where, name, error.expected) from error
-    if not found.fitted:
-        raise InputError(where, name, "an effect with a size; this one is noise of the bench")
-    return found
-
-
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
-def _check_number(where: object, field: str, value: Any, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise InputError(where, field, f"a number from {low:g} to {high:g}, not {value!r}")
-    return float(value)
-
-
-def _check_count(where: object, field: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise InputError(where, field, f"a whole number from {least}, not {value!r}")
-    return value
+        if name not in own:
+            with place.at(name).locate():
+                effect = find_effect(name, model.plant)
+                if not effect.fitted:
+                    raise InputError("", name, "an effect with a size; this one is noise of the bench")
+                sizes[name] = [parse_value("", name, effect.parameters[effect.fitted[0]], value)
+                               for value in (values if isinstance(values, list) else [values])]
+                if not sizes[name]:
+                    raise InputError("", name, "at least one size")
+    return {"seeds": settings["seeds"], "sizes": sizes, "tolerance": settings["tolerance"]}
 
 
 def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:

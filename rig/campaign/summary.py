@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,70 +15,35 @@ from rig.campaign.batch import Row
 from rig.campaign.judge import CANNOT_TELL, FAILED, OK, REFUSED
 from rig.campaign.matrix import HEALTHY, label_plant
 
+Figures = dict[str, Any]  # JSON values
+# The paper's second worked case, which no cell of a 21 x 21 grid hits.
 OFF_GRID = label_plant({"filter_clogging": 0.17, "spool_friction": 45.0})
-"""The paper's second worked case, which no cell of a 21 x 21 grid hits."""
-CLOSE = {CLOGGING.name: 0.05, FRICTION.name: 0.02}
-"""Largest relative error of an estimate of the off-grid case."""
+CLOSE = {CLOGGING.name: 0.05, FRICTION.name: 0.02}  # largest relative error of an estimate of the off-grid case
 LEVELS = [level.word for level in Level]
+FAULT_NAMES = {fault.name: fault for fault in FAULTS}
 
 
-class Rate(NamedTuple):
-    """A required share, and the share that was counted."""
+def judge_rate(name: str, share: Share, least: float = 0.0, most: float = 1.0) -> Figures:
+    """A share and whether it is in the required range; None if nothing is required, or too few cases were counted.
 
-    name: str
-    share: Share
-    least: float = 0.0  # required
-    most: float = 1.0  # required; from 0 to 1 nothing is required, and the share is for information
-
-    @property
-    def met(self) -> bool | None:
-        """Whether the share is in the required range; None if nothing is required, or too few cases were counted.
-
-        Too few are fewer than 20, or so few that a single wrong case would miss the range. They are enough when the
-        whole interval is outside the range.
-        """
-        if (self.least, self.most) == (0.0, 1.0) or not self.share.of:
-            return None
-        if self.share.low > self.most or self.share.high < self.least:
-            return False
-        if self.share.of < max(20, round(1.0 / self._allowed_share())):
-            return None
-        return self.least <= self.share.value <= self.most
-
-    def _allowed_share(self) -> float:
-        """The share of wrong cases that the requirement allows, or the width of a range inside 0 to 1."""
-        if self.least == 0.0:
-            return self.most
-        if self.most == 1.0:
-            return 1.0 - self.least
-        return self.most - self.least
+    Too few are fewer than 20, or so few that a single wrong case would miss the range. They are enough when the whole
+    interval is outside the range. From 0 to 1 nothing is required, and the share is for information.
+    """
+    met = None
+    if (least, most) != (0.0, 1.0) and share.of:
+        if share.low > most or share.high < least:
+            met = False
+        elif share.of >= max(20, round(1.0 / (most - least))):
+            met = least <= share.value <= most
+    return {"name": name, "share": format_share(share), "least": least, "most": most, "met": met}
 
 
-class Point(NamedTuple):
-    """How often a single fault of one size is detected."""
-
-    size: float
-    detected: Share  # level beyond acceptable
-    most: Share  # level non-nominal
-    ruling: Share  # named as the ruling fault
-    bands: Share  # beyond acceptable by the bands alone
+def format_share(share: Share) -> Figures:
+    """A share as JSON values: its value beside its count."""
+    return {**share._asdict(), "share": share.value if share.of else None}
 
 
-class Error(NamedTuple):
-    """Errors of the estimates of one fault, over the cases of one label that have an estimate."""
-
-    label: str
-    fault: str
-    truth: float
-    cases: int
-    bias: float
-    rms: float
-    most: float  # 95 % of the errors are smaller
-    close: Share | None  # errors as small as required of the off-grid case; None for a healthy plant
-    covered: Share  # the 95 % interval contains the truth
-
-
-def summarise_campaign(rows: Sequence[Row]) -> dict[str, Any]:
+def summarise_campaign(rows: Sequence[Row]) -> Figures:
     """All figures as JSON values: simulated plants by tolerance, recorded traces one by one.
 
     A refused or failed case detects nothing. It counts among the cases, but never as a false alarm. Rows of a judgement
@@ -87,73 +52,58 @@ def summarise_campaign(rows: Sequence[Row]) -> dict[str, Any]:
     levelled = [row for row in rows if row["status"] != OK or f"level_{CLOGGING.name}" in row]
     simulated = [row for row in levelled if "true_fss" in row]
     tolerances = sorted({row["tolerance"] for row in simulated})
+    shown = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in FAULTS), "kintas", "fss", "trust")
     return {"cases": len(rows), "status": dict(Counter(row["status"] for row in rows)),
             "seconds": summarise_times(rows),
             "tolerances": [_summarise_tolerance(tolerance, [row for row in simulated if row["tolerance"] == tolerance])
                            for tolerance in tolerances],
-            "traces": [_summarise_trace(row) for row in levelled if "true_fss" not in row],
+            "traces": [{name: row.get(name) for name in shown} for row in levelled if "true_fss" not in row],
             "reasons": [{"case": row["label"], "seed": row["seed"], "status": row["status"], "reason": row["reason"]}
                         for row in rows if row["status"] != OK]}
 
 
-def _summarise_tolerance(tolerance: float, rows: Sequence[Row]) -> dict[str, Any]:
+def _summarise_tolerance(tolerance: float, rows: Sequence[Row]) -> Figures:
     """The figures of the simulated plants of one tolerance."""
     false_alarms = [row for row in rows if row["label"] == HEALTHY and is_alarm(row)]
     shown = ("seed", "verdict", *(f"level_{fault.name}" for fault in FAULTS))
-    return {"tolerance": tolerance, "cases": len(rows),
-            "rates": [_to_json(rate) | {"met": rate.met} for rate in count_rates(rows)],
-            "curves": {fault.name: [_to_json(point) for point in count_detections(rows, fault)] for fault in FAULTS},
+    return {"tolerance": tolerance, "cases": len(rows), "rates": count_rates(rows),
+            "curves": {fault.name: count_detections(rows, fault) for fault in FAULTS},
             "levels": {fault.name: count_levels(rows, fault) for fault in FAULTS},
-            "ruling": count_ruling_faults(rows),
-            "errors": [_to_json(error) for error in measure_errors(rows)],
+            "ruling": count_ruling_faults(rows), "errors": measure_errors(rows),
             "false_alarms": [{key: row.get(key) for key in shown} for row in false_alarms]}
 
 
-def _summarise_trace(row: Row) -> dict[str, Any]:
-    names = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in FAULTS), "kintas", "fss", "trust")
-    return {name: row.get(name) for name in names}
-
-
-def count_rates(rows: Sequence[Row]) -> list[Rate]:
+def count_rates(rows: Sequence[Row]) -> list[Figures]:
     """The rates of one tolerance, required ones and those for information, with counts."""
     healthy = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK]
-    rates = [Rate("healthy: false alarm", count_share(healthy, is_alarm), most=0.005),
-             Rate("  event outside a band", count_share(healthy, lambda row: bool(row.get("event_count")))),
-             Rate("  judged acceptable", count_share(healthy, lambda row: row.get("verdict") == "ACCEPTABLE"))]
+    rates = [judge_rate("healthy: false alarm", count_share(healthy, is_alarm), most=0.005),
+             judge_rate("  event outside a band", count_share(healthy, lambda row: bool(row.get("event_count")))),
+             judge_rate("  judged acceptable", count_share(healthy, lambda row: row.get("verdict") == "ACCEPTABLE"))]
     for fault in FAULTS:
         for band, least, size in (("MidBand", 0.95, fault.middle), ("MaxBand", 0.995, fault.most)):
             group = [row for row in select_single_fault(rows, fault) if true_size(row, fault) == size]
-            rates.append(Rate(f"{name_size(fault)} at {band} detected",
-                              count_share(group, partial(is_detected, fault=fault)), least))
+            rates.append(judge_rate(f"{name_size(fault)} at {band} detected",
+                                    count_share(group, partial(is_detected, fault=fault)), least))
     beyond = [row.get("ruling") == fault.name for fault in FAULTS for row in select_single_fault(rows, fault)
               if true_size(row, fault) >= fault.middle]
-    rates.append(Rate("ruling fault, MidBand on", measure_share(sum(beyond), len(beyond)), 0.97))
-    return [*rates, *_count_coverage(rows), *_count_off_grid_rates([row for row in rows if row["label"] == OFF_GRID])]
-
-
-def _count_coverage(rows: Sequence[Row]) -> list[Rate]:
-    """The coverage over all plants that scatter, without those at a bound, where an interval starts at the truth."""
+    rates.append(judge_rate("ruling fault, MidBand on", measure_share(sum(beyond), len(beyond)), 0.97))
+    # The coverage over all plants that scatter, without those at a bound, where an interval starts at the truth.
     errors = measure_errors([row for row in rows if row["tolerance"] > 0.0])
-    rates = []
     for fault in FAULTS:
-        covered = [error.covered for error in errors if error.fault == fault.name and error.truth > 0.0]
-        share = measure_share(sum(share.good for share in covered), sum(share.of for share in covered))
-        rates.append(Rate(f"{name_size(fault)} covered, all", share))
-    return rates
+        covered = [error["covered"] for error in errors if error["fault"] == fault.name and error["truth"] > 0.0]
+        share = measure_share(sum(each["good"] for each in covered), sum(each["of"] for each in covered))
+        rates.append(judge_rate(f"{name_size(fault)} covered, all", share))
+    return [*rates, *_count_off_grid_rates([row for row in rows if row["label"] == OFF_GRID])]
 
 
-def _count_off_grid_rates(rows: Sequence[Row]) -> list[Rate]:
+def _count_off_grid_rates(rows: Sequence[Row]) -> Iterator[Figures]:
     """Without scatter the estimates have to be close; with scatter their intervals have to be right."""
-    rates = []
     for error in measure_errors(rows):
-        name = name_size(next(fault for fault in FAULTS if fault.name == error.fault))
-        is_exact = rows[0]["tolerance"] == 0.0
-        if error.close is not None:
-            rates.append(Rate(f"off-grid {name} within {100 * CLOSE[error.fault]:g} %", error.close,
-                              least=0.95 if is_exact else 0.0))
-        least, most = (0.0, 1.0) if is_exact else (0.93, 0.97)
-        rates.append(Rate(f"off-grid {name} covered", error.covered, least, most))
-    return rates
+        name, is_exact = name_size(FAULT_NAMES[error["fault"]]), rows[0]["tolerance"] == 0.0
+        close, covered = (measure_share(error[key]["good"], error[key]["of"]) for key in ("close", "covered"))
+        yield judge_rate(f"off-grid {name} within {100 * CLOSE[error['fault']]:g} %", close,
+                         least=0.95 if is_exact else 0.0)
+        yield judge_rate(f"off-grid {name} covered", covered, *((0.0, 1.0) if is_exact else (0.93, 0.97)))
 
 
 def name_size(fault: Fault) -> str:
@@ -190,21 +140,23 @@ def true_size(row: Row, fault: Fault) -> float:
     return float(row[f"true_{fault.symbol}"])
 
 
-def count_detections(rows: Sequence[Row], fault: Fault) -> list[Point]:
-    """The detection curve: how often a single fault is detected, by size; the first point is the healthy plant."""
+def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
+    """The detection curve: how often a single fault is detected, by size; the first point is the healthy plant.
+
+    detected: level beyond acceptable; most: non-nominal; ruling: named as the ruling fault; bands: beyond acceptable by
+    the bands alone.
+    """
     healthy = [row for row in rows if row["label"] == HEALTHY and row["status"] == OK]
     groups: dict[float, list[Row]] = {}
     for row in healthy + select_single_fault(rows, fault):
         groups.setdefault(true_size(row, fault), []).append(row)
-    return [_count_detections_of_size(size, groups[size], fault) for size in sorted(groups)]
-
-
-def _count_detections_of_size(size: float, rows: Sequence[Row], fault: Fault) -> Point:
-    return Point(size,
-                 detected=count_share(rows, partial(is_detected, fault=fault)),
-                 most=count_share(rows, partial(is_detected, fault=fault, level=Level.NON_NOMINAL)),
-                 ruling=count_share(rows, lambda row: row.get("ruling") == fault.name),
-                 bands=count_share(rows, partial(is_detected, fault=fault, judged_by="band")))
+    counted: dict[str, Callable[[Row], bool]] = {
+        "detected": partial(is_detected, fault=fault),
+        "most": partial(is_detected, fault=fault, level=Level.NON_NOMINAL),
+        "ruling": lambda row: row.get("ruling") == fault.name,
+        "bands": partial(is_detected, fault=fault, judged_by="band")}
+    return [{"size": size, **{name: format_share(count_share(groups[size], is_good)) for name, is_good in
+                              counted.items()}} for size in sorted(groups)]
 
 
 def count_levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]:
@@ -218,17 +170,14 @@ def count_levels(rows: Iterable[Row], fault: Fault) -> dict[str, dict[str, int]]
     return table
 
 
-def has_other_fault(row: Row) -> bool:
-    """Whether a plant has another fault than clogging and friction."""
-    known = {fault.name for fault in FAULTS}
-    return any(name not in known for name in _list_faults(row))
-
-
 def _list_faults(row: Row) -> list[str]:
     """The names of a plant's faults."""
-    if row["label"] == HEALTHY:
-        return []
-    return [part.partition("=")[0] for part in row["label"].split()]
+    return [] if row["label"] == HEALTHY else [part.partition("=")[0] for part in row["label"].split()]
+
+
+def has_other_fault(row: Row) -> bool:
+    """Whether a plant has another fault than clogging and friction."""
+    return not FAULT_NAMES.keys() >= set(_list_faults(row))
 
 
 def count_ruling_faults(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
@@ -242,44 +191,45 @@ def count_ruling_faults(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
 
 def _describe_faults(row: Row) -> str:
     names = _list_faults(row)
-    if not names:
-        return HEALTHY
-    if len(names) == 1 and not has_other_fault(row):
-        fault = next(fault for fault in FAULTS if fault.name == names[0])
+    if len(names) == 1 and names[0] in FAULT_NAMES:
+        fault = FAULT_NAMES[names[0]]
         return f"{names[0]}, {classify_size(fault, true_size(row, fault)).word}"
-    return " and ".join(names)
+    return " and ".join(names) or HEALTHY
 
 
-def measure_errors(rows: Sequence[Row]) -> list[Error]:
+def measure_errors(rows: Sequence[Row]) -> list[Figures]:
     """Errors of the estimates by label and fault: healthy plants, single faults, both faults, each by size."""
     order = {row["label"]: (row["faults"], row["true_kintas"] == 0.0, row["true_kintas"], row["true_fss"], row["label"])
              for row in rows}
     errors = []
     for label in sorted(order, key=lambda label: order[label]):
-        group = [row for row in rows if row["label"] == label and not has_other_fault(row)]
+        group = [row for row in rows if row["label"] == label and row["status"] == OK and not has_other_fault(row)]
         for fault in FAULTS:
-            estimated = [row for row in group if _has_finite_interval(row, fault)]
+            estimated = [row for row in group if math.isfinite(_measure_width(row, fault))]
             if estimated:
                 errors.append(_measure_error(label, estimated, fault))
     return errors
 
 
-def _has_finite_interval(row: Row, fault: Fault) -> bool:
-    if row["status"] != OK or row.get(f"{fault.symbol}_low") is None:
-        return False
-    return math.isfinite(row[f"{fault.symbol}_high"] - row[f"{fault.symbol}_low"])
+def _measure_width(row: Row, fault: Fault) -> float:
+    """Width of the interval of an estimate; NaN without one."""
+    low = row.get(f"{fault.symbol}_low")
+    return math.nan if low is None else float(row[f"{fault.symbol}_high"] - low)
 
 
-def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Error:
+def _measure_error(label: str, rows: Sequence[Row], fault: Fault) -> Figures:
+    """The errors of the estimates of one fault over the cases of a label.
+
+    most: 95 % of the errors are smaller; close: errors as small as required of the off-grid case, None for a healthy
+    plant; covered: the 95 % interval contains the truth.
+    """
     size = true_size(rows[0], fault)
     error = np.array([row[fault.symbol] for row in rows]) - size
-    close = None
-    if size > fault.healthy:
-        close = measure_share(int((abs(error) <= CLOSE[fault.name] * size).sum()), len(error))
+    close = measure_share(int((abs(error) <= CLOSE[fault.name] * size).sum()), len(error))
     covered = count_share(rows, lambda row: row[f"{fault.symbol}_low"] <= size <= row[f"{fault.symbol}_high"])
-    return Error(label, fault.name, size, len(error), bias=float(error.mean()),
-                 rms=float(np.sqrt((error**2).mean())), most=float(np.quantile(abs(error), 0.95)), close=close,
-                 covered=covered)
+    return {"label": label, "fault": fault.name, "truth": size, "cases": len(error), "bias": float(error.mean()),
+            "rms": float(np.sqrt((error**2).mean())), "most": float(np.quantile(abs(error), 0.95)),
+            "close": format_share(close) if size > fault.healthy else None, "covered": format_share(covered)}
 
 
 def summarise_times(rows: Iterable[Row]) -> dict[str, float]:
@@ -288,12 +238,3 @@ def summarise_times(rows: Iterable[Row]) -> dict[str, float]:
     if not seconds:
         return {}
     return {"median": float(np.median(seconds)), "p95": float(np.quantile(seconds, 0.95)), "most": max(seconds)}
-
-
-def _to_json(record: Any) -> Any:
-    """A named tuple, with those inside it, as a JSON object; a share has its value beside its count."""
-    if isinstance(record, Share):
-        return {**record._asdict(), "share": record.value if record.of else None}
-    if hasattr(record, "_asdict"):
-        return {key: _to_json(value) for key, value in record._asdict().items()}
-    return record

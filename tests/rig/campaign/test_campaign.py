@@ -220,9 +220,9 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     assert "an empty folder" in rig("campaign", *MATRIX, "--out", tmp_path).err
     whole, sources = folder.read_matrix_of_folder(local), cases.hash_campaign_sources()
     with pytest.raises(InputError, match="the code has changed"):
-        folder.CampaignFolder(local, whole, "another")
-    with folder.CampaignFolder(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
-        folder.CampaignFolder(local, whole, sources)
+        folder.open_campaign(local, whole, "another")
+    with folder.open_campaign(local, whole, sources), pytest.raises(InputError, match="no other rig process"):
+        folder.open_campaign(local, whole, sources)
 
 
 @pytest.mark.parametrize(("words", "complaint"), [
