@@ -6,10 +6,10 @@ and `json.to_json(report.data)` prints it for other programs. The report holds f
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 Mood = Literal["", "good", "doubtful", "bad", "neutral", "muted"]
 Align = Literal["left", "right"]
@@ -94,6 +94,16 @@ class Table:
 
 def _as_cell(cell: Cell | str) -> Cell:
     return cell if isinstance(cell, Cell) else Cell(cell)
+
+
+Row = TypeVar("Row")
+
+
+def tabulate(items: Iterable[Row], caption: str, *columns: tuple[Column, Callable[[Row], Cell | str]],
+             terminal_rows: int | None = None) -> list[Table]:
+    """A table with a row for each item, each column with the function that makes its cell; none without items."""
+    rows = [[make_cell(item) for _, make_cell in columns] for item in items]
+    return [Table([column for column, _ in columns], rows, caption, terminal_rows)] if rows else []
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import numpy as np
 from fdi.report.numbers import count_nouns, format_amount, format_signal
 from plant import Model, simulate
 from plant.model import find_quantity
-from plant.quantity import Quantity
 from plant.run import Columns
 from plant.segments import RATE, Array
 from rig.nodes.scenario import require_servovalve
@@ -17,21 +16,18 @@ from rig.run.job import Job
 from rig.run.outcome import LimitReached, find_limits
 from rig.sequences.checks import CheckResult, Guard, evaluate_checks
 from rig.sequences.faults import (
-    BusOff,
     Corrupted,
-    Duplicated,
     Fault,
     Foreign,
+    Frames,
     Jitter,
     Late,
-    Lost,
     Noise,
     Offset,
     Parameter,
     Reset,
     Schedule,
     Short,
-    Silent,
     Stuck,
     require_sensible,
 )
@@ -56,8 +52,11 @@ class Demand(NamedTuple):
 
     def describe(self, value: float) -> str:
         """A value of this figure in the unit of tables: "5 mm"."""
-        unit, scale = SHOWN_UNITS[self.unit]
-        return f"{scale * value:.4g} {unit}"
+        return f"{self.show(value)} {SHOWN_UNITS[self.unit][0]}"
+
+    def show(self, value: float) -> str:
+        """The number alone."""
+        return f"{SHOWN_UNITS[self.unit][1] * value:.4g}"
 
     @property
     def is_violated(self) -> bool:
@@ -241,68 +240,41 @@ def plan_faults(job: Job) -> list[PlannedFault]:
 
 def name_target(fault: Fault) -> str:
     """What a fault acts on: a parameter, a sensor, a frame, a node, or a COB-ID."""
-    match fault:
-        case Parameter():
-            return fault.parameter
-        case Offset() | Stuck():
-            return f"sensor {fault.signal}"
-        case Lost() | Late() | Duplicated() | Corrupted() | Short():
-            return f"frame {fault.frame}"
-        case Jitter():
-            return "frame sync"
-        case Foreign():
-            return f"COB-ID 0x{fault.cob_id:X}"
-        case BusOff() | Silent():
-            return f"node {fault.node}"
-        case Reset():
-            return "node controller"
-    raise AssertionError(fault)
+    for key, words in (("parameter", "{}"), ("signal", "sensor {}"), ("frame", "frame {}"), ("node", "node {}"),
+                       ("cob_id", "COB-ID 0x{:X}")):
+        if hasattr(fault, key):
+            return words.format(getattr(fault, key))
+    return "frame sync" if isinstance(fault, Jitter) else "node controller"
 
 
 def describe_size(fault: Fault, base: Mapping[str, float]) -> str:
     """How large a fault is, in words; `base` has the model's own parameters."""
+    parts: list[str] = []
     match fault:
         case Parameter():
             quantity = find_quantity(fault.parameter)
-            change = " to ".join(_format_parameter(value, quantity) for value in (
-                base[fault.parameter], fault.find_target(quantity)))
-            return change + _describe_ramp(fault.ramp)
-        case Noise():
-            return f"{format_signal(fault.value, fault.signal)} RMS{_describe_ramp(fault.ramp)}"
-        case Offset():
-            return format_signal(fault.value, fault.signal) + _describe_ramp(fault.ramp)
-        case Stuck():
-            return "its last reading" if fault.value is None else format_signal(fault.value, fault.signal)
-        case Lost() | Duplicated():
-            return _describe_frames(fault)
+            words = {number: word for word, number in quantity.words.items()}
+            values = base[fault.parameter], fault.find_target(quantity)
+            parts = [" to ".join(words.get(value) or format_amount(value, quantity.unit) for value in values)]
+        case Offset() | Stuck():
+            of_noise = " RMS" if isinstance(fault, Noise) else ""
+            parts = ["its last reading" if fault.value is None else format_signal(fault.value, fault.signal) + of_noise]
         case Late():
-            return f"{format_amount(fault.delay, 's')}, {_describe_frames(fault)}"
+            parts = [format_amount(fault.delay, "s")]
         case Corrupted():
-            return f"{count_nouns(fault.bits, 'bit')}, {_describe_frames(fault)}"
+            parts = [count_nouns(fault.bits, "bit")]
         case Short():
-            return f"{count_nouns(fault.length, 'byte')} left, {_describe_frames(fault)}"
+            parts = [f"{count_nouns(fault.length, 'byte')} left"]
         case Jitter():
-            return f"up to {format_amount(fault.size, 's')}"
+            parts = [f"up to {format_amount(fault.size, 's')}"]
         case Foreign():
-            return f"{count_nouns(fault.frames, 'frame')} of {count_nouns(fault.length, 'byte')} in " + (
-                "every cycle" if fault.every == 1 else f"one of {fault.every} cycles")
+            parts = [f"{count_nouns(fault.frames, 'frame')} of {count_nouns(fault.length, 'byte')} in "
+                     + ("every cycle" if fault.every == 1 else f"one of {fault.every} cycles")]
         case Reset():
-            return fault.reset
-    return ""
-
-
-def _describe_frames(fault: Lost | Late | Duplicated | Corrupted | Short) -> str:
-    """Which frames a fault hits: "one of 10, each with probability 0.2, at most 3"."""
-    parts = ["every frame" if fault.every == 1 else f"one of {fault.every} frames"]
-    parts += [f"with probability {fault.probability:g}"] if fault.probability < 1.0 else []
-    parts += [f"at most {fault.count}"] if fault.count is not None else []
-    return ", ".join(parts)
-
-
-def _describe_ramp(seconds: float) -> str:
-    return f" within {format_amount(seconds, 's')}" if seconds else ""
-
-
-def _format_parameter(value: float, quantity: Quantity) -> str:
-    word = next((word for word, number in quantity.words.items() if number == value), "")
-    return word or format_amount(value, quantity.unit)
+            parts = [fault.reset]
+    if isinstance(fault, Frames):
+        parts.append("every frame" if fault.every == 1 else f"one of {fault.every} frames")
+        parts += [f"with probability {fault.probability:g}"] if fault.probability < 1.0 else []
+        parts += [f"at most {fault.count}"] if fault.count is not None else []
+    ramp = getattr(fault, "ramp", 0.0)
+    return ", ".join(parts) + (f" within {format_amount(ramp, 's')}" if ramp else "")

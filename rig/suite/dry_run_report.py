@@ -9,11 +9,12 @@ import numpy as np
 
 from fdi.report.drawing import COMMAND, FAULT, GREEN, INK, RED, start_figure, thin_line, to_svg
 from fdi.report.json import to_plain
-from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Figure, Line, Medium, Report, Section, Table, tabulate
 from fdi.report.run_report import format_limits
 from plant.segments import RATE, Array
 from rig.run.job import find_differences
-from rig.suite.dry_run import SHOWN_UNITS, Demand, DryRun
+from rig.sequences.checks import CheckResult
+from rig.suite.dry_run import SHOWN_UNITS, Demand, DryRun, PlannedFault
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,28 +23,28 @@ if TYPE_CHECKING:
 def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> Report:
     """Report on a dry run; `files` are (label, path) of the files written."""
     sequence = dry.job.sequence
-    problems = dry.problems
-    verdict, mood = ("BEYOND_LIMITS", "bad") if problems else ("WITHIN_LIMITS", "good")
+    problems, data = dry.problems, collect_data(dry)
     sentence = "; ".join(problems) if problems else "The actuator can follow this sequence."
     parts = [f"{name} {seconds:g} s" for name, seconds in dry.durations.items() if seconds]
     duration = f"{sum(dry.durations.values()):g} s: {', '.join(parts)}"
-    facts = [("model", dry.job.model.name), ("differs from nominal", find_differences(dry.job).describe()),
+    facts = [("model", dry.job.model.name), ("differs from nominal", data["differences"]),
              ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards)))]
     facts += [("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))] if (
         sequence.steps) else []
+    coloured = " Orange: the faults of the sequence." if dry.faults else ""
+    picture = Figure("Position and speed of the command; position, following error and current of the predicted run of "
+                     "a healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are the windows "
+                     "of the checks, green for a check that passes on the predicted run and red for one that does not."
+                     + coloured, lambda: draw_dry_run(dry))
     return Report(
-        command="check", title=f"Dry run: {sequence.title}", verdict=verdict, mood=_as_mood(mood), sentence=sentence,
-        facts=facts, notes=_list_notes(dry),
-        sections=[Section("Command and load", [Line("duration", duration), _tabulate_demands(dry.demands)]),
-                  Section("Faults", _tabulate_faults(dry)),
+        command="check", title=f"Dry run: {sequence.title}", verdict=data["verdict"],
+        mood="bad" if problems else "good", sentence=sentence, facts=facts, notes=_list_notes(dry),
+        sections=[Section("Command and load", [Line("duration", duration), *_tabulate_demands(dry.demands)]),
+                  Section("Faults", _tabulate_faults(dry.faults)),
                   Section("Predicted run", [Line(name, text) for name, text in describe_prediction(dry)]),
-                  Section("Checks", _tabulate_checks(dry)),
-                  Section("Picture", [_draw(dry)])],
-        files=files, data=collect_data(dry))
-
-
-def _as_mood(word: str) -> Mood:
-    return "bad" if word == "bad" else "good"
+                  Section("Checks", _tabulate_checks(dry.checks)),
+                  Section("Picture", [picture])],
+        files=files, data=data)
 
 
 def _list_notes(dry: DryRun) -> list[str]:
@@ -61,30 +62,28 @@ def _list_notes(dry: DryRun) -> list[str]:
     return notes
 
 
-def _tabulate_demands(demands: Sequence[Demand]) -> Table:
-    columns = [Column("largest"), Column("value", align="right"), Column("limit", align="right"), Column("unit"),
-               Column("limit from"), Column("section"), Column("t", "s", "right")]
-    rows: list[list[Cell | str]] = []
-    for each in demands:
-        if each.value < 1e-9:
-            continue
-        unit, scale = SHOWN_UNITS[each.unit]
-        limit = "" if each.limit is None else f"{scale * each.limit:.4g}"
-        rows.append([each.name, Cell(f"{scale * each.value:.4g}", "bad" if each.is_violated else "", True), limit, unit,
-                     each.parameter if each.limit is not None else "", each.section, f"{each.t:.3f}"])
-    return Table(columns, rows,
-                 "A jump between two sections is a step and counts neither as speed nor as acceleration.")
+def _tabulate_demands(demands: Sequence[Demand]) -> list[Table]:
+    return tabulate(
+        [each for each in demands if each.value >= 1e-9],
+        "A jump between two sections is a step and counts neither as speed nor as acceleration.",
+        (Column("largest"), lambda each: each.name),
+        (Column("value", align="right"),
+         lambda each: Cell(each.show(each.value), "bad" if each.is_violated else "", True)),
+        (Column("limit", align="right"), lambda each: "" if each.limit is None else each.show(each.limit)),
+        (Column("unit"), lambda each: SHOWN_UNITS[each.unit][0]),
+        (Column("limit from"), lambda each: "" if each.limit is None else each.parameter),
+        (Column("section"), lambda each: each.section), (Column("t", "s", "right"), lambda each: f"{each.t:.3f}"))
 
 
-def _tabulate_faults(dry: DryRun) -> list[Table]:
-    if not dry.faults:
-        return []
-    columns = [Column("fault"), Column("kind", medium=Medium.PAGE), Column("target"), Column("from", "s", "right"),
-               Column("to", "s", "right"), Column("duration", "s", "right", Medium.PAGE), Column("size")]
-    rows: list[list[Cell | str]] = [
-        [each.name, each.kind, each.target, f"{each.t0:.3f}", f"{each.t1:.3f}", f"{each.duration:.3f}", each.size]
-        for each in dry.faults]
-    return [Table(columns, rows, "Times count from the start of main; all faults end with it.")]
+def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
+    return tabulate(
+        faults, "Times count from the start of main; all faults end with it.",
+        (Column("fault"), lambda each: each.name), (Column("kind", medium=Medium.PAGE), lambda each: each.kind),
+        (Column("target"), lambda each: each.target),
+        (Column("from", "s", "right"), lambda each: f"{each.t0:.3f}"),
+        (Column("to", "s", "right"), lambda each: f"{each.t1:.3f}"),
+        (Column("duration", "s", "right", Medium.PAGE), lambda each: f"{each.duration:.3f}"),
+        (Column("size"), lambda each: each.size))
 
 
 def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
@@ -102,32 +101,19 @@ def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
     return lines
 
 
-def _tabulate_checks(dry: DryRun) -> list[Table]:
-    if not dry.checks:
-        return []
-    columns = [Column("check"), Column("window", "s"), Column("predicted", align="right"),
-               Column("limits", align="right"), Column("unit"), Column("remark")]
-    rows: list[list[Cell | str]] = []
-    for check in dry.checks:
-        is_measured = check.value == check.value
-        window = f"{check.t0:.3f} .. {check.t1:.3f}" if check.t0 == check.t0 else "-"
-        rows.append([check.name, window,
-                     Cell(f"{check.value:.4g}" if is_measured else "none", "good" if check.passed else "bad", True),
-                     format_limits(check.low, check.high), "" if check.unit == "1" else check.unit, check.detail])
-    return [Table(columns, rows)]
+def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
+    def show_value(check: CheckResult) -> Cell:
+        text = "none" if math.isnan(check.value) else f"{check.value:.4g}"
+        return Cell(text, "good" if check.passed else "bad", True)
 
-
-def _draw(dry: DryRun) -> Figure:
-    faults = " Orange: the faults of the sequence." if dry.faults else ""
-
-    def draw() -> str:
-
-        return draw_dry_run(dry)
-
-    return Figure("Position and speed of the command; position, following error and current of the predicted run of a "
-                  "healthy actuator. Steps have no speed. Red: limits of the actuator. The bars are "
-                  "the windows of the checks, green for a check that passes on the predicted run and red for one that "
-                  "does not." + faults, draw)
+    return tabulate(
+        checks, "",
+        (Column("check"), lambda check: check.name),
+        (Column("window", "s"), lambda check: "-" if math.isnan(check.t0) else f"{check.t0:.3f} .. {check.t1:.3f}"),
+        (Column("predicted", align="right"), show_value),
+        (Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
+        (Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
+        (Column("remark"), lambda check: check.detail))
 
 
 def collect_data(dry: DryRun) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from fdi.report.json import to_plain
 from fdi.report.numbers import count_nouns
-from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Medium, Mood, Report, Section, Table, tabulate
 from fdi.report.run_report import MOODS as RUN_MOODS
 from fdi.report.run_report import format_limits
 from rig import junit
@@ -38,13 +38,16 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
     """
     requirements = trace_requirements(results, suite.requirements)
     verdict = find_verdict(results)
-    facts = [("cases", count_cases(results)), ("wall-clock time", f"{seconds:.1f} s, {processes} at a time")]
+    verdicts = [each.verdict for each in requirements]
+    facts = [("cases", count_verdicts([result.verdict for result in results])),
+             ("wall-clock time", f"{seconds:.1f} s, {processes} at a time")]
     facts += [("suite file", suite.source)] if suite.source else []
-    facts += [("requirements", _count_requirements(requirements))] if requirements else []
+    facts += [("requirements", count_verdicts(verdicts))] if requirements else []
+    missing = [each.id for each in requirements if each.verdict == "NOT_COVERED"]
     return Report(
         command="run", title=suite.title, verdict=verdict, mood=MOODS[verdict], sentence=_describe(results),
-        facts=facts, notes=_list_notes(requirements),
-        sections=[Section("Cases", [_tabulate_cases(results, folder)]),
+        facts=facts, notes=[f"no check verifies {', '.join(missing)}"] if missing else [],
+        sections=[Section("Cases", _tabulate_cases(results, folder)),
                   Section("Checks that failed", _tabulate_failures(results, folder), title_medium=Medium.BOTH),
                   Section("Servovalve", _tabulate_faults(results, folder), title_medium=Medium.BOTH),
                   Section("Requirements", _tabulate_requirements(requirements), title_medium=Medium.BOTH)],
@@ -52,10 +55,9 @@ def build_suite_report(suite: Suite, results: Sequence[CaseResult], seconds: flo
         data=collect_data(suite, results, requirements, seconds, processes))
 
 
-def count_cases(results: Sequence[CaseResult]) -> str:
-    """The number of cases by verdict: "12: 10 PASS, 2 FAIL"."""
-    counts = Counter(result.verdict for result in results)
-    return f"{len(results)}: " + ", ".join(f"{count} {word}" for word, count in counts.most_common())
+def count_verdicts(verdicts: Sequence[str]) -> str:
+    """Their number, and that of each: "12: 10 PASS, 2 FAIL"."""
+    return f"{len(verdicts)}: " + ", ".join(f"{count} {word}" for word, count in Counter(verdicts).most_common())
 
 
 def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
@@ -69,29 +71,17 @@ def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
     return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {named}{more}."
 
 
-def _list_notes(requirements: Sequence[Requirement]) -> list[str]:
-    missing = [each.id for each in requirements if each.verdict == "NOT_COVERED"]
-    return [f"no check verifies {', '.join(missing)}"] if missing else []
-
-
-def _count_requirements(requirements: Sequence[Requirement]) -> str:
-    counts = Counter(each.verdict for each in requirements)
-    return f"{len(requirements)}: " + ", ".join(f"{count} {word}" for word, count in counts.most_common())
-
-
-def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> Table:
-    columns = [Column("case"), Column("verdict"), Column("checks", align="right"), Column("time", "s", "right"),
-               Column("reason"), Column("differs from nominal", medium=Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for result in results:
-        passed = len(result.checks) - len(result.failed)
-        rows.append([Cell(result.case.name, link=_link(result, folder)),
-                     Cell(result.verdict, MOODS[result.verdict]),
-                     f"{passed}/{len(result.checks)}" if result.checks else "-",
-                     f"{result.seconds:.1f}" if result.seconds else "-", result.reason,
-                     Cell("" if result.differences == "nothing" else result.differences, "muted")])
-    caption = "Checks: passed of all, protocol checks included. Time: wall-clock, with the page."
-    return Table(columns, rows, caption)
+def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> list[Table]:
+    return tabulate(
+        results, "Checks: passed of all, protocol checks included. Time: wall-clock, with the page.",
+        (Column("case"), lambda result: Cell(result.case.name, link=_link(result, folder))),
+        (Column("verdict"), lambda result: Cell(result.verdict, MOODS[result.verdict])),
+        (Column("checks", align="right"), lambda result: f"{len(result.checks) - len(result.failed)}/"
+                                                         f"{len(result.checks)}" if result.checks else "-"),
+        (Column("time", "s", "right"), lambda result: f"{result.seconds:.1f}" if result.seconds else "-"),
+        (Column("reason"), lambda result: result.reason),
+        (Column("differs from nominal", medium=Medium.PAGE),
+         lambda result: Cell("" if result.differences == "nothing" else result.differences, "muted")))
 
 
 def _link(result: CaseResult, folder: Path) -> str:
@@ -101,39 +91,38 @@ def _link(result: CaseResult, folder: Path) -> str:
 
 
 def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Table]:
-    failures = [(result, check) for result in results for check in result.failed]
-    if not failures:
-        return []
-    columns = [Column("case"), Column("check"), Column("measured", align="right"), Column("limits", align="right"),
-               Column("unit"), Column("requirement")]
-    rows: list[list[Cell | str]] = [
-        [Cell(result.case.name, link=_link(result, folder)), check.name,
-         Cell(_format_value(check), "bad" if result.verdict == "FAIL" else "doubtful"),
-         format_limits(check.low, check.high), "" if check.unit == "1" else check.unit, ", ".join(check.requirement)]
-        for result, check in failures]
-    return [Table(columns, rows, terminal_rows=30)]
+    return tabulate(
+        [(result, check) for result in results for check in result.failed], "",
+        (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder))),
+        (Column("check"), lambda row: row[1].name),
+        (Column("measured", align="right"),
+         lambda row: Cell(_format_value(row[1]), "bad" if row[0].verdict == "FAIL" else "doubtful")),
+        (Column("limits", align="right"), lambda row: format_limits(row[1].low, row[1].high)),
+        (Column("unit"), lambda row: "" if row[1].unit == "1" else row[1].unit),
+        (Column("requirement"), lambda row: ", ".join(row[1].requirement)), terminal_rows=30)
 
 
 def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]:
-    """Level and size of both faults in each case that asked for a diagnosis."""
-    diagnosed = [result for result in results if result.fdi]
-    if not diagnosed:
-        return []
+    """Level and size of both faults in each case that asked for a diagnosis; what both share stands once."""
     from fdi.report.diagnosis_report import LEVEL_MOODS, LEVEL_NAMES, VERDICT_MOODS, FoundFault, list_found_faults
 
     moods = {name: LEVEL_MOODS[level] for level, name in LEVEL_NAMES.items()}
-    columns = [Column("case"), Column("rig fdi"), Column("fault", medium=Medium.PAGE), Column("level"),
-               Column("size (95 % interval)", align="right"), Column("finding", medium=Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for result in diagnosed:
-        word = result.fdi["verdict"]
-        mood = VERDICT_MOODS.get(word, "bad" if result.has_fault else "doubtful")
-        name, sentence = Cell(result.case.name, link=_link(result, folder)), result.fdi["sentence"]
-        for found in list_found_faults(result.fdi) or [FoundFault("", "", "")]:
-            rows.append([name, Cell(word, mood), found.name, Cell(found.level, moods.get(found.level, "")), found.size,
-                         sentence])
-            name, word, sentence = Cell(""), "", ""  # once for both faults
-    return [Table(columns, rows, "A fault beyond acceptable, or another deviation, fails the case.", terminal_rows=30)]
+    rows = [(result if number == 0 else None, found) for result in results if result.fdi
+            for number, found in enumerate(list_found_faults(result.fdi) or [FoundFault("", "", "")])]
+
+    def show_verdict(result: CaseResult | None) -> Cell:
+        word = result.fdi["verdict"] if result else ""
+        return Cell(word, VERDICT_MOODS.get(word, "bad" if result and result.has_fault else "doubtful"))
+
+    return tabulate(
+        rows, "A fault beyond acceptable, or another deviation, fails the case.",
+        (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder)) if row[0] else ""),
+        (Column("rig fdi"), lambda row: show_verdict(row[0])),
+        (Column("fault", medium=Medium.PAGE), lambda row: row[1].name),
+        (Column("level"), lambda row: Cell(row[1].level, moods.get(row[1].level, ""))),
+        (Column("size (95 % interval)", align="right"), lambda row: row[1].size),
+        (Column("finding", medium=Medium.PAGE), lambda row: row[0].fdi["sentence"] if row[0] else ""),
+        terminal_rows=30)
 
 
 def _format_value(check: CheckResult) -> str:
@@ -141,16 +130,14 @@ def _format_value(check: CheckResult) -> str:
 
 
 def _tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
-    if not requirements:
-        return []
-    columns = [Column("requirement"), Column("text", medium=Medium.PAGE), Column("verdict"),
-               Column("checks", align="right"), Column("verified by", medium=Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for each in requirements:
-        passed = sum(evidence.verdict == "PASS" for evidence in each.evidence)
-        rows.append([each.id, each.text, Cell(each.verdict, MOODS[each.verdict]), f"{passed}/{len(each.evidence)}",
-                     describe_evidence(each.evidence)])
-    return [Table(columns, rows, "OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.")]
+    return tabulate(
+        requirements, "OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.",
+        (Column("requirement"), lambda each: each.id),
+        (Column("text", medium=Medium.PAGE), lambda each: each.text),
+        (Column("verdict"), lambda each: Cell(each.verdict, MOODS[each.verdict])),
+        (Column("checks", align="right"), lambda each: f"{sum(proof.verdict == 'PASS' for proof in each.evidence)}/"
+                                                       f"{len(each.evidence)}"),
+        (Column("verified by", medium=Medium.PAGE), lambda each: describe_evidence(each.evidence)))
 
 
 def describe_evidence(evidence: Sequence[Evidence], most: int = 3) -> str:
@@ -225,9 +212,8 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
 
 
 def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> junit.TestCase:
-    value = "not measurable" if check.value != check.value else f"{check.value:.4g}"
     unit = "" if check.unit == "1" else f" {check.unit}"
-    measured = f"measured {value}{unit}, limits {format_limits(check.low, check.high)}{unit}"
+    measured = f"measured {_format_value(check)}{unit}, limits {format_limits(check.low, check.high)}{unit}"
     measured += f" ({check.detail})" if check.detail else ""
     window = "" if check.t0 != check.t0 else f"; window {check.t0:.3f} to {check.t1:.3f} s"
     test = junit.TestCase(check.name, classname, output="\n".join(

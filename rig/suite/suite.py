@@ -14,20 +14,21 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NamedTuple
 
-from fdi.progress import Progress, ignore_progress
+from fdi.progress import ignore_progress
 from fdi.report.run_report import write_run_page
 from plant.errors import InputError, RigError
 from rig.campaign.batch import run_in_processes
 from rig.network.clock import WallClock
 from rig.run.job import JobChoice, build_job, find_differences
-from rig.run.outcome import Outcome, describe_finding, diagnose_servovalve, has_fault
+from rig.run.outcome import INTERRUPTED, Outcome, describe_finding, diagnose_servovalve, has_fault
 from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
 from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import load_sequence
-from rig.sequences.tables import Place, build_dataclass, parse_table
+from rig.sequences.tables import Range, build_dataclass, parse_table
 
 Value = float | str
+Seed = Annotated[int, Range("1", low=0)]
 MOST_CASES = 10_000
 
 
@@ -39,23 +40,16 @@ class CaseEntry:
     name: str = ""
     model: str | tuple[str, ...] = ()
     set: Mapping[str, float | str | tuple[float | str, ...]] = field(default_factory=dict)
-    seed: int | tuple[int, ...] = 0
+    seed: Seed | tuple[Seed, ...] = 0
     effects: tuple[str, ...] = ()
     requirement: str | tuple[str, ...] = ()
-    timeout: Annotated[float, "s"] | None = None
+    timeout: Annotated[float, Range("s", above=0.0, high=1e6)] | None = None
     fdi: bool = False
 
     def __post_init__(self) -> None:
-        for key in ("sequence", "seed"):
-            if getattr(self, key) == ():
-                raise InputError("case", key, "at least one")
-        if any(seed < 0 for seed in _as_tuple(self.seed)):
-            raise InputError("case", "seed", "whole numbers from 0")
-        if self.timeout is not None and not 0 < self.timeout <= 1e6:
-            raise InputError("case", "timeout", f"above 0 s and at most 1e6, not {self.timeout:g}")
-        for name, values in self.set.items():
+        for key, values in (("sequence", self.sequence), ("seed", self.seed), *(("set", x) for x in self.set.values())):
             if values == ():
-                raise InputError("case", "set", f"at least one value of {name}")
+                raise InputError("case", key, "at least one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,21 +113,16 @@ def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Varian
     variants: list[Variant] = []
     for i, entry in enumerate(suite.case):
         for variant in _vary(entry, path.parent, base):
-            _try_variant(variant, place.at("case", i))
+            try:
+                load_sequence(variant.choice.sequence)
+            except InputError as error:  # refused with the line of the suite file, if it is not there
+                if error.where == variant.choice.sequence:
+                    raise place.at("case", i, "sequence").refuse(f"a sequence; {error}") from error
+                raise
             variants.append(variant)
             if len(variants) > MOST_CASES:
                 raise place.at("case", i).refuse(f"at most {MOST_CASES} cases in all")
     return suite, variants
-
-
-def _try_variant(variant: Variant, place: Place) -> None:
-    """Refuse a sequence that is not there with the line of the suite file that names it."""
-    try:
-        load_sequence(variant.choice.sequence)
-    except InputError as error:
-        if error.where == variant.choice.sequence:
-            raise place.at("sequence").refuse(f"a sequence; {error}") from error
-        raise
 
 
 def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Variant]:
@@ -255,21 +244,18 @@ class CaseResult(NamedTuple):
         return has_fault(self.fdi)
 
 
-def find_status(results: Sequence[CaseResult], *, is_interrupted: bool) -> int:
-    """The exit status of a suite: 130 interrupted, 1 if a case did not pass, 3 if the timing of one is invalid, 0."""
-    verdicts = {result.verdict for result in results}
-    if is_interrupted:
-        return 130
-    if verdicts & {"FAIL", "ABORTED", *NO_VERDICT}:
-        return 1
-    return 3 if "INVALID_TIMING" in verdicts else 0
+_STATUS = {"ERROR": 1, "FAIL": 1, "ABORTED": 1, "NOT_RUN": 1, "INVALID_TIMING": 3, "NOT_JUDGED": 0}  # worst first
 
 
 def find_verdict(results: Sequence[CaseResult]) -> str:
     """The worst verdict of the cases: that of the suite."""
-    order = ("ERROR", "FAIL", "ABORTED", "NOT_RUN", "INVALID_TIMING", "NOT_JUDGED")
     verdicts = {result.verdict for result in results}
-    return next((word for word in order if word in verdicts), "PASS")
+    return next((word for word in _STATUS if word in verdicts), "PASS")
+
+
+def find_status(results: Sequence[CaseResult], *, is_interrupted: bool) -> int:
+    """The exit status of a suite: 130 interrupted, 1 if a case did not pass, 3 if the timing of one is invalid, 0."""
+    return INTERRUPTED if is_interrupted else _STATUS.get(find_verdict(results), 0)
 
 
 def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult], None],
@@ -290,8 +276,8 @@ def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult]
     """
     found: dict[str, CaseResult] = {}
     is_interrupted = False
-    finished = run_in_processes(play_case, cases, processes, _describe_failure, attempts=1, choose_limit=_choose_limit,
-                                patience=patience)
+    finished = run_in_processes(play_case, cases, processes, lambda case, reason: CaseResult(case, "ERROR", reason),
+                                attempts=1, choose_limit=lambda case: case.timeout, patience=patience)
     with contextlib.closing(finished):  # type: ignore[type-var]  # a generator
         try:
             for case, result in finished:
@@ -303,21 +289,18 @@ def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult]
     return [found.get(case.name) or CaseResult(case, "NOT_RUN", missing) for case in cases], is_interrupted
 
 
-def _choose_limit(case: Case) -> float:
-    return case.timeout
-
-
-def _describe_failure(case: Case, reason: str) -> CaseResult:
-    return CaseResult(case, "ERROR", reason)
-
-
 def play_case(case: Case) -> CaseResult:
     """Run a case and write its page. Errors are part of the result; an internal one is written to error.txt."""
     clock = WallClock()
     try:
         with catch_termination(case.choice.bus) as is_to_stop:
-            job = build_job(case.choice, is_trusted=True, announce=_ignore)  # the code was announced when it was tried
-            diagnose = partial(diagnose_servovalve, progress=_make_progress(is_to_stop), workers=1)
+            def end_if_asked(stage: str, share: float) -> None:  # during a diagnosis, which follows the run
+                if is_to_stop():
+                    raise SystemExit(128 + signal.SIGTERM)
+
+            # the code was announced when it was tried
+            job = build_job(case.choice, is_trusted=True, announce=lambda text: None)
+            diagnose = partial(diagnose_servovalve, progress=end_if_asked, workers=1)
             outcome = run_job(job, case.folder, ignore_progress, is_to_stop,
                               diagnose=diagnose if case.choice.is_diagnosed else None)
             write_run_page(case.folder / "trace.mcap", case.folder / "report.html")
@@ -329,15 +312,6 @@ def play_case(case: Case) -> CaseResult:
         text = f"internal error, {type(error).__name__}: {error} ({case.folder}/error.txt)"
         return CaseResult(case, "ERROR", text, 1e-9 * clock.now())
     return make_result(case, outcome, 1e-9 * clock.now())
-
-
-def _make_progress(is_to_stop: Callable[[], bool]) -> Progress:
-    """The progress of a diagnosis, which follows the run: it ends the process if the case is to stop."""
-    def end_if_asked(stage: str, share: float) -> None:
-        if is_to_stop():
-            raise SystemExit(128 + signal.SIGTERM)
-
-    return end_if_asked
 
 
 def make_result(case: Case, outcome: Outcome, seconds: float) -> CaseResult:
@@ -372,7 +346,3 @@ def catch_termination(bus: str, patience: float = 1.0) -> Iterator[Callable[[], 
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _ignore(text: str) -> None:
-    """Announce nothing."""
