@@ -282,23 +282,22 @@ def run_in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], process
     clock = WallClock()
     try:
         while waiting or workers:
-            while waiting and len(workers) < processes:
-                workers.append(_Worker(work, *waiting.popleft()))
+            while waiting and len(workers) < min(processes, len(jobs)):
+                workers.append(_Worker(work))
             for worker in _wait_for_messages(workers, clock):
                 job, attempt = worker.job, worker.attempt
                 state, result = worker.receive()
-                if state in (_DONE, _RAISED) and waiting:
-                    worker.job, worker.attempt = waiting.popleft()
-                elif state != _STARTED:
+                if state in (_STARTED, _DONE, _RAISED) and waiting:
+                    worker.start_job(*waiting.popleft())
+                    worker.due_ns = clock.now() + round(1e9 * choose_limit(worker.job))
+                else:
                     workers.remove(worker)
                     worker.stop(patience if state == _LATE else 5.0)
-                if worker in workers:
-                    worker.start_job(clock.now() + round(1e9 * choose_limit(worker.job)))
                 if state == _STARTED:
                     continue
                 if state == _RAISED:
                     raise result
-                if state == _DIED and not worker.is_started:
+                if state == _DIED and not attempt:
                     raise RigError("a worker process died while it was starting")
                 if state == _DIED and attempt < attempts:
                     waiting.append((job, attempt + 1))
@@ -329,24 +328,25 @@ _STARTED, _DONE, _RAISED, _DIED, _LATE = range(5)  # what becomes of a worker: t
 
 
 class _Worker(Generic[Job]):
-    """A worker process with a job, and how many have tried this job with it."""
+    """A worker process; `job` is the one it has, and `attempt` counts those that have tried it, 0 before the first."""
 
-    def __init__(self, work: Callable[[Job], Any], job: Job, attempt: int) -> None:
+    def __init__(self, work: Callable[[Job], Any]) -> None:
         context = get_context("spawn")
         self.connection, far_end = context.Pipe()
         self.process = context.Process(target=_serve_jobs, args=(far_end, work), daemon=True)
         with ignore_interrupts():
             self.process.start()
         far_end.close()
-        self.job, self.attempt = job, attempt
+        self.job: Any = None
+        self.attempt = 0
         self.due_ns = round(1e9 * UNLIMITED)  # when its job must have ended
-        self.is_started = self.is_idle = False  # before it has said so
+        self.is_idle = False  # not before it has said that it has started
 
-    def start_job(self, due_ns: int) -> None:
-        """Send the worker its job, which must have ended by that time."""
-        self.is_started, self.is_idle, self.due_ns = True, False, due_ns
+    def start_job(self, job: Job, attempt: int) -> None:
+        """Send the worker a job, with the number of the attempt."""
+        self.job, self.attempt, self.is_idle = job, attempt, False
         with contextlib.suppress(OSError):  # it has died since; `receive` will notice
-            self.connection.send(self.job)
+            self.connection.send(job)
 
     def receive(self) -> tuple[int, Any]:
         """What has become of the worker, and the result or exception of its job."""

@@ -21,7 +21,7 @@ from fdi.report.report import (
     Table,
 )
 from rig.campaign.batch import BatchProgress
-from rig.campaign.summary import name_size
+from rig.campaign.summary import FAULT_NAMES, name_size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,14 +36,12 @@ def describe_progress(progress: BatchProgress) -> str:
 def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -> Report:
     """Report on the figures of `rig.campaign.summary.summarise_campaign`, which are its `data`."""
     status = ", ".join(f"{count} {word}" for word, count in figures["status"].items())
-    lines: list[Item] = []
-    if figures["seconds"]:
-        took = figures["seconds"]
-        lines.append(Line("time a case", f"{took['median']:.2f} s (median), {took['p95']:.2f} s (95th percentile), "
-                                         f"{took['most']:.2f} s (longest)"))
+    took = figures["seconds"]
+    time = [Line("time a case", f"{took['median']:.2f} s (median), {took['p95']:.2f} s (95th percentile), "
+                                f"{took['most']:.2f} s (longest)")] if took else []
     return Report(
         command="campaign", title=title, sentence=f"{figures['cases']} cases: {status or 'none finished'}.",
-        sections=[Section("Time", lines), *(_build_tolerance_section(part) for part in figures["tolerances"]),
+        sections=[Section("Time", time), *(_build_tolerance_section(part) for part in figures["tolerances"]),
                   Section("Traces", _tabulate_traces(figures["traces"])),
                   Section("Cases without a result", _list_reasons(figures["reasons"]))],
         data=figures)
@@ -80,11 +78,9 @@ def format_share(count: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _tabulate_rates(rates: Sequence[Mapping[str, Any]]) -> Table:
-    rows = []
-    for rate in rates:
-        if rate["share"]["of"]:
-            required = format_requirement(100 * rate["least"], 100 * rate["most"])
-            rows.append([rate["name"], *format_share(rate["share"]), required, _judge_rate(rate["met"], required)])
+    required = [format_requirement(100 * rate["least"], 100 * rate["most"]) for rate in rates]
+    rows = [[rate["name"], *format_share(rate["share"]), words, _judge_rate(rate["met"], words)]
+            for rate, words in zip(rates, required, strict=True) if rate["share"]["of"]]
     return Table(_number_columns("rate", "count", "share", "95 % interval", "required", "verdict"), rows,
                  "Detection and false-alarm rates beside what is required of them.")
 
@@ -112,10 +108,9 @@ def _tabulate_detections(fault: Fault, points: Sequence[Mapping[str, Any]]) -> T
     unit = f" [{fault.unit}]" if fault.unit != "1" else ""
     columns = _number_columns(f"{fault.name}{unit}", "detected", "share", "95 % interval", "non-nominal", "ruling",
                               "by bands")
-    rows = []
-    for point in points if len(points) > 1 else []:
-        more = (format_share(point[key])[1] for key in ("most", "ruling", "bands"))
-        rows.append([f"{point['size']:g}", *format_share(point["detected"]), *more])
+    rows = [[f"{point['size']:g}", *format_share(point["detected"]),
+             *(format_share(point[key])[1] for key in ("most", "ruling", "bands"))]
+            for point in points if len(points) > 1]
     return Table(columns, rows, f"Detected: {fault.name} judged maintenance or worse, by true size; then the shares "
                                 "judged non-nominal, named as ruling fault, and detected by the bands alone.")
 
@@ -129,11 +124,10 @@ def _tabulate_counts(title: str, counts: Mapping[str, Mapping[str, int]], captio
 def _tabulate_errors(errors: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     for error in errors:
-        fault = next(fault for fault in FAULTS if fault.name == error["fault"])
         plant = error["label"]
         for other in FAULTS:
             plant = plant.replace(f"{other.name}=", f"{name_size(other)} ")
-        rows.append([plant, name_size(fault), str(error["cases"]),
+        rows.append([plant, name_size(FAULT_NAMES[error["fault"]]), str(error["cases"]),
                      *(f"{error[key]:.2g}" for key in ("bias", "rms", "most")), *format_share(error["covered"])[1:]])
     columns = _number_columns("plant", "estimate", "cases", "bias", "RMS", "p95", "covered", "95 % interval")
     return Table(columns, rows, "Errors of the estimated sizes (FSS in N); covered: share of 95 % intervals that "

@@ -8,12 +8,13 @@ import pytest
 from rich.console import Console
 from scipy.stats import binomtest
 
-from fdi.diagnosis.faults import CLOGGING, FRICTION
 from fdi.estimation.binomial import measure_share
 from fdi.report.terminal import print_report
 from rig.campaign import report
 from rig.campaign import summary as campaign_summary
 from rig.campaign.report import build_campaign_report
+
+CLOGGING, FRICTION = "filter_clogging", "spool_friction"
 
 
 @pytest.mark.parametrize(("good", "of"), [(0, 20), (1, 7), (137, 500), (3000, 3000)])
@@ -43,10 +44,12 @@ def test_statistics_count_what_was_said() -> None:
              *judged("spool_friction=70", 0.0, 70.0, (bad, fine), 1),
              *judged("spool_friction=70", 0.0, 70.0, (fine, fine), 1, status="refused"),
              *judged(campaign_summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
-    rates = {rate.name: rate for rate in campaign_summary.count_rates(found)}
+    figures = campaign_summary.summarise_campaign(found)
+    (part,) = figures["tolerances"]
+    rates = {rate["name"]: rate for rate in part["rates"]}
 
     def count(name: str) -> tuple[int, int, bool | None]:
-        return rates[name].share.good, rates[name].share.of, rates[name].met
+        return rates[name]["share"]["good"], rates[name]["share"]["of"], rates[name]["met"]
 
     assert count("healthy: false alarm") == (3, 402, False)
     assert count("Kintas at MidBand detected") == (38, 40, True)
@@ -54,22 +57,19 @@ def test_statistics_count_what_was_said() -> None:
     assert count("Kintas at MaxBand detected") == (0, 0, None)
     assert count("ruling fault, MidBand on") == (68, 72, False)
     assert count("off-grid Kintas covered") == (25, 25, False) and count("off-grid FSS within 2 %") == (25, 25, None)
-    points = [(p.size, p.detected.good, p.most.good) for p in campaign_summary.count_detections(found, FRICTION)]
-    assert [p.bands.good for p in campaign_summary.count_detections(found, FRICTION)] == [0, 30]
-    assert points == [(5.0, 3, 0), (70.0, 30, 30)]
-    assert campaign_summary.count_levels(found, CLOGGING)["acceptable"] == {
+    points = [(p["size"], *(p[key]["good"] for key in ("detected", "most", "bands"))) for p in part["curves"][FRICTION]]
+    assert points == [(5.0, 3, 0, 0), (70.0, 30, 30, 30)]
+    assert part["levels"][CLOGGING]["acceptable"] == {
         fine: 402 + 30 + 25, bad: 1, worst: 0, "cannot_tell": 0, "refused": 1, "failed": 0}
-    assert campaign_summary.count_ruling_faults(found)["spool_friction, non_nominal"] == {
+    assert part["ruling"]["spool_friction, non_nominal"] == {
         "spool_friction": 30, "filter_clogging": 1, "refused": 1}
-    wanted = campaign_summary.OFF_GRID, "spool_friction"
-    error = next(e for e in campaign_summary.measure_errors(found) if (e.label, e.fault) == wanted)
-    assert (error.bias, error.rms, error.covered.good) == (pytest.approx(0.45), pytest.approx(0.45), 25)
-    figures = campaign_summary.summarise_campaign(found)
+    error = next(e for e in part["errors"] if (e["label"], e["fault"]) == (campaign_summary.OFF_GRID, FRICTION))
+    assert (error["bias"], error["rms"], error["covered"]["good"]) == (pytest.approx(0.45), pytest.approx(0.45), 25)
     json.dumps(figures, allow_nan=False)
     out = Console(width=100, record=True, quiet=False)
     print_report(build_campaign_report(figures), out)
     assert "3/402" in (text := out.export_text()) and "NOT met" in text and "95.0 %" in text
-    drawn = report.draw_detection_curves(figures["tolerances"][0])
+    drawn = report.draw_detection_curves(part)
     assert drawn.startswith("<svg") and "MaxBand" in drawn and "maintenance or worse" in drawn
 
 
@@ -79,4 +79,4 @@ def test_statistics_count_what_was_said() -> None:
     (99, 100, 0.93, 0.97, False), (3, 9, 0.0, 1.0, None), (0, 0, 0.95, 1.0, None)])
 def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, met: bool | None
                                                   ) -> None:
-    assert campaign_summary.Rate("", measure_share(good, of), least, most).met is met
+    assert campaign_summary.judge_rate("", measure_share(good, of), least, most)["met"] is met
