@@ -7,6 +7,7 @@ noise of the comparison.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import pty
 import signal
@@ -17,28 +18,25 @@ import tempfile
 import termios
 from collections.abc import Iterator, Mapping, Sequence
 from fcntl import ioctl
+from functools import partial
 from importlib.util import find_spec
 from math import isfinite, log, nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.estimation.binomial import estimate_geometric_mean
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Item, Line, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Line, Mood, Report, Section, Table, tabulate
 from fdi.trace.trace import Trace
-from plant.errors import InputError, RigError
-from rig.bench.realtime import choose_priority, compute_percentiles
+from plant.errors import RigError
+from rig.bench.blocks import Times, compute_percentiles, describe_conditions, measure_blocks, pool_times
 from rig.network.clock import WallClock
-from rig.network.raw_bus import can_open
-from rig.run.hard_loop import compile_cycle
 from rig.run.priority import list_cpus
 from rig.view.viewer import find_free_port, is_listening, kill_viewer, make_viewer_command
 
-Seconds = NDArray[np.float64]
 WITHOUT, AGAIN, LIVE, VIEWER = "without", "without, again", "--live", "--live rerun"
 QUANTITIES = ("lateness", "response", "feedback_response")
 SHARES = ("p50", "p99")
@@ -52,26 +50,6 @@ checks = [
 """
 
 
-class Ratio(NamedTuple):
-    """How a percentile of a contender compares with that of the runs without a screen: geometric mean over blocks."""
-
-    quantity: str
-    share: str  # p50 or p99
-    contender: str
-    ratio: float
-    low: float  # of the simultaneous 95 % interval of all ratios; NaN with fewer than four blocks
-    high: float
-
-    @property
-    def word(self) -> str:
-        """slower, faster, no difference found, or, with fewer than four blocks, not known."""
-        if not isfinite(self.low):
-            return "not known"
-        if self.low > 1.0:
-            return "slower"
-        return "faster" if self.high < 1.0 else "no difference found"
-
-
 def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
     """Measure all contenders on a bus for `seconds` each, in so many blocks.
 
@@ -79,25 +57,17 @@ def measure_live_runs(bus: str, seconds: float, blocks: int, progress: Progress 
         InputError: a bus that compiled code cannot use.
         RigError: a run that came to no verdict.
     """
-    if not can_open(bus):
-        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
-    compile_cycle(realtime=True)
     missing = {} if find_spec("rerun") else {VIEWER: "not measured: pip install 'eha-rig[view]'"}
-    contenders = [name for name in (WITHOUT, AGAIN, LIVE, VIEWER) if name not in missing]
-    found: dict[str, list[dict[str, Seconds]]] = {name: [] for name in contenders}
-    for block in range(blocks):
-        turn = block % len(contenders)  # nobody is always the first
-        for number, name in enumerate(contenders[turn:] + contenders[:turn]):
-            progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(contenders)) / blocks)
-            found[name].append(play_contender(name, bus, seconds / blocks))
-    return summarise_live_runs(found) | {
-        "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
+    contenders = {name: partial(play_contender, name, bus) for name in (WITHOUT, AGAIN, LIVE, VIEWER)
+                  if name not in missing}
+    found, conditions = measure_blocks(bus, seconds, blocks, contenders, progress)
+    return summarise_live_runs(found) | conditions | {
         "missing": missing,
         "ended_early": {name: sum(len(run["lateness"]) < 900.0 * seconds / blocks for run in runs)
                         for name, runs in found.items()}}
 
 
-def play_contender(name: str, bus: str, seconds: float) -> dict[str, Seconds]:
+def play_contender(name: str, bus: str, seconds: float) -> Times:
     """Times of the cycles of a run of one kind, see `play_run`."""
     if name != VIEWER:
         return play_run(bus, seconds, ("--live",) if name == LIVE else ())
@@ -134,7 +104,7 @@ def open_hidden_viewer(patience: float = 60.0) -> Iterator[int]:
         kill_viewer(viewer)
 
 
-def play_run(bus: str, seconds: float, options: Sequence[str]) -> dict[str, Seconds]:
+def play_run(bus: str, seconds: float, options: Sequence[str]) -> Times:
     """Times of the cycles of main of a run with its emulator; NaN where no answer came.
 
     Raises:
@@ -181,34 +151,39 @@ def _read_some(number: int) -> bytes:
         return b""
 
 
-def summarise_live_runs(found: Mapping[str, Sequence[Mapping[str, Seconds]]]) -> dict[str, Any]:
+def summarise_live_runs(found: Mapping[str, list[Times]]) -> dict[str, Any]:
     """Percentiles in us by quantity and contender over all blocks and of each block, ratios, overruns.
 
     Args:
         found: contender -> of each block, quantity -> times in s, and which cycles are overruns.
     """
-    pooled = {quantity: {name: compute_percentiles(np.concatenate([block[quantity] for block in blocks]))
-                         for name, blocks in found.items()} for quantity in QUANTITIES}
+    pooled = {name: pool_times(blocks) for name, blocks in found.items()}
     single = {quantity: {name: [compute_percentiles(block[quantity]) for block in blocks]
                          for name, blocks in found.items()} for quantity in QUANTITIES}
-    return {"times_us": pooled, "blocks_us": single,
-            "ratios": [ratio._asdict() | {"word": ratio.word} for ratio in compare_contenders(single)],
-            "overruns": {name: int(sum(block["overrun"].sum() for block in blocks)) for name, blocks in found.items()},
-            "cycles": {name: sum(len(block["lateness"]) for block in blocks) for name, blocks in found.items()}}
+    return {"times_us": {quantity: {name: compute_percentiles(times[quantity]) for name, times in pooled.items()}
+                         for quantity in QUANTITIES},
+            "blocks_us": single, "ratios": compare_contenders(single),
+            "overruns": {name: int(times["overrun"].sum()) for name, times in pooled.items()},
+            "cycles": {name: len(times["lateness"]) for name, times in pooled.items()}}
 
 
-def compare_contenders(blocks_us: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> list[Ratio]:
-    """The ratios of all contenders to the runs without a screen, by the logarithms of the blocks' percentiles."""
+def compare_contenders(blocks_us: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> list[dict[str, Any]]:
+    """The ratios of all contenders to the runs without a screen: geometric means of the blocks' percentiles.
+
+    low, high: the simultaneous 95 % interval of all ratios; NaN with fewer than four blocks.
+    """
     found = []
     others = [name for name in next(iter(blocks_us.values())) if name != WITHOUT]
     count = len(QUANTITIES) * len(SHARES) * len([name for name in others if name != AGAIN])
-    for quantity in QUANTITIES:
-        for share in SHARES:
-            logs = {name: np.array([log(block[share]) if block.get(share, 0.0) > 0.0 else nan for block in blocks])
-                    for name, blocks in blocks_us[quantity].items()}
-            for name in others:
-                base = logs[WITHOUT] if name == AGAIN else (logs[WITHOUT] + logs[AGAIN]) / 2
-                found.append(Ratio(quantity, share, name, *estimate_geometric_mean(logs[name] - base, 0.05 / count, 4)))
+    for quantity, share in itertools.product(QUANTITIES, SHARES):
+        logs = {name: np.array([log(block[share]) if block.get(share, 0.0) > 0.0 else nan for block in blocks])
+                for name, blocks in blocks_us[quantity].items()}
+        for name in others:
+            base = logs[WITHOUT] if name == AGAIN else (logs[WITHOUT] + logs[AGAIN]) / 2
+            ratio, low, high = estimate_geometric_mean(logs[name] - base, 0.05 / count, 4)
+            words = {"not known": not isfinite(low), "slower": low > 1.0, "faster": high < 1.0}
+            found.append({"quantity": quantity, "share": share, "contender": name, "ratio": ratio, "low": low,
+                          "high": high, "word": next((word for word in words if words[word]), "no difference found")})
     return found
 
 
@@ -222,19 +197,15 @@ _MOODS: Mapping[str, Mood] = {"slower": "bad", "faster": "", "no difference foun
 
 def build_live_runs_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.live.measure_live_runs`, which are its `data`."""
-    priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
     overruns = ", ".join(f"{name} {count} of {figures['cycles'][name]}" for name, count in figures["overruns"].items())
-    lines: list[Item] = [
-        Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks on "
-                         f"{figures['bus']}, 1 ms a cycle, {figures['cpus']} CPUs, {priority}"),
-        Line("overruns", overruns),
-        *(Line("ended early", f"{name}: {count}") for name, count in figures["ended_early"].items() if count),
-        *(Line(name, reason) for name, reason in figures["missing"].items())]
+    lines = [describe_conditions(figures), Line("overruns", overruns),
+             *(Line("ended early", f"{name}: {count}") for name, count in figures["ended_early"].items() if count),
+             *(Line(name, reason) for name, reason in figures["missing"].items())]
     return Report(
         command="bench", title="live", sentence=describe_ratios(figures["ratios"]),
-        sections=[Section("With and without", [_tabulate_ratios(figures["ratios"])]),
-                  *(Section(title, [_tabulate_times(figures["times_us"][quantity], figures["blocks_us"][quantity],
-                                                    caption)]) for quantity, (title, caption) in _TITLES.items()),
+        sections=[Section("With and without", _tabulate_ratios(figures["ratios"])),
+                  *(Section(title, _tabulate_times(figures["times_us"][quantity], figures["blocks_us"][quantity],
+                                                   caption)) for quantity, (title, caption) in _TITLES.items()),
                   Section("Conditions", lines)],
         data=dict(figures))
 
@@ -253,32 +224,35 @@ def describe_ratios(ratios: Sequence[Mapping[str, Any]]) -> str:
     return f"Lateness and response with {shown} differ from those without by no more than noise."
 
 
-def _tabulate_ratios(ratios: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column("percentile"), Column("run"), Column("ratio", align="right"), Column("interval", align="right"),
-               Column("")]
-    rows: list[list[Cell | str]] = [
-        [f"{ratio['quantity'].replace('_', ' ')} {ratio['share']}", ratio["contender"], _format_number(ratio["ratio"]),
-         f"{_format_number(ratio['low'])} .. {_format_number(ratio['high'])}" if isfinite(ratio["low"]) else "",
-         Cell(ratio["word"], _MOODS[ratio["word"]])] for ratio in ratios]
-    return Table(columns, rows, f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same '
-                                "runs once more, which is the noise. All intervals together hold with 95 %.")
+def _tabulate_ratios(ratios: Sequence[Mapping[str, Any]]) -> list[Table]:
+    def show_interval(ratio: Mapping[str, Any]) -> str:
+        return f"{_format_ratio(ratio['low'])} .. {_format_ratio(ratio['high'])}" if isfinite(ratio["low"]) else ""
+
+    return tabulate(
+        ratios, f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same runs once more, '
+                "which is the noise. All intervals together hold with 95 %.",
+        (Column("percentile"), lambda ratio: f"{ratio['quantity'].replace('_', ' ')} {ratio['share']}"),
+        (Column("run"), lambda ratio: ratio["contender"]),
+        (Column("ratio", align="right"), lambda ratio: _format_ratio(ratio["ratio"])),
+        (Column("interval", align="right"), show_interval),
+        (Column(""), lambda ratio: Cell(ratio["word"], _MOODS[ratio["word"]])))
 
 
-def _format_number(ratio: float) -> str:
+def _format_ratio(ratio: float) -> str:
     if not ratio < 100.0:
         return "> 100" if ratio >= 100.0 else "-"
     return f"{ratio:.2f}"
 
 
 def _tabulate_times(times: Mapping[str, Mapping[str, float]], blocks: Mapping[str, Sequence[Mapping[str, float]]],
-                    caption: str) -> Table:
-    columns = [Column("run"), *(Column(share, "us", "right") for share in SHARES),
-               *(Column(f"{share} by block", "us", "right") for share in SHARES)]
-    rows = [[name, *(f"{found[share]:.1f}" for share in SHARES),
-             *(_describe_spread([block[share] for block in blocks[name] if block]) for share in SHARES)]
-            for name, found in times.items() if found]
-    return Table(columns, rows, caption)
+                    caption: str) -> list[Table]:
+    def show_spread(name: str, share: str) -> str:
+        values = [block[share] for block in blocks[name] if block]
+        return f"{min(values):.1f} .. {max(values):.1f}"
 
-
-def _describe_spread(values: Sequence[float]) -> str:
-    return f"{min(values):.1f} .. {max(values):.1f}"
+    return tabulate(
+        [name for name, found in times.items() if found], caption, (Column("run"), str),
+        (Column("p50", "us", "right"), lambda name: f"{times[name]['p50']:.1f}"),
+        (Column("p99", "us", "right"), lambda name: f"{times[name]['p99']:.1f}"),
+        (Column("p50 by block", "us", "right"), lambda name: show_spread(name, "p50")),
+        (Column("p99 by block", "us", "right"), lambda name: show_spread(name, "p99")))

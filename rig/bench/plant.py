@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
+from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table, tabulate
 from plant import Actuator, Model, simulate
 from plant.model import STEPS, build_kernel
 from plant.run import sample_noise
@@ -41,19 +41,6 @@ FRICTIONLESS = {f"{body}.{kind}_friction": 0.0 for body in ("spool", "jack") for
 QUIET = {f"sensors.{quantity}_noise": 0.0 for quantity in ("position", "pressure", "spool")}
 
 
-class StepCost(NamedTuple):
-    """A step of the reference model in Python and in C, ns; `ratio` is Python's over C's."""
-
-    python: float
-    c: float  # gcc -O3 -march=native, free to fuse multiply and add
-    c_same_rounding: float  # without fusing
-    ratio: float
-    ratio_same_rounding: float
-    difference: float  # m, largest between the positions of Python and C over the run
-    identical: bool  # all columns, against C with the same rounding
-    compiler: str
-
-
 class Accuracy(NamedTuple):
     """Error of one step size over a command, against the finest; position in um."""
 
@@ -64,8 +51,12 @@ class Accuracy(NamedTuple):
     largest_friction: float
 
 
-def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) -> StepCost | None:
-    """The nominal plant over `command` (n,) m, compiled from Python and from step.c; None without gcc."""
+def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) -> dict[str, Any] | None:
+    """A step of the nominal plant over `command` (n,) m in Python and in C (step.c), ns; None without gcc.
+
+    c: gcc -O3 -march=native, free to fuse multiply and add; c_same_rounding: without fusing. ratio: Python's time over
+    C's. difference: largest between the positions of Python and C, m. identical: all columns, with the same rounding.
+    """
     if not find_gcc():
         return None
     model, draws = Model(), sample_noise(0, len(command))
@@ -79,9 +70,10 @@ def compare_step_with_c(command: Array, rounds: int = 15, steps: int = STEPS) ->
     each = {name: float(np.median(t)) / (len(command) * steps) * 1e9 for name, t in seconds.items()}
     ratios = {name: float(np.median(seconds["python"] / t)) for name, t in seconds.items()}  # round by round
     version = subprocess.run([find_gcc(), "-dumpfullversion"], capture_output=True, text=True, check=True)
-    return StepCost(each["python"], each["c"], each["c_same_rounding"], ratios["c"], ratios["c_same_rounding"],
-                    float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
-                    bool((outs["python"] == outs["c_same_rounding"]).all()), f"gcc {version.stdout.strip()}")
+    return {**each, "ratio": ratios["c"], "ratio_same_rounding": ratios["c_same_rounding"],
+            "difference": float(np.abs(outs["python"] - outs["c"])[:, 0].max()),
+            "identical": bool((outs["python"] == outs["c_same_rounding"]).all()),
+            "compiler": f"gcc {version.stdout.strip()}"}
 
 
 def _make_python_run(model: Model, command: Array, draws: Array, steps: int) -> tuple[Work, Array]:
@@ -119,8 +111,6 @@ def _measure_error(error: Array) -> tuple[float, float]:
     return float(np.sqrt((error**2).mean())) * 1e6, float(np.abs(error).max()) * 1e6
 
 
-
-
 def measure_cycle_cost(cycles: int = 5000, rounds: int = 9) -> float:
     """The cost of `Actuator.sample` and `advance` called from Python, s a cycle."""
     plant = Actuator(Model())
@@ -144,7 +134,6 @@ def measure_bus_run_speed(runs: int = 3) -> float:
     """The speed of a preflight run on the embedded bus, with its log, as a multiple of real time; best of `runs`."""
     from rig.run.job import Job
     from rig.run.runner import run_job
-    from rig.sequences import load_sequence
 
     job = Job(sequence=load_sequence("preflight"), model=Model())
     speeds = []
@@ -179,13 +168,10 @@ def run_rig(*words: str) -> None:
     done.check_returncode()
 
 
-
-
 def run_benchmarks(command: Array, progress: Progress = ignore_progress) -> dict[str, Any]:
     """Measure everything over `command` (n,) m; `step` is None without gcc."""
     progress("one run, and a run on the embedded bus", 0.0)
-    cost = compare_step_with_c(command)
-    return {"step": cost and cost._asdict(),
+    return {"step": compare_step_with_c(command),
             "times_real_time": measure_simulation_speed(command),
             "cycle": measure_cycle_cost(),
             "lockstep": measure_bus_run_speed(),
@@ -198,12 +184,11 @@ def build_plant_report(figures: Mapping[str, Any]) -> Report:
 
     They may hold "accuracy": rows of `rig.bench.plant.Accuracy` as dicts.
     """
-    accuracy = [_tabulate_accuracy(figures["accuracy"])] if figures.get("accuracy") else []
     return Report(
         command="bench", title="plant",
         sentence=f"The preflight is simulated at {figures['times_real_time']:.0f} times real time.",
         sections=[Section("The plant", _list_costs(figures)),
-                  Section("Accuracy", accuracy)],
+                  Section("Accuracy", _tabulate_accuracy(figures.get("accuracy", ())))],
         data=figures)
 
 
@@ -232,9 +217,11 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
     return items
 
 
-def _tabulate_accuracy(accuracy: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column("step", "us", "right"), Column("friction off: RMS", "um", "right"), Column("max", "um", "right"),
-               Column("friction on: RMS", "um", "right"), Column("max", "um", "right")]
-    rows = [[f"{1000 / row['steps']:g}", f"{row['rms']:.4f}", f"{row['largest']:.4f}", f"{row['rms_friction']:.2f}",
-             f"{row['largest_friction']:.2f}"] for row in accuracy]
-    return Table(columns, rows, "Error of XJ over the closed-loop preflight, against steps of 0.2 us.")
+def _tabulate_accuracy(accuracy: Sequence[Mapping[str, float]]) -> list[Table]:
+    return tabulate(
+        accuracy, "Error of XJ over the closed-loop preflight, against steps of 0.2 us.",
+        (Column("step", "us", "right"), lambda row: f"{1000 / row['steps']:g}"),
+        (Column("friction off: RMS", "um", "right"), lambda row: f"{row['rms']:.4f}"),
+        (Column("max", "um", "right"), lambda row: f"{row['largest']:.4f}"),
+        (Column("friction on: RMS", "um", "right"), lambda row: f"{row['rms_friction']:.2f}"),
+        (Column("max", "um", "right"), lambda row: f"{row['largest_friction']:.2f}"))

@@ -5,30 +5,37 @@ The contenders take turns in short blocks, so that a disturbance of the machine 
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.progress import Progress, ignore_progress
 from fdi.report.numbers import format_digits
-from fdi.report.report import Cell, Column, Item, Line, Report, Section, Table
-from plant.errors import InputError, RigError
+from fdi.report.report import Cell, Column, Line, Report, Section, Table, tabulate
+from plant.errors import RigError
+from rig.bench.blocks import (
+    Seconds,
+    Times,
+    choose_priority,
+    compute_percentiles,
+    describe_conditions,
+    measure_blocks,
+    pool_times,
+)
 from rig.bench.responders import run_c_responder, run_emulator
 from rig.bench.stopwatch import GET_GCC, find_gcc
 from rig.network.bus import open_can
 from rig.network.clock import WallClock
 from rig.network.link import Link, LinkWire
 from rig.network.master import Master
-from rig.network.raw_bus import can_open, open_raw_bus
+from rig.network.raw_bus import open_raw_bus
 from rig.recorder import Recorder, Signals, Timing
-from rig.run.hard_loop import RECEIVED, HardLoop, compile_cycle
+from rig.run.hard_loop import RECEIVED, HardLoop
 from rig.run.loop import CycleInput, CycleLoop, History, Loop
 from rig.run.priority import (
     LOOP_PRIORITY,
@@ -40,24 +47,9 @@ from rig.run.priority import (
 )
 from rig.sequences.faults import Plan, Schedule
 
-Seconds = NDArray[np.float64]
 CYCLICTEST, COMPILED, IN_C, PYTHON = "cyclictest", "compiled", "C", "Python"
 _QUANTITIES = ("lateness", "feedback_response", "valve_response", "execution")
 _SETTLING = 100  # cycles at the beginning of a block that are not counted
-
-
-class Target(NamedTuple):
-    """A ratio or a time, and the limit that it is to keep."""
-
-    name: str
-    value: float | None  # None: not measured
-    limit: float
-    unit: str  # "" for a ratio
-
-    @property
-    def is_met(self) -> bool:
-        """Whether the value is known and within the limit."""
-        return self.value is not None and self.value <= self.limit
 
 
 def measure_realtime(bus: str, seconds: float, blocks: int, progress: Progress = ignore_progress) -> dict[str, Any]:
@@ -67,48 +59,34 @@ def measure_realtime(bus: str, seconds: float, blocks: int, progress: Progress =
         InputError: a bus that compiled code cannot use.
         RigError: a bus or a node that does not work.
     """
-    if not can_open(bus):
-        raise InputError("--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
-    compile_cycle(realtime=True)
-    contenders = list_contenders(bus, seconds / blocks)
-    times: dict[str, dict[str, list[Seconds]]] = {name: {} for name in contenders}
-    for block in range(blocks):
-        turn = block % len(contenders)  # nobody is always the first
-        for name in [*contenders][turn:] + [*contenders][:turn]:
-            progress(name, block / blocks)
-            for quantity, values in contenders[name]().items():
-                times[name].setdefault(quantity, []).append(values)
-    pooled = {name: {quantity: np.concatenate(parts) for quantity, parts in found.items()}
-              for name, found in times.items()}
-    return summarise_contenders(pooled) | {
-        "bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()), "priority": choose_priority(),
+    found, conditions = measure_blocks(bus, seconds, blocks, list_contenders(bus), progress)
+    return summarise_contenders({name: pool_times(each) for name, each in found.items()}) | conditions | {
         "missing": [name for name, path in (("cyclictest", find_cyclictest()), ("gcc", find_gcc())) if not path]}
 
 
-def list_contenders(bus: str, seconds: float) -> dict[str, Callable[[], dict[str, Seconds]]]:
-    """What is measured in a block of so many seconds, by name; without those that this machine does not have."""
-    def measure_python() -> dict[str, Seconds]:
-        with run_emulator(bus, is_compiled=False):
-            return play_block(bus, seconds, is_compiled=False)
+def list_contenders(bus: str) -> dict[str, Callable[[float], Times]]:
+    """What is measured for so many seconds, by name; without those that this machine does not have."""
+    def measure_cyclictest(seconds: float) -> Times:
+        return {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
 
-    def measure_compiled() -> dict[str, Seconds]:
+    def measure_compiled(seconds: float) -> Times:
         with run_emulator(bus, is_compiled=True):
             return play_block(bus, seconds)
 
-    def measure_c() -> dict[str, Seconds]:
+    def measure_c(seconds: float) -> Times:
         with run_c_responder(bus):
             return play_block(bus, seconds)
 
-    found: dict[str, Callable[[], dict[str, Seconds]]] = {}
-    if find_cyclictest():
-        found[CYCLICTEST] = lambda: {"lateness": run_cyclictest(seconds, choose_priority(), list_cpus()[-1])}
-    found[COMPILED] = measure_compiled
-    if find_gcc():
-        found[IN_C] = measure_c
-    return found | {PYTHON: measure_python}
+    def measure_python(seconds: float) -> Times:
+        with run_emulator(bus, is_compiled=False):
+            return play_block(bus, seconds, is_compiled=False)
+
+    rows = ((CYCLICTEST, measure_cyclictest, find_cyclictest()), (COMPILED, measure_compiled, "always"),
+            (IN_C, measure_c, find_gcc()), (PYTHON, measure_python, "always"))
+    return {name: measure for name, measure, is_there in rows if is_there}
 
 
-def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000) -> dict[str, Seconds]:
+def play_block(bus: str, seconds: float, is_compiled: bool = True, period_ns: int = 1_000_000) -> Times:
     """Times of the rig's cycle on a bus, with its log, without the first cycles; NaN where no answer came."""
     history = History()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
@@ -149,13 +127,7 @@ def enter_real_time(is_compiled: bool) -> Iterator[None]:
         yield
 
 
-def choose_priority() -> int:
-    """The loop's real-time priority, or 0 where the machine does not grant it."""
-    with raise_priority():
-        return LOOP_PRIORITY if os.sched_getscheduler(0) == os.SCHED_FIFO else 0
-
-
-def summarise_contenders(times: Mapping[str, Mapping[str, Seconds]]) -> dict[str, Any]:
+def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
     """Percentiles in us by quantity and contender, lost answers, and the targets."""
     tables: dict[str, dict[str, dict[str, float]]] = {
         quantity: {name: compute_percentiles(found[quantity]) for name, found in times.items() if quantity in found}
@@ -163,29 +135,21 @@ def summarise_contenders(times: Mapping[str, Mapping[str, Seconds]]) -> dict[str
     tables["execution"].pop(PYTHON, None)  # it is another quantity there: up to SYNC
     lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items() if len(found) > 1}
     return {"times_us": tables, "lost": lost, "cycles": {name: len(found["lateness"]) for name, found in times.items()},
-            "targets": [target._asdict() | {"is_met": target.is_met} for target in list_targets(tables)]}
+            "targets": list_targets(tables)}
 
 
-def compute_percentiles(seconds: Seconds) -> dict[str, float]:
-    """p50, p99, p99.9 and the largest of the values that are there, us."""
-    known = seconds[~np.isnan(seconds)] * 1e6
-    if not len(known):
-        return {}
-    values = (*np.percentile(known, (50, 99, 99.9)), known.max())
-    return dict(zip(("p50", "p99", "p99_9", "max"), map(float, values), strict=True))
-
-
-def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[Target]:
-    """The ratios to cyclictest and to the responder in C, and the execution."""
-    found = []
+def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, Any]]:
+    """The ratios to cyclictest and to the responder in C, and the execution, with their limits; None: not measured."""
+    found: list[tuple[str, float | None, float, str]] = []
     for quantity, rival, limit in (("lateness", CYCLICTEST, 1.2), ("feedback_response", IN_C, 1.3),
                                    ("valve_response", IN_C, 1.3)):
         for share in ("p50", "p99"):
             own, other = (tables[quantity].get(name, {}).get(share) for name in (COMPILED, rival))
             ratio = own / other if own is not None and other else None
-            found.append(Target(f"{quantity.replace('_', ' ')} {share}, compiled / {rival}", ratio, limit, ""))
-    own = tables["execution"].get(COMPILED, {}).get("p99_9")
-    return [*found, Target("execution p99.9", own, 100.0, "us")]
+            found.append((f"{quantity.replace('_', ' ')} {share}, compiled / {rival}", ratio, limit, ""))
+    found.append(("execution p99.9", tables["execution"].get(COMPILED, {}).get("p99_9"), 100.0, "us"))
+    return [{"name": name, "value": value, "limit": limit, "unit": unit,
+             "is_met": value is not None and value <= limit} for name, value, limit, unit in found]
 
 
 GET_CYCLICTEST = "apt-get install rt-tests"
@@ -196,7 +160,7 @@ def find_cyclictest() -> str:
     return shutil.which("cyclictest", path="/usr/bin:/usr/local/bin:/bin:/usr/sbin") or ""
 
 
-def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 1000) -> NDArray[np.float64]:
+def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 1000) -> Seconds:
     """Latencies of cyclictest, s, to the microsecond: one thread, absolute due times, memory locked.
 
     `priority` 0 runs it without real-time priority.
@@ -213,7 +177,7 @@ def run_cyclictest(seconds: float, priority: int, cpu: int, period_us: int = 100
     return parse_histogram(done.stdout)
 
 
-def parse_histogram(text: str) -> NDArray[np.float64]:
+def parse_histogram(text: str) -> Seconds:
     """The latencies, s, in the histogram that cyclictest prints; those beyond its end count as its maximum."""
     bins, most, overflows = [], 0, 0
     for line in text.splitlines():
@@ -243,47 +207,46 @@ _TITLES = {
     "valve_response": ("SYNC to valve state", "From SYNC until the kernel received the valve state."),
     "execution": ("Execution", "Time that the rig's cycle takes: collecting answers, command, SYNC; without waiting."),
 }
-_SHARES = (("p50", "p50"), ("p99", "p99"), ("p99_9", "p99.9"), ("max", "max"))
 
 
 def build_realtime_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.realtime.measure_realtime`, which are its `data`."""
     met = sum(target["is_met"] for target in figures["targets"])
-    priority = f"SCHED_FIFO {figures['priority']}" if figures["priority"] else "no real-time priority"
+    get = {"cyclictest": GET_CYCLICTEST, "gcc": GET_GCC}
     return Report(
         command="bench", title="realtime",
         sentence=f"{met} of {len(figures['targets'])} targets are met on {figures['bus']}.",
-        sections=[Section("Targets", [_tabulate_targets(figures["targets"])]),
-                  *(Section(title, [_tabulate_times(figures["times_us"][quantity], _NAMES[quantity], caption)])
+        sections=[Section("Targets", _tabulate_targets(figures["targets"])),
+                  *(Section(title, _tabulate_times(figures["times_us"][quantity], _NAMES[quantity], caption))
                     for quantity, (title, caption) in _TITLES.items()),
                   Section("Conditions", [
-                      Line("measured", f"{figures['seconds']:g} s each in {figures['blocks']} alternating blocks, 1 ms "
-                                       f"a cycle, {figures['cpus']} CPUs, {priority}"),
+                      describe_conditions(figures),
                       *(Line(f"no answer, {name}", f"{count} of {figures['cycles'][name]} cycles")
                         for name, count in figures["lost"].items() if count),
-                      *_list_missing(figures["missing"])])],
+                      *(Line(name, f"skipped: it is not installed; to get it: {get[name]}")
+                        for name in figures["missing"])])],
         data=figures)
 
 
-def _list_missing(missing: list[str]) -> list[Item]:
-    get = {"cyclictest": GET_CYCLICTEST, "gcc": GET_GCC}
-    return [Line(name, f"skipped: it is not installed; to get it: {get[name]}") for name in missing]
-
-
-def _tabulate_targets(targets: list[dict[str, Any]]) -> Table:
-    rows: list[list[Cell | str]] = []
-    for target in targets:
+def _tabulate_targets(targets: Sequence[Mapping[str, Any]]) -> list[Table]:
+    def judge(target: Mapping[str, Any]) -> Cell:
         failed = "not measured" if target["value"] is None else "NOT met"
-        word = Cell("met", "good") if target["is_met"] else Cell(failed, "bad")
-        measured = "" if target["value"] is None else format_digits(target["value"])
-        rows.append([target["name"], measured, f"<= {target['limit']:g}", target["unit"], word])
-    columns = [Column("target"), Column("measured", align="right"), Column("limit", align="right"), Column("unit"),
-               Column("")]
-    return Table(columns, rows, "Ratios are those of the percentiles over all blocks.")
+        return Cell("met", "good") if target["is_met"] else Cell(failed, "bad")
+
+    return tabulate(
+        targets, "Ratios are those of the percentiles over all blocks.",
+        (Column("target"), lambda target: target["name"]),
+        (Column("measured", align="right"),
+         lambda target: "" if target["value"] is None else format_digits(target["value"])),
+        (Column("limit", align="right"), lambda target: f"<= {target['limit']:g}"),
+        (Column("unit"), lambda target: target["unit"]), (Column(""), judge))
 
 
-def _tabulate_times(times: Mapping[str, Mapping[str, float]], names: Mapping[str, str], caption: str) -> Table:
-    columns = [Column(""), *(Column(title, "us", "right") for _, title in _SHARES)]
-    rows = [[name, *(f"{times[key][share]:.1f}" for share, _ in _SHARES)] for key, name in names.items()
-            if times.get(key)]
-    return Table(columns, rows, caption)
+def _tabulate_times(times: Mapping[str, Mapping[str, float]], names: Mapping[str, str], caption: str) -> list[Table]:
+    return tabulate(
+        [(name, times[key]) for key, name in names.items() if times.get(key)], caption,
+        (Column(""), lambda row: row[0]),
+        (Column("p50", "us", "right"), lambda row: f"{row[1]['p50']:.1f}"),
+        (Column("p99", "us", "right"), lambda row: f"{row[1]['p99']:.1f}"),
+        (Column("p99.9", "us", "right"), lambda row: f"{row[1]['p99_9']:.1f}"),
+        (Column("max", "us", "right"), lambda row: f"{row[1]['max']:.1f}"))

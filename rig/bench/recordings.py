@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fdi.diagnosis.learn_bands import sample_sensor_noise
 from fdi.estimation.unknowns import list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
-from fdi.report.report import Cell, Column, Report, Section, Table
+from fdi.report.report import Column, Report, Section, tabulate
 from fdi.trace.trace import Trace
 from plant.lanes import Lanes
 from plant.model import Model
@@ -31,21 +31,10 @@ LENGTHS = (13.5, 60.0, 300.0, 1800.0)  # s
 HIDDEN = {"spool.static_friction": 45.0, "spool.dynamic_friction": 30.0}  # N, not in the model
 
 
-class Cost(NamedTuple):
-    """One command on one recording."""
-
-    command: str
-    length: float  # s of recording
-    cpu: float  # s, user and system, of the whole process
-    memory: int  # bytes, largest resident set
-    verdict: str
-    interrupted: float | None  # s from SIGINT in the middle of the work to the end of the process; None: not tried
-
-
 def measure_long_recordings(lengths: Sequence[float] = LENGTHS, seed: int = 0, progress: Progress = ignore_progress
                             ) -> dict[str, Any]:
     """The costs of each command on a recording of each length, s; the longest is interrupted as well."""
-    costs = []
+    costs: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for number, length in enumerate(lengths):
             progress(f"recording of {length:g} s", number / len(lengths))
@@ -54,7 +43,7 @@ def measure_long_recordings(lengths: Sequence[float] = LENGTHS, seed: int = 0, p
             for command in COMMANDS:
                 progress(f"{command}, {length:g} s", number / len(lengths))
                 costs.append(_measure_cost(command, length, file, length == max(lengths)))
-    return {"seed": seed, "cpus": os.cpu_count(), "costs": [cost._asdict() for cost in costs]}
+    return {"seed": seed, "cpus": os.cpu_count(), "costs": costs}
 
 
 def make_command(length: float, seed: int) -> Array:
@@ -88,13 +77,18 @@ def record_unit(com: Array, seed: int) -> Trace:
     return Trace.from_columns(columns | {name: np.round(columns[name], n) for name, n in digits.items()}, 1e-3, {})
 
 
-def _measure_cost(command: str, length: float, file: Path, is_interrupted: bool) -> Cost:
+def _measure_cost(command: str, length: float, file: Path, is_interrupted: bool) -> dict[str, Any]:
+    """One command on a recording of `length` s: CPU time of the whole process, s, and largest memory, bytes.
+
+    interrupted: s from SIGINT in the middle of the work to the end of the process; None: not tried.
+    """
     process = _start_rig(command, file)
     answer = process.stdout.read() if process.stdout else b""
     _, _, used = os.wait4(process.pid, 0)
     duration = used.ru_utime + used.ru_stime
     after = _measure_interruption(command, file, 0.5 * duration) if is_interrupted else None
-    return Cost(command, length, duration, 1024 * used.ru_maxrss, str(json.loads(answer)["verdict"]), after)
+    return {"command": command, "length": length, "cpu": duration, "memory": 1024 * used.ru_maxrss,
+            "verdict": str(json.loads(answer)["verdict"]), "interrupted": after}
 
 
 def _measure_interruption(command: str, file: Path, delay: float) -> float | None:
@@ -122,15 +116,16 @@ def _start_rig(command: str, file: Path) -> subprocess.Popen[bytes]:
 def build_long_recordings_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.recordings.measure_long_recordings`."""
     costs = figures["costs"]
-    rows: list[list[Cell | str]] = [
-        [c["command"], f"{c['length']:g} s", f"{c['cpu']:.1f} s", f"{1e-9 * c['memory']:.2f} GB", c["verdict"],
-         "" if c["interrupted"] is None else f"{c['interrupted']:.1f} s"] for c in costs]
-    columns = [Column("command"), Column("recording", align="right"), Column("CPU time", align="right"),
-               Column("memory", align="right"), Column("verdict"), Column("ends after Ctrl-C", align="right")]
-    largest = max(c["memory"] for c in costs)
-    longest = max(c["length"] for c in costs)
-    caption = "CPU time: user and system time of the whole process. Memory: largest resident set."
+    table = tabulate(
+        costs, "CPU time: user and system time of the whole process. Memory: largest resident set.",
+        (Column("command"), lambda cost: cost["command"]),
+        (Column("recording", align="right"), lambda cost: f"{cost['length']:g} s"),
+        (Column("CPU time", align="right"), lambda cost: f"{cost['cpu']:.1f} s"),
+        (Column("memory", align="right"), lambda cost: f"{1e-9 * cost['memory']:.2f} GB"),
+        (Column("verdict"), lambda cost: cost["verdict"]),
+        (Column("ends after Ctrl-C", align="right"),
+         lambda cost: "" if cost["interrupted"] is None else f"{cost['interrupted']:.1f} s"))
+    largest, longest = (max(cost[key] for cost in costs) for key in ("memory", "length"))
     return Report("bench", "recordings",
                   sentence=f"{longest:g} s of recording at 1 kHz take {1e-9 * largest:.2f} GB at most.",
-                  sections=[Section("Cost by length of the recording", [Table(columns, rows, caption)])],
-                  data=dict(figures))
+                  sections=[Section("Cost by length of the recording", table)], data=dict(figures))

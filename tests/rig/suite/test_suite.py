@@ -177,7 +177,7 @@ def test_junit_of_one_sequence(tmp_path: Path) -> None:
     ("seed = [1, 2]", "seeds = [1, 2]", r"suite\.toml:7: case\[0\]\.seeds: expected a key: .*'seed'\?"),
     ('"jack.mass" = [90.0, 110]', '"jack.mas" = 90', r"jack\.mas: expected"),
     ('"jack.mass" = [90.0, 110]', '"jack.mass" = [90, -1]', r"jack\.mass: expected .*-1"),
-    ("timeout = 1.0", "timeout = 0", r"suite\.toml:\d+: case\[3\]\.timeout: expected a number above 0 and at most 1e\+06 s"),
+    ("timeout = 1.0", "timeout = 0", r"suite\.toml:\d+: case\[3\]\.timeout: expected a number above 0"),
     ("timeout = 1.0", 'model = "none.toml"', r"none\.toml"),
     ('title = "All kinds"', "", r"suite\.toml: expected also the key 'title'"),
 ])
