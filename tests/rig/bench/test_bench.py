@@ -45,7 +45,8 @@ def test_whole_processes_are_timed() -> None:
 
 def test_a_path_that_cannot_be_written_is_told_in_one_line(
         monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(plant, "run_benchmarks", lambda command, progress: {"step": None})
+    monkeypatch.setattr(plant, "run_benchmarks", lambda command, progress: {
+        "step": None, "times_real_time": 1.0, "cycle": 1.0, "lockstep": 1.0, "run_process": 1.0, "help_process": 1.0})
     assert main.main(["bench", "--out", str(tmp_path / "none" / "b.json"), "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--out" in line and "none/b.json: expected a file that can be written (No such file" in line
