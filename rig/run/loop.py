@@ -25,21 +25,11 @@ from rig.network.master import Master
 from rig.recorder import Signals, Timing
 from rig.sequences.faults import DELAY, DROP, Schedule, apply_action
 
-
-class _Answer(NamedTuple):
-    """One of the frames that nodes send in a cycle: where its values go, in the row and in the timing."""
-
-    bit: int
-    unpack: Callable[[bytes], tuple[Any, ...]]
-    fields: tuple[str, ...]
-    response: str
-    is_numbered: bool = True  # it carries the number of its cycle
-
-
-_ANSWERS = {
-    codec.FEEDBACK: _Answer(1, codec.unpack_feedback, ("xj", "p12"), "feedback_response", is_numbered=False),
-    codec.VALVE_STATE: _Answer(2, codec.unpack_valve_state, ("xs", "flags"), "valve_response"),
-    codec.DRIVE: _Answer(4, codec.unpack_drive, ("cor", "status"), "response"),
+_ANSWERS: dict[int, tuple[int, Callable[[bytes], tuple[Any, ...]], str, str, str, bool]] = {
+    # COB-ID: bit, decoder, two fields of the row, field of the timing, whether it carries the number of its cycle
+    codec.FEEDBACK: (1, codec.unpack_feedback, "xj", "p12", "feedback_response", False),
+    codec.VALVE_STATE: (2, codec.unpack_valve_state, "xs", "flags", "valve_response", True),
+    codec.DRIVE: (4, codec.unpack_drive, "cor", "status", "response", True),
 }
 _ALL = 7  # answers have come
 
@@ -219,18 +209,18 @@ class CycleLoop(Loop):
         if self._open is None or len(frame.data) != 8:
             return
         _, row, timing = self._open
-        answer, seen = _ANSWERS[frame.cob_id], self._seen
-        first, second, *cycle = answer.unpack(frame.data)
-        is_first = not seen & answer.bit
-        if cycle != [row.cycle & 0xFFFF] if answer.is_numbered else not is_first:
+        bit, decode, first, second, response, is_numbered = _ANSWERS[frame.cob_id]
+        values, seen = decode(frame.data), self._seen
+        is_first = not seen & bit
+        if values[2] != row.cycle & 0xFFFF if is_numbered else not is_first:
             return
-        setattr(row, answer.fields[0], first)
-        setattr(row, answer.fields[1], second)
-        self._seen |= answer.bit
+        setattr(row, first, values[0])
+        setattr(row, second, values[1])
+        self._seen = seen | bit
         if is_first:
-            setattr(timing, answer.response, self._since_sync(frame))
-        if self._seen == _ALL != seen:
-            timing.work = self._since_sync(frame)
+            setattr(timing, response, self._since_sync(frame))
+            if self._seen == _ALL:
+                timing.work = self._since_sync(frame)
 
     def _since_sync(self, frame: Frame) -> float:
         """Seconds from SYNC to a frame, by its time of reception; in lockstep, where that is virtual, to now."""
