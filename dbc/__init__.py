@@ -4,6 +4,8 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
+__all__ = ["DBC", "EDS"]
+
 _HERE = Path(str(files(__name__)))
 
 DBC = _HERE / "eha.dbc"

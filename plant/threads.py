@@ -1,9 +1,10 @@
 """Runs work in threads: kernels and NumPy release the interpreter lock while they compute."""
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -18,19 +19,25 @@ def count_threads() -> int:
     return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def _open_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads for a while. On Ctrl-C nobody waits for what is still at work, and what has not begun is dropped."""
+    pool = ThreadPoolExecutor(workers, THREAD_NAME)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
 def map_in_threads(do: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """`do(item)` of each item, in order, in `workers` threads; a single item or one worker uses the calling thread."""
     work = list(items)
     if min(workers, len(work)) < 2:
         return [do(item) for item in work]
-    pool = ThreadPoolExecutor(min(workers, len(work)), THREAD_NAME)
-    try:
-        found = list(pool.map(do, work))
-    except BaseException:  # Ctrl-C: nobody waits for what is still at work
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    pool.shutdown()
-    return found
+    with _open_pool(min(workers, len(work))) as pool:
+        return list(pool.map(do, work))
 
 
 def run_beside(do: Callable[[], R]) -> R:
@@ -41,11 +48,5 @@ def run_beside(do: Callable[[], R]) -> R:
     """
     if threading.current_thread() is not threading.main_thread():
         return do()
-    pool = ThreadPoolExecutor(1, THREAD_NAME)
-    try:
-        found = pool.submit(do).result()
-    except BaseException:  # Ctrl-C: nobody waits for what is still at work
-        pool.shutdown(wait=False)
-        raise
-    pool.shutdown()
-    return found
+    with _open_pool(1) as pool:
+        return pool.submit(do).result()

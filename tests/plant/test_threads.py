@@ -11,13 +11,15 @@ import pytest
 from plant.threads import THREAD_NAME, count_threads, map_in_threads, run_beside
 
 
-def test_answers_come_in_the_order_of_the_questions() -> None:
-    def slow_first(i: int) -> int:
-        time.sleep(0.02 if i == 0 else 0.0)
-        return i * i
+def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_asked() -> None:
+    def slow_first(i: int) -> float:
+        time.sleep(0.02 if i == 1 else 0.0)
+        return 1 / i
 
-    assert map_in_threads(slow_first, range(7), 3) == [i * i for i in range(7)]
+    assert map_in_threads(slow_first, range(1, 8), 3) == [1 / i for i in range(1, 8)]
     assert map_in_threads(slow_first, [], 3) == []
+    with pytest.raises(ZeroDivisionError):
+        map_in_threads(slow_first, [1, 0, 2], 2)
 
 
 def test_one_worker_or_one_item_stays_in_this_thread() -> None:
@@ -25,11 +27,6 @@ def test_one_worker_or_one_item_stays_in_this_thread() -> None:
     assert map_in_threads(lambda _: threading.get_ident(), range(3), 1) == [here] * 3
     assert map_in_threads(lambda _: threading.get_ident(), range(1), 4) == [here]
     assert here not in map_in_threads(lambda _: threading.get_ident(), range(3), 2)
-
-
-def test_an_error_reaches_who_asked() -> None:
-    with pytest.raises(ZeroDivisionError):
-        map_in_threads(lambda i: 1 / i, [1, 0, 2], 2)
 
 
 def test_an_error_leaves_what_is_still_at_work() -> None:

@@ -10,14 +10,10 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+from jsonschema import Draft202012Validator
+from jsonschema.exceptions import best_match
 from places import ROOT
-
-try:
-    from jsonschema import Draft202012Validator
-    from jsonschema.exceptions import best_match
-    from referencing import Registry, Resource
-except ImportError:  # test_answer_schemas.py fails then; other tests need not
-    Draft202012Validator = None  # type: ignore[assignment,misc]
+from referencing import Registry, Resource
 
 FOLDER = ROOT / "docs" / "schema"
 KINDS_OF_BENCH = ("realtime", "live", "recordings")
@@ -65,8 +61,6 @@ def check_answer(words: Sequence[str], answer: Any) -> None:
     Raises:
         AssertionError: the answer differs; it names the schema, the place and the difference.
     """
-    if Draft202012Validator is None:
-        return
     name = name_schema(words)
     if name == "run.json" and "cases" in answer:  # several sequences
         name = "suite.json"
