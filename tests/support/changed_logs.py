@@ -44,10 +44,10 @@ def write_bomb(out: Path, kind: str) -> Path:
     if kind == "attachment":
         raw = encode_records([Attachment(0, 0, "model.toml", "text/plain", b"x" * 100)])
         at = raw.index(struct.pack("<Q", 100))
-        _append(file, raw[:at] + struct.pack("<Q", size) + raw[at + 8:])
+        file._write(raw[:at] + struct.pack("<Q", size) + raw[at + 8:])
         file._attachments.append(AttachmentIndex(file._offset - len(raw), len(raw), 0, 0, 100, "model.toml", ""))
     elif kind == "record":
-        _append(file, struct.pack("<BQ", Opcode.ATTACHMENT, size) + b"x" * 100)
+        file._write(struct.pack("<BQ", Opcode.ATTACHMENT, size) + b"x" * 100)
         file._attachments.append(AttachmentIndex(file._offset - 109, 109, 0, 0, 100, "model.toml", ""))
     elif kind in ("one chunk", "lying chunk"):  # zeros compress to a 20,000th
         packer = zstandard.ZstdCompressor(level=1).compressobj(size=4 << 30)
@@ -67,11 +67,7 @@ def write_bomb(out: Path, kind: str) -> Path:
     return out
 
 
-def _append(file: McapFile, data: bytes) -> None:
-    file._write(data)
-
-
 def _append_chunk(file: McapFile, packed: bytes, declared: int) -> None:
     at = file._offset
-    _append(file, encode_records([Chunk("zstd", packed, 0, 0, zlib.crc32(b""), declared)]))
+    file._write(encode_records([Chunk("zstd", packed, 0, 0, zlib.crc32(b""), declared)]))
     file._chunks.append(ChunkIndex(file._offset - at, at, "zstd", len(packed), 0, 0, {}, 0, declared))

@@ -60,15 +60,6 @@ def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
     assert counters(desk) == (0, 0)
 
 
-def test_a_drive_before_its_sync_does_not_act_at_once() -> None:
-    """Two desks that differ in the last drive only are the same until the SYNC after it."""
-    a, b = PlantDesk(scenario()), PlantDesk(scenario())
-    assert a.cycle(0.0) == b.cycle(5e-3)
-    assert a.node._plant.state == b.node._plant.state
-    assert a.cycle() == b.cycle()  # sampled before the current acts
-    assert a.cycle() != b.cycle()
-
-
 @pytest.mark.parametrize(("drives", "flags", "counted", "emergencies", "current"), [
     (".-<..", [0, 0, 1, 2, 0], (1, 1), [], 2e-3),  # the current stays
     (".---", [0, 0, 1, 1], (2, 0), [], 2e-3),
