@@ -299,6 +299,7 @@ def test_the_rigs_heartbeat_can_be_dropped(bus_kind: str, realtime: bool, monkey
         one.master._beat.configure(1, one.wire.clock.now())
         one.play(*range(160))
         one.loop.finish()
+        one.loop.close()
         one.settle()
         assert [silent for _, silent in asked] == [100 <= k < 130 for k, _ in asked] and asked[-1][0] >= 130
         assert sum(frame.cob_id == 0x701 for frame in one.nodes.heard) == len(one.logged(0x701)) > 0
