@@ -17,7 +17,7 @@ from fdi.discovery.runs import read_runs
 from fdi.discovery.update_model import load_model_file
 from fdi.estimation.replay import compute_residuals, prepare_trace, replay_current
 from fdi.report import explain_report
-from fdi.report.drawing import STYLE, shorten_svg, to_svg
+from fdi.report.drawing import AFTER, BEFORE, GREEN, STYLE, shorten_svg, to_svg
 from plant import Model
 from plant.effects import load_effects
 
@@ -33,7 +33,7 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
     with rc_context(STYLE):
         figure = Figure(figsize=(8, 4.5), layout="constrained")
         axes = figure.subplots(3, 1, sharex=True)
-        models = ((Model(), explain_report.BEFORE, "nominal model"), (model, explain_report.AFTER, "after rig add"))
+        models = ((Model(), BEFORE, "nominal model"), (model, AFTER, "after rig add"))
         for which, colour, label in models:
             prepared = prepare_trace(trace, which)
             rest = compute_residuals(prepared, replay_current(prepared, which))
@@ -45,7 +45,7 @@ def draw_residuals(run: str, repeat: str, model: Model) -> str:
                 ax.set_ylabel(title)
         for ax, (name, _, scale) in zip(axes, SIGNALS, strict=True):
             for side in (-2, 2):
-                ax.axhline(side * floor[name].floor.value * scale, color=explain_report.FLOOR, lw=0.8, ls=":")
+                ax.axhline(side * floor[name].floor.value * scale, color=GREEN, lw=0.8, ls=":")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
         axes[-1].set_xlabel("time [s]; dotted: twice the floor")
         return to_svg(figure, run)

@@ -6,23 +6,21 @@ turned into the dictionary that the command of the same name prints with --json.
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from fdi.foreign_code import load_effects_of_model
-from fdi.output import write_text, write_whole
+from fdi.output import write_text
+from fdi.report.drawing import Drawing, save_drawing
 from fdi.report.report import Figure, Medium, Report
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.model import Model, load_model
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
-
     from fdi.comparison.compare import Comparison
     from fdi.diagnosis.diagnosis import Diagnosis
     from fdi.discovery.explain_runs import Answer
@@ -34,27 +32,16 @@ TraceOrPath = Trace | str | Path
 ModelOrPath = Model | str | Path
 
 
-class Plot(str):
-    """A figure as SVG text, with its caption. A notebook shows it as a picture."""
+class Plot(Drawing):
+    """A figure as SVG text, with its caption and as `figure` of matplotlib. A notebook shows it as a picture."""
 
     caption: str
-    _draw: Callable[[], str]
 
-    def __new__(cls, svg: str, caption: str, draw: Callable[[], str]) -> Plot:
-        plot = super().__new__(cls, svg)
-        plot.caption, plot._draw = caption, draw
+    def __new__(cls, drawing: str, caption: str) -> Plot:
+        plot = super().__new__(cls, drawing)
+        plot.caption = caption
+        vars(plot).update(vars(drawing))
         return plot
-
-    @cached_property
-    def figure(self) -> MatplotlibFigure:
-        """The matplotlib figure, with all points of its lines, to change and to save."""
-        from fdi.report.drawing import Drawing, keep_all_points
-
-        with keep_all_points():
-            drawing = self._draw()
-        if not isinstance(drawing, Drawing):
-            raise InputError("plot", self.caption, "a figure that matplotlib has drawn")
-        return drawing.figure
 
     def to_plotly(self) -> Any:
         """The figure as a Figure of plotly, which can be zoomed and read off.
@@ -72,20 +59,10 @@ class Plot(str):
         Raises:
             InputError: a path that cannot be written, a format that matplotlib does not know, or no plotly for .html.
         """
-        kind = Path(path).suffix
-        if kind in ("", ".svg"):
-            write_text(path, str(self), "path")
-        elif kind == ".html":
+        if Path(path).suffix == ".html":
             write_text(path, self.to_plotly().to_html(include_plotlyjs=True), "path")
         else:
-            known = self.figure.canvas.get_supported_filetypes()
-            if kind[1:] not in known:
-                raise InputError("path", str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
-            try:
-                with write_whole(path) as part:
-                    self.figure.savefig(part, dpi=150)
-            except OSError as error:
-                raise InputError("path", str(path), f"a file that can be written ({error.strerror})") from error
+            save_drawing(self, Path(path), "path")
 
     def _repr_svg_(self) -> str:
         return str(self)
@@ -129,7 +106,7 @@ class Result:
         for figure in chosen:
             svg = figure.draw()
             if svg:
-                return Plot(svg, figure.caption, figure.draw)
+                return Plot(svg, figure.caption)
         raise InputError("plot", title or "", "a figure for which the trace has data")
 
     def _list_figures(self) -> list[tuple[str, Figure]]:

@@ -4,24 +4,35 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi.comparison.compare import BALANCED, Comparison, SignalError
-from fdi.comparison.residuals import Depends, DeviationMap, ResidualTests, map_deviation
+from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
 from fdi.report.drawing import (
-    ABOVE,
+    BLUE,
     COMMAND,
+    GREEN,
     INK,
     LEVELS,
+    ORANGE,
     RED,
+    SIGNAL_COLOURS,
+    Mark,
+    Panel,
+    area,
+    axes,
+    band,
+    call,
     choose_drawn_unit,
-    shade_sections,
-    start_figure,
-    thin_line,
-    to_svg,
+    draw_over_time,
+    draw_panels,
+    instant,
+    legend,
+    line,
+    name_rows,
+    shade,
 )
 from fdi.report.numbers import (
     SIGNAL_NAMES,
@@ -32,13 +43,10 @@ from fdi.report.numbers import (
     format_ratio,
     format_signal,
     join_words,
+    list_first,
 )
-from fdi.report.report import Cell, Column, Figure, Item, Line, Medium, Mood, Report, Section, Table
+from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE, FLOW_GAIN_FAR, NOISE_BAND_RATIO
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
 INPUTS_OF_BLOCKS = {
@@ -47,9 +55,7 @@ INPUTS_OF_BLOCKS = {
     "jack": "XS and P12 to the ram",
     "sensor": "flow of the ram to XJ",
 }
-
 OTHER_ACTUATOR = "If the model describes another actuator than the measured one, `rig identify` fits it"
-
 SHAPE_WORDS = {  # how a residual depends on a quantity
     "": "", "proportional to": " (proportional)", "steps with the sign of": " (a step where it changes sign)",
     "even in": " (an even function)",
@@ -58,11 +64,42 @@ SHAPE_WORDS = {  # how a residual depends on a quantity
 
 def build_comparison_report(c: Comparison, next_command: str = "", files: Sequence[tuple[str, str]] = ()) -> Report:
     """The report of a comparison; `files` are those that were written."""
-    return Report(
-        "compare", c.source, c.verdict, MOODS[c.verdict], describe_verdict(c), _list_facts(c), c.notes,
-        [Section("Signals", [_tabulate_signals(c)]), Section("Blocks", _tabulate_blocks(c)),
-         Section("Findings", describe_findings(c)), *_show_figures(c), *_list_parameters(c)],
-        next_command, files, collect_data(c))
+    t, changes = c.trace, sorted(c.model.list_changes().items())
+    facts = [("model", c.model.name), ("trace", f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"),
+             ("repeats", str(c.repeats)), ("signals", ", ".join(SIGNAL_NAMES[name] for name in t.outputs))]
+    sections = [
+        Section("Signals", [_tabulate_signals(c)]),
+        Section("Blocks", [_tabulate_blocks(c)]),
+        Section("Findings", describe_findings(c)),
+        Section("Measured and replayed", [Figure(
+            "Each signal as measured and as replayed from the measured current, and its residual (measured minus "
+            "model) below. Green: two noise floors on either side; noise stays within for 95 % of the time. Shaded: "
+            "ramps (blue) and dynamic sections (violet) of the command. Red: not judged.", partial(draw_overview, c))]),
+        Section("Where", [_tabulate_places(c), Figure(
+            "Share of each section in the squared error. The longest bar shows where to look first.",
+            partial(draw_error_shares, c))] if c.where else [], medium=Medium.PAGE),
+        Section("By speed and amplitude", [Figure(
+            "Error over noise floor by speed of the ram (over 20 rows) and by amplitude (half its range within 0.25 s "
+            "before and after). 1 is noise; dark cells show at which motion the model fails. Empty: fewer than 30 "
+            "rows.", partial(draw_deviation_map, c))]),
+        Section("Is the residual noise", [Figure(
+            "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within "
+            "green: the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat "
+            "shows the colour of the noise, the residual is whitened by it.", partial(draw_whiteness, c))]),
+        Section("What the residual depends on", [Figure(
+            "Mean residual (measured minus model) over each quantity, in bins of equal count with 95 % intervals. A "
+            "curve that leaves the green band of two noise floors shows a dependence.", partial(draw_dependence, c))]
+            if any(d.depends for d in c.diagnoses.values()) else []),
+        Section("Refit within the tolerances", [_list_values(
+            "change, in tolerances", {} if c.scatter is None else
+            {name: f"{moved:+.2f}" for name, moved in c.scatter.moved.items()},
+            "How far each parameter moves when the model is refitted within the tolerances of a healthy unit.")],
+            medium=Medium.PAGE),
+        Section("Changes of the model", [_list_values(
+            "value, SI", {name: f"{value:g}" for name, value in changes},
+            "Parameters that differ from the nominal model.")], medium=Medium.PAGE)]
+    return Report("compare", c.source, c.verdict, MOODS[c.verdict], describe_verdict(c), facts, c.notes, sections,
+                  next_command, files, collect_data(c))
 
 
 def describe_verdict(c: Comparison) -> str:
@@ -75,8 +112,8 @@ def describe_verdict(c: Comparison) -> str:
     worst = max(c.signals.values(), key=lambda s: s.ratio)
     if c.named == ("controller",) and worst.ratio <= worst.limit:
         return "The plant fits, but the output of the controller differs from the model's."
-    error = f"The model does not explain this trace: {_error_and_floor(worst)}"
-    return f"{error}; {_describe_blocks(c)}." if c.model.plant == BALANCED else f"{error}."
+    blocks = f"; {_describe_blocks(c)}" if c.model.plant == BALANCED else ""
+    return f"The model does not explain this trace: {_error_and_floor(worst)}{blocks}."
 
 
 def _error_and_floor(s: SignalError) -> str:
@@ -88,63 +125,61 @@ def _error_and_floor(s: SignalError) -> str:
 def _describe_blocks(c: Comparison) -> str:
     """Which blocks disagree with the measurement, the worst first, and which fit."""
     if not c.named:
-        if set(c.signals) == {"xj"}:
-            return "P12 or XS would show in which block"
-        return "no single block stands out"
+        is_short = set(c.signals) == {"xj"}
+        return "P12 or XS would show in which block" if is_short else "no single block stands out"
     names = list(c.named)
-    is_jack_or_sensor = c.blocks["jack"] is not None and c.blocks["jack"] == c.blocks["sensor"] and "jack" in names
-    if is_jack_or_sensor:
+    if c.blocks["jack"] is not None and c.blocks["jack"] == c.blocks["sensor"] and "jack" in names:
         names[names.index("jack")] = "jack or the sensor"
         names.remove("sensor")
-    found = f"the {names[0]} disagree" + ("" if " or " in names[0] else "s")
-    if len(names) > 1:
-        found += f", the {' and the '.join(names[1:])} less"
+    less = f", the {' and the '.join(names[1:])} less" if names[1:] else ""
+    found = f"the {names[0]} disagree{'' if ' or ' in names[0] else 's'}{less}"
     fits = [name for name, ratio in c.blocks.items() if ratio is not None and name not in c.named]
-    if not fits:
-        return found
-    return f"{found}; {join_words(fits)} fit" + ("s" if len(fits) == 1 else "")
-
-
-def _list_facts(c: Comparison) -> list[tuple[str, str]]:
-    t = c.trace
-    length = f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"
-    return [("model", c.model.name), ("trace", length), ("repeats", str(c.repeats)),
-            ("signals", ", ".join(SIGNAL_NAMES[name] for name in t.outputs))]
+    return f"{found}; {join_words(fits)} fit{'s' if len(fits) == 1 else ''}" if fits else found
 
 
 def _tabulate_signals(c: Comparison) -> Table:
     page = Medium.PAGE
-    columns = [Column("signal"), Column("error", align="right"), Column("noise floor", align="right"),
-               Column("ratio", align="right"), Column("floor from", medium=page),
-               Column("error from the command alone", align="right"),
-               Column("solver error", align="right", medium=page)]
-    rows: list[list[Cell | str]] = []
-    for s in c.signals.values():
-        bound = ">= " if s.floor.lower_bound else ""
-        rows.append([
-            SIGNAL_NAMES[s.name], Cell(format_signal(s.error, s.name), is_strong=True),
-            bound + format_signal(s.floor.value, s.name),
-            Cell(format_ratio(s.ratio), "bad" if s.ratio > s.limit else "good"), Cell(s.floor.source, "muted"),
-            format_signal(s.closed_loop_error, s.name), Cell(format_signal(s.solver_error, s.name), "muted")])
-    return Table(columns, rows, "Error: RMS of the residual (measured minus model) with the measured current as "
-                                "input. Noise floor: RMS that noise alone leaves. A perfect model has ratio 1.")
+    return tabulate(
+        c.signals.values(),
+        (Column("signal"), lambda s: SIGNAL_NAMES[s.name]),
+        (Column("error", align="right"), lambda s: Cell(format_signal(s.error, s.name), is_strong=True)),
+        (Column("noise floor", align="right"),
+         lambda s: (">= " if s.floor.lower_bound else "") + format_signal(s.floor.value, s.name)),
+        (Column("ratio", align="right"), lambda s: Cell(format_ratio(s.ratio), "bad" if s.ratio > s.limit else "good")),
+        (Column("floor from", medium=page), lambda s: Cell(s.floor.source, "muted")),
+        (Column("error from the command alone", align="right"), lambda s: format_signal(s.closed_loop_error, s.name)),
+        (Column("solver error", align="right", medium=page),
+         lambda s: Cell(format_signal(s.solver_error, s.name), "muted")),
+        caption="Error: RMS of the residual (measured minus model) with the measured current as input. Noise floor: "
+                "RMS that noise alone leaves. A perfect model has ratio 1.")
 
 
-def _tabulate_blocks(c: Comparison) -> list[Item]:
-    if all(ratio is None for ratio in c.blocks.values()):
-        return []
-    rows: list[list[Cell | str]] = [[name, _block_ratio(c, name), Cell(describe_block(c, name), "muted")]
-                                    for name in c.blocks]
-    return [Table([Column("block"), Column("ratio", align="right"), Column("from")], rows,
-                  "Ratio: error of the block alone over its noise floor. A block above "
-                  f"{format_digits(BLOCK_ERROR_RATIO, 2)} disagrees with the measurement.")]
+def _tabulate_blocks(c: Comparison) -> Table:
+    def show_ratio(name: str) -> Cell:
+        ratio = c.blocks[name]
+        if ratio is None:
+            return Cell("-", "muted")
+        return Cell(format_ratio(ratio), "bad" if name in c.named else "good")
+
+    return tabulate(
+        c.blocks if any(ratio is not None for ratio in c.blocks.values()) else (),
+        (Column("block"), str), (Column("ratio", align="right"), show_ratio),
+        (Column("from"), lambda name: Cell(describe_block(c, name), "muted")),
+        caption="Ratio: error of the block alone over its noise floor. A block above "
+                f"{format_digits(BLOCK_ERROR_RATIO, 2)} disagrees with the measurement.")
 
 
-def _block_ratio(c: Comparison, name: str) -> Cell:
-    ratio = c.blocks[name]
-    if ratio is None:
-        return Cell("-", "muted")
-    return Cell(format_ratio(ratio), "bad" if name in c.named else "good")
+def _tabulate_places(c: Comparison) -> Table:
+    return tabulate(
+        c.where, (Column("section"), lambda p: p.section),
+        (Column("time", "s"), lambda p: Cell(f"{p.t0:.2f} - {p.t1:.2f}", "muted")),
+        (Column("share of the squared error", align="right"), lambda p: format_percent(p.share, 3)),
+        (Column("error over floor", align="right"), lambda p: format_ratio(p.ratio)),
+        (Column("condition"), lambda p: p.condition))
+
+
+def _list_values(heading: str, texts: dict[str, str], caption: str) -> Table:
+    return Table([Column("parameter"), Column(heading)], list(texts.items()), caption, is_list=True)
 
 
 def describe_block(c: Comparison, name: str) -> str:
@@ -154,7 +189,8 @@ def describe_block(c: Comparison, name: str) -> str:
     path = INPUTS_OF_BLOCKS[name]
     measured = [SIGNAL_NAMES[s] for s in ("xs", "p12") if s in c.signals]
     if c.blocks[name] is None:
-        return f"{path}: {_describe_missing_signal(measured)}"
+        needs = {(): "needs XS or P12", ("P12",): "needs XS", ("XS",): "needs P12"}
+        return f"{path}: {needs.get(tuple(measured), 'too little data')}"
     if name == "servovalve" and "XS" not in measured:
         return "Cor to flow, as XS was not measured"
     if name == "jack" and len(measured) == 1:
@@ -165,19 +201,10 @@ def describe_block(c: Comparison, name: str) -> str:
     return path
 
 
-def _describe_missing_signal(measured: list[str]) -> str:
-    if len(measured) == 2:
-        return "too little data"
-    if not measured:
-        return "needs XS or P12"
-    return "needs XS" if measured == ["P12"] else "needs P12"
-
-
 def _describe_controller(c: Comparison) -> str:
-    path = INPUTS_OF_BLOCKS["controller"]
+    path, a = INPUTS_OF_BLOCKS["controller"], c.answer
     if c.blocks["controller"] is None:
         return f"{path}: the firmware is not known"
-    a = c.answer
     lags = [f"{name} {count_nouns(lag, 'cycle')} earlier" for name, lag in (("Com", a.com_lag), ("XJ", a.xj_lag))
             if lag > 0]
     if lags:
@@ -191,30 +218,28 @@ def _describe_controller(c: Comparison) -> str:
     return found
 
 
-def describe_findings(c: Comparison) -> list[Line]:
-    """Labelled lines: where the floor is from, solver error, where and when the error is large, what it depends on."""
-    lines = [Line("floor", _describe_floor(c)), Line("solver", _describe_solver(c))]
-    if c.verdict != "WITHIN_FLOOR":
-        lines += _describe_places(c)
-        if c.condition:
-            lines.append(Line("when", c.condition))
-    lines += _describe_flow_and_drift(c)
-    for name, d in c.diagnoses.items():
-        found = _describe_residual(name, d)
-        if c.signals[name].ratio > c.signals[name].limit and found:
-            lines.append(Line("residual", f"{SIGNAL_NAMES[name]}: {'; '.join(found)}"))
-    if c.scatter is not None:
-        lines.append(Line("scatter", _describe_scatter(c)))
-    if changes := _describe_changes(c):
-        lines.append(Line("not nominal", changes, medium=Medium.TERMINAL))
-    return lines
+def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6) -> list[Line]:
+    """Labelled lines: where the floor is from, solver error, where and when the error is large, what it depends on.
 
-
-def _describe_changes(c: Comparison, most: int = 6) -> str:
-    """The parameters of the model that are not nominal; the page has a table of them."""
+    The page and the JSON answer have all places and changes.
+    """
+    is_wrong = c.verdict != "WITHIN_FLOOR"
     changes = [f"{name} = {value:g}" for name, value in sorted(c.model.list_changes().items())]
-    more = f" and {len(changes) - most} more" if len(changes) > most else ""
-    return ", ".join(changes[:most]) + more
+    errors = ", ".join(f"{SIGNAL_NAMES[s.name]} by {format_signal(s.solver_error, s.name)}" for s in c.signals.values())
+    lines = [
+        Line("floor", _describe_floor(c)),
+        Line("solver", f"halving the step to {1e6 * c.trace.period / c.replay.steps:g} us changes {errors}"),
+        *(Line("where", f"{p.section}, {p.t0:.2f}-{p.t1:.2f} s: {format_percent(p.share)} of the squared error, "
+                        f"{format_ratio(p.ratio)} times the floor" + (f"; {p.condition}" if p.condition else ""),
+               medium=Medium.TERMINAL) for p in [p for p in c.where if is_wrong and p.share > 0.05][:most_places]),
+        Line("when", c.condition if is_wrong else ""),
+        Line("flow", _describe_flow(c)),
+        Line("drift", _describe_drift(c)),
+        *(Line("residual", _describe_residual(name, d)) for name, d in c.diagnoses.items()
+          if c.signals[name].ratio > c.signals[name].limit),
+        Line("scatter", _describe_scatter(c)),
+        Line("not nominal", list_first(changes, most_changes), medium=Medium.TERMINAL)]
+    return [finding for finding in lines if finding.text]
 
 
 def _describe_floor(c: Comparison) -> str:
@@ -226,42 +251,28 @@ def _describe_floor(c: Comparison) -> str:
     return "; ".join(words[source] for source in words if source in sources)
 
 
-def _describe_solver(c: Comparison) -> str:
-    errors = ", ".join(f"{SIGNAL_NAMES[s.name]} by {format_signal(s.solver_error, s.name)}" for s in c.signals.values())
-    step = 1e6 * c.trace.period / c.replay.steps
-    return f"halving the step to {step:g} us changes {errors}"
-
-
-def _describe_places(c: Comparison, most: int = 3) -> list[Line]:
-    """The sections with the largest shares of the squared error; the page and the JSON answer have all."""
-    lines = []
-    for place in [p for p in c.where if p.share > 0.05][:most]:
-        text = (f"{place.section}, {place.t0:.2f}-{place.t1:.2f} s: {format_percent(place.share)} of the squared "
-                f"error, {format_ratio(place.ratio)} times the floor")
-        if place.condition:
-            text += f"; {place.condition}"
-        lines.append(Line("where", text, medium=Medium.TERMINAL))
-    return lines
-
-
-def _describe_flow_and_drift(c: Comparison, notable_share: float = 0.005, notable_drift: float = 1e-6) -> list[Line]:
-    """A ram that is faster or slower than the flow into it by 0.5 %; a free replay that drifts by 1 um/s."""
-    lines = []
+def _describe_flow(c: Comparison, notable_share: float = 0.005) -> str:
+    """A ram that is faster or slower than the flow into it by 0.5 %."""
     flow, gain = c.parts["flow"], c.parts["gain"]
-    if flow is not None and gain is not None and flow > BLOCK_ERROR_RATIO and abs(gain) > notable_share:
-        direction = "further" if gain > 0 else "less"
-        other = f". {OTHER_ACTUATOR}" if abs(gain) > FLOW_GAIN_FAR else ""
-        lines.append(Line("flow", f"the ram moves {format_percent(abs(gain))} {direction} than the flow through the "
-                                  f"metering edges predicts{other}"))
-    if "xj" in c.signals and abs(c.drift) > notable_drift and not c.trace.filled.any():
-        lines.append(Line("drift", "a replay that is not corrected towards the measured position drifts by "
-                                   f"{format_amount(c.drift, 'm/s')}"))
-    return lines
+    if flow is None or gain is None or flow <= BLOCK_ERROR_RATIO or abs(gain) <= notable_share:
+        return ""
+    other = f". {OTHER_ACTUATOR}" if abs(gain) > FLOW_GAIN_FAR else ""
+    return (f"the ram moves {format_percent(abs(gain))} {'further' if gain > 0 else 'less'} than the flow through the "
+            f"metering edges predicts{other}")
+
+
+def _describe_drift(c: Comparison, notable: float = 1e-6) -> str:
+    """A free replay that drifts by 1 um/s."""
+    if "xj" not in c.signals or abs(c.drift) <= notable or c.trace.filled.any():
+        return ""
+    return ("a replay that is not corrected towards the measured position drifts by "
+            f"{format_amount(c.drift, 'm/s')}")
 
 
 def _describe_scatter(c: Comparison) -> str:
     s = c.scatter
-    assert s is not None
+    if s is None:
+        return ""
     if s.enough:
         changed = [f"{name} by {moved:+.1f}" for name, moved in s.moved.items() if abs(moved) > 1.0][:2]
         which = f" (in tolerances: {', '.join(changed)})" if changed else ""
@@ -272,8 +283,8 @@ def _describe_scatter(c: Comparison) -> str:
             f"{format_ratio(s.ratio[worst])} times the floor")
 
 
-def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_memory: float = 3.0) -> list[str]:
-    """What distinguishes a residual from noise: memory, input it follows, quantity it depends on.
+def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_memory: float = 3.0) -> str:
+    """What distinguishes a residual from noise: memory, input it follows, quantity it depends on; "" for nothing.
 
     A correlation below `strong` explains 2 % of the power or less; `long_memory` is in memories of the noise.
     """
@@ -289,63 +300,18 @@ def _describe_residual(name: str, d: ResidualTests, strong: float = 0.15, long_m
         first = d.depends[0]
         found.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
                      f"up to {format_signal(abs(first.size), name)}")
-    return found
-
-
-def _show_figures(c: Comparison) -> list[Section]:
-    sections = [Section("Measured and replayed", [Figure(
-        "Each signal as measured and as replayed from the measured current, and its residual (measured minus model) "
-        "below. Green: two noise floors on either side; noise stays within for 95 % of the time. Shaded: ramps (blue) "
-        "and dynamic sections (violet) of the command. Red: not judged.", partial(draw_overview, c))])]
-    if c.where:
-        sections.append(Section("Where", [_tabulate_places(c), Figure(
-            "Share of each section in the squared error. The longest bar shows where to look first.",
-            partial(draw_error_shares, c))], medium=Medium.PAGE))
-    sections.append(Section("By speed and amplitude", [Figure(
-        "Error over noise floor by speed of the ram (over 20 rows) and by amplitude (half its range within 0.25 s "
-        "before and after). 1 is noise; dark cells show at which motion the model fails. Empty: fewer than 30 rows.",
-        partial(draw_deviation_map, c))]))
-    sections.append(Section("Is the residual noise", [Figure(
-        "From the left: autocorrelation, cumulative periodogram, correlation with an input. Noise stays within green: "
-        "the 99 % band of the correlations and Bartlett's 95 % band of the periodogram. Where a repeat shows the "
-        "colour of the noise, the residual is whitened by it.", partial(draw_whiteness, c))]))
-    if any(d.depends for d in c.diagnoses.values()):
-        sections.append(Section("What the residual depends on", [Figure(
-            "Mean residual (measured minus model) over each quantity, in bins of equal count with 95 % intervals. A "
-            "curve that leaves the green band of two noise floors shows a dependence.",
-            partial(draw_dependence, c))]))
-    return sections
-
-
-def _tabulate_places(c: Comparison) -> Table:
-    columns = [Column("section"), Column("time", "s"), Column("share of the squared error", align="right"),
-               Column("error over floor", align="right"), Column("condition")]
-    return Table(columns, [[p.section, Cell(f"{p.t0:.2f} - {p.t1:.2f}", "muted"), format_percent(p.share, 3),
-                            format_ratio(p.ratio), p.condition] for p in c.where])
-
-
-def _list_parameters(c: Comparison) -> list[Section]:
-    sections = []
-    if c.scatter is not None:
-        rows = [[name, f"{moved:+.2f}"] for name, moved in c.scatter.moved.items()]
-        sections.append(Section("Refit within the tolerances", [Table(
-            [Column("parameter"), Column("change, in tolerances")], rows,
-            "How far each parameter moves when the model is refitted within the tolerances of a healthy unit.",
-            is_list=True)], medium=Medium.PAGE))
-    changes = sorted(c.model.list_changes().items())
-    if changes:
-        rows = [[name, f"{value:g}"] for name, value in changes]
-        sections.append(Section("Changes of the model", [Table(
-            [Column("parameter"), Column("value, SI")], rows, "Parameters that differ from the nominal model.",
-            is_list=True)], medium=Medium.PAGE))
-    return sections
+    return f"{SIGNAL_NAMES[name]}: {'; '.join(found)}" if found else ""
 
 
 def collect_data(c: Comparison) -> dict[str, Any]:
     """The answer of `rig compare --json`; SI units."""
     return {
         "verdict": c.verdict, "reason": c.reason or describe_verdict(c), "trace": c.source, "model": c.model.name,
-        "signals": {name: _signal_data(s) for name, s in c.signals.items()},
+        "signals": {name: {
+            "unit": s.unit, "error": s.error, "floor": s.floor.value, "ratio": s.ratio,
+            "closed_loop_error": s.closed_loop_error, "solver_error": s.solver_error, "limit": s.limit,
+            "floor_source": s.floor.source, "sensor_noise": s.sensor_noise, "lower_bound": s.floor.lower_bound,
+            "hum": s.floor.hum, "difference": s.floor.difference} for name, s in c.signals.items()},
         "solver_error": c.signals["xj"].solver_error if "xj" in c.signals else None,
         "steps": c.replay.steps,
         "where": [{"section": p.section, "t0": p.t0, "t1": p.t1, "share": p.share, "ratio": p.ratio,
@@ -356,200 +322,111 @@ def collect_data(c: Comparison) -> dict[str, Any]:
         "drift": {"speed": c.drift, "free_error": c.free_error},
         "tolerances": None if c.scatter is None else {
             "enough": c.scatter.enough, "error": c.scatter.error, "ratio": c.scatter.ratio, "moved": c.scatter.moved},
-        "diagnostics": {name: _diagnosis_data(d) for name, d in c.diagnoses.items()},
-        "repeats": c.repeats, "notes": list(c.notes)}
-
-
-def _signal_data(s: SignalError) -> dict[str, Any]:
-    return {"unit": s.unit, "error": s.error, "floor": s.floor.value, "ratio": s.ratio,
-            "closed_loop_error": s.closed_loop_error, "solver_error": s.solver_error, "limit": s.limit,
-            "floor_source": s.floor.source, "sensor_noise": s.sensor_noise, "lower_bound": s.floor.lower_bound,
-            "hum": s.floor.hum, "difference": s.floor.difference}
-
-
-def _diagnosis_data(d: ResidualTests) -> dict[str, Any]:
-    return {"memory": d.memory, "noise_memory": d.noise_memory, "half_power": d.half_power,
+        "diagnostics": {name: {
+            "memory": d.memory, "noise_memory": d.noise_memory, "half_power": d.half_power,
             "periodogram": {"distance": d.departs, "band": d.allowed},
             "autocorrelation": {"lag_1": d.correlation[1], "band": d.band},
             "inputs": {f.input: {"correlation": f.correlation, "lag": f.lag, "bound": f.bound} for f in d.follows},
             "depends_on": [{"on": x.on, "share": x.share, "shape": x.shape, "size": x.size} for x in d.depends]}
+            for name, d in c.diagnoses.items()},
+        "repeats": c.repeats, "notes": list(c.notes)}
 
 
-Floats = NDArray[np.float64]
-
-COLOURS = {"xj": "#1f6feb", "p12": "#0f8b8d", "xs": "#bf3989"}
-MODEL, NOISE = "#d9730d", "#2b8a3e"
 QUANTITIES = {"speed": ("speed [mm/s]", 1e3), "position": ("position [mm]", 1e3), "P12": ("P12 [bar]", 1e-5),
               "acceleration": ("acceleration [m/s2]", 1.0)}
 
 
 def draw_overview(c: Comparison) -> str:
     """Command and position, then each signal measured and replayed, and its residual beside the noise floor."""
-    run, names = c.trace, list(c.signals)
-    heights = [1.5] + [1.3, 1.3] * len(names)
-    with start_figure(0.8 + sum(heights)) as figure:
-        axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        axes[0].plot(*thin_line(run.t, run.com * 1e3), color=COMMAND, lw=2.2, label="Com, command")
-        axes[0].plot(*thin_line(run.t, run.xj * 1e3), color=COLOURS["xj"], lw=1.0, label="XJ, ram")
-        axes[0].set_ylabel("position [mm]")
-        axes[0].legend(ncols=2, **ABOVE)
-        for i, name in enumerate(names):
-            _draw_replay(axes[1 + 2 * i], c, name)
-            _draw_residual(axes[2 + 2 * i], c, name)
-        for ax in axes:
-            shade_sections(ax, run)
-            _shade_rows_left_out(ax, c)
-        axes[-1].set_xlabel("time [s]")
-        axes[-1].set_xlim(float(run.t[0]), float(run.t[-1]) + run.period)
-        figure.align_ylabels()
-        return to_svg(figure, "overview")
-
-
-def _draw_replay(ax: Axes, c: Comparison, name: str) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], LEVELS[name]
     t = c.trace.t
-    ax.plot(*thin_line(t, c.trace.mask_unusable(name) * scale), color=COLOURS[name], lw=1.2, label="measured")
-    ax.plot(*thin_line(t, c.replay.model[name] * scale), color=MODEL, lw=0.8, label="model, from the current")
-    ax.set_ylabel(f"{label} [{unit}]")
-    ax.legend(ncols=2, **ABOVE)
-
-
-def _draw_residual(ax: Axes, c: Comparison, name: str) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], choose_drawn_unit(name, c.signals[name].error)
-    floor = NOISE_BAND_RATIO * c.signals[name].floor.value * scale
-    ax.axhspan(-floor, floor, color=NOISE, alpha=0.25, lw=0)
-    ax.plot(*thin_line(c.trace.t, c.replay.residual[name] * scale), color=INK, lw=0.7)
-    ax.set_ylabel(f"residual of\n{label} [{unit}]")
-
-
-def _shade_rows_left_out(ax: Axes, c: Comparison) -> None:
-    """Rows that are not judged, in red."""
-    t = c.trace.t
-    out = (c.replay.undecided | ~c.trace.usable).astype(int)
-    for a, b in np.flatnonzero(np.diff(out, prepend=0, append=0)).reshape(-1, 2):
-        ax.axvspan(float(t[a]), float(t[b - 1]), color=RED, alpha=0.12, lw=0, zorder=-1)
+    ends = np.flatnonzero(np.diff((c.replay.undecided | ~c.trace.usable).astype(int), prepend=0, append=0))
+    left_out = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
+    panels: list[Panel] = [[line(t, c.trace.com * 1e3, COMMAND, "Com, command", 2.2),
+                            line(t, c.trace.xj * 1e3, BLUE, "XJ, ram"), axes(ylabel="position [mm]"), legend(2),
+                            *left_out]]
+    for name, s in c.signals.items():
+        (unit, scale), (fine, small) = LEVELS[name], choose_drawn_unit(name, s.error)
+        floor = NOISE_BAND_RATIO * s.floor.value * small
+        panels += [[line(t, c.trace.mask_unusable(name) * scale, SIGNAL_COLOURS[name], "measured", 1.2),
+                    line(t, c.replay.model[name] * scale, ORANGE, "model, from the current", 0.8),
+                    axes(ylabel=f"{SIGNAL_NAMES[name]} [{unit}]"), legend(2), *left_out],
+                   [band(-floor, floor, GREEN), line(t, c.replay.residual[name] * small, INK, width=0.7),
+                    axes(ylabel=f"residual of\n{SIGNAL_NAMES[name]} [{fine}]"), *left_out]]
+    return draw_over_time("overview", c.trace, panels, [1.5] + [1.3, 1.3] * len(c.signals))
 
 
 def draw_error_shares(c: Comparison) -> str:
     """Each section's share of the squared error, in the order of time."""
     places = sorted(c.where, key=lambda place: place.t0)
-    with start_figure(0.7 + 0.27 * len(places)) as figure:
-        ax = figure.subplots()
-        ax.barh(range(len(places)), [100 * p.share for p in places], color=MODEL, height=0.7)
-        ax.set_yticks(range(len(places)), [f"{p.section}, {p.t0:.2f}–{p.t1:.2f} s" for p in places])
-        for row, place in enumerate(places):
-            ax.text(100 * place.share, row, f" {format_ratio(place.ratio)} times the floor", va="center", fontsize=8)
-        ax.invert_yaxis()
-        ax.grid(axis="y", visible=False)
-        ax.set_xlabel("share of the squared error [%]")
-        ax.set_xlim(0, 125 * max(p.share for p in places))
-        return to_svg(figure, "shares")
+    shares = [100 * p.share for p in places]
+    return draw_panels("shares", [[[
+        call("barh", range(len(places)), shares, color=ORANGE, height=0.7),
+        *name_rows([f"{p.section}, {p.t0:.2f}–{p.t1:.2f} s" for p in places]),
+        *(call("text", share, row, f" {format_ratio(place.ratio)} times the floor", va="center", fontsize=8)
+          for row, (share, place) in enumerate(zip(shares, places, strict=True))),
+        axes(xlabel="share of the squared error [%]", xlim=(0, 1.25 * max(shares)))]]], 0.7 + 0.27 * len(places))
 
 
 def draw_deviation_map(c: Comparison) -> str:
     """Error over noise floor of each signal by speed and amplitude of the ram; "" without rows enough."""
     from matplotlib.colors import LogNorm
 
-    found = map_error(c)
+    floor = {name: s.floor.value for name, s in c.signals.items() if s.floor.value > 0.0}
+    found = map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
     if found is None:
         return ""
-    names = list(found.ratio)
-    most = max(float(np.nanmax(ratio)) for ratio in found.ratio.values())
-    norm = LogNorm(1.0, max(most, 10.0))
-    with start_figure(1.2 + 0.42 * len(found.amplitudes)) as figure:
-        axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-        for ax, name in zip(axes, names, strict=True):
-            ratio = found.ratio[name]
-            ax.pcolormesh(np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0)
-            for (row, column), value in np.ndenumerate(ratio):
-                if np.isfinite(value):
-                    colour = "white" if norm(value) > 0.6 else INK
-                    ax.text(column + 0.5, row + 0.5, format_ratio(float(value)), ha="center", va="center", fontsize=8,
-                            color=colour)
-            ax.set_xticks(range(len(found.speeds)), _name_edges(found.speeds))
-            ax.set_title(SIGNAL_NAMES[name], fontsize=9)
-            ax.set_xlabel("speed [mm/s]")
-            ax.grid(visible=False)
-        axes[0].set_yticks(range(len(found.amplitudes)), _name_edges(found.amplitudes))
-        axes[0].set_ylabel("amplitude [mm]")
-        return to_svg(figure, "map")
-
-
-def map_error(c: Comparison) -> DeviationMap | None:
-    """The residuals of a comparison by speed and amplitude, over their noise floors."""
-    floor = {name: s.floor.value for name, s in c.signals.items() if s.floor.value > 0.0}
-    return map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
-
-
-def _name_edges(edges: Floats) -> list[str]:
-    return ["" if np.isinf(edge) else f"{1e3 * edge:g}" for edge in edges]
+    norm = LogNorm(1.0, max(10.0, *(float(np.nanmax(ratio)) for ratio in found.ratio.values())))
+    speeds, amplitudes = ([["" if np.isinf(edge) else f"{1e3 * edge:g}" for edge in edges]
+                           for edges in (found.speeds, found.amplitudes)])
+    return draw_panels("map", [[[
+        call("pcolormesh", np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0),
+        *(call("text", column + 0.5, row + 0.5, format_ratio(float(value)), ha="center", va="center", fontsize=8,
+               color="white" if norm(value) > 0.6 else INK)
+          for (row, column), value in np.ndenumerate(ratio) if np.isfinite(value)),
+        call("set_xticks", range(len(speeds)), speeds), call("set_yticks", range(len(amplitudes)), amplitudes),
+        axes(title=SIGNAL_NAMES[name], xlabel="speed [mm/s]", ylabel="" if number else "amplitude [mm]"),
+        call("grid", False)] for number, (name, ratio) in enumerate(found.ratio.items())]],
+        1.2 + 0.42 * len(found.amplitudes), sharey=True)
 
 
 def draw_whiteness(c: Comparison) -> str:
     """One row per signal: autocorrelation, cumulative periodogram, cross-correlation with the current."""
-    names = list(c.diagnoses)
-    with start_figure(2.4 * len(names)) as figure:
-        rows = figure.subplots(len(names), 3, squeeze=False)
-        for name, axes in zip(names, rows, strict=True):
-            d = c.diagnoses[name]
-            _draw_autocorrelation(axes[0], d, c.trace.period, SIGNAL_NAMES[name])
-            _draw_periodogram(axes[1], d)
-            _draw_cross_correlation(axes[2], d)
-        return to_svg(figure, "whiteness")
+    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, SIGNAL_NAMES[name])
+                                     for name, d in c.diagnoses.items()], 2.4 * len(c.diagnoses))
 
 
-def _draw_autocorrelation(ax: Axes, d: ResidualTests, period: float, label: str) -> None:
-    lags = np.arange(1, len(d.correlation)) * period * 1e3
-    ax.axhspan(-d.band, d.band, color=NOISE, alpha=0.25, lw=0)
-    ax.vlines(lags, 0.0, d.correlation[1:], color=INK, lw=0.8)
-    ax.set_ylabel(f"{label}\nautocorrelation")
-    ax.set_xlabel("lag [ms]")
-
-
-def _draw_periodogram(ax: Axes, d: ResidualTests) -> None:
-    f, line = d.frequencies, np.linspace(0.0, 1.0, len(d.frequencies))
-    ax.fill_between(f, line - d.allowed, line + d.allowed, color=NOISE, alpha=0.25, lw=0)
-    ax.plot(*thin_line(f, d.power), color=INK, lw=1.0)
-    ax.set_ylim(0, 1)
-    ax.set_ylabel("cumulative power")
-    ax.set_xlabel("frequency [Hz]")
-
-
-def _draw_cross_correlation(ax: Axes, d: ResidualTests) -> None:
+def _draw_tests(d: ResidualTests, period: float, label: str) -> list[Panel]:
+    rise = np.linspace(0.0, 1.0, len(d.frequencies))
     chosen = next((f for f in d.follows if f.input == "Cor"), d.follows[0] if d.follows else None)
-    if chosen is None:
-        ax.set_axis_off()
-        return
-    ax.axhspan(-chosen.bound, chosen.bound, color=NOISE, alpha=0.25, lw=0)
-    ax.vlines(chosen.lags * 1e3, 0.0, chosen.curve, color=INK, lw=0.8)
-    ax.axvline(0.0, color=COMMAND, lw=0.6)
-    ax.set_ylabel(f"correlation with {chosen.input}")
-    ax.set_xlabel(f"residual later than {chosen.input} by [ms]")
+    return [
+        [*_draw_correlation(np.arange(1, len(d.correlation)) * period, d.correlation[1:], d.band),
+         axes(ylabel=f"{label}\nautocorrelation", xlabel="lag [ms]")],
+        [area(d.frequencies, rise - d.allowed, rise + d.allowed, GREEN), line(d.frequencies, d.power, INK),
+         axes(ylim=(0, 1), ylabel="cumulative power", xlabel="frequency [Hz]")],
+        [] if chosen is None else
+        [*_draw_correlation(chosen.lags, chosen.curve, chosen.bound), instant(0.0, COMMAND, width=0.6),
+         axes(ylabel=f"correlation with {chosen.input}", xlabel=f"residual later than {chosen.input} by [ms]")]]
+
+
+def _draw_correlation(lags: Any, values: Any, bound: float) -> list[Mark]:
+    return [band(-bound, bound, GREEN), call("vlines", lags * 1e3, 0.0, values, color=INK, lw=0.8)]
 
 
 def draw_dependence(c: Comparison) -> str:
     """One row per signal: mean residual over speed, position, P12 and acceleration, with 95 % intervals."""
-    names = list(c.diagnoses)
-    kinds = [kind for kind in QUANTITIES if any(d.on == kind for n in names for d in c.diagnoses[n].depends)]
+    by = {name: {x.on: x for x in d.depends} for name, d in c.diagnoses.items()}
+    kinds = [kind for kind in QUANTITIES if any(kind in own for own in by.values())]
     if not kinds:
         return ""
-    with start_figure(2.3 * len(names)) as figure:
-        rows = figure.subplots(len(names), len(kinds), squeeze=False)
-        for name, axes in zip(names, rows, strict=True):
-            by = {d.on: d for d in c.diagnoses[name].depends}
-            _draw_means(axes, kinds, by, name, NOISE_BAND_RATIO * c.signals[name].floor.value)
-        return to_svg(figure, "dependence")
+    return draw_panels("dependence", [_draw_means(c, name, kinds, own) for name, own in by.items()], 2.3 * len(by))
 
 
-def _draw_means(axes: Sequence[Axes], kinds: Sequence[str], by: dict[str, Depends], name: str, floor: float) -> None:
-    label, (unit, scale) = SIGNAL_NAMES[name], choose_drawn_unit(name, max((d.size for d in by.values()), key=abs))
-    for ax, kind in zip(axes, kinds, strict=True):
-        if kind not in by:
-            ax.set_axis_off()
-            continue
-        d, (words, factor) = by[kind], QUANTITIES[kind]
-        ax.axhspan(-floor * scale, floor * scale, color=NOISE, alpha=0.15, lw=0)
-        ax.errorbar(d.centres * factor, d.means * scale, d.half * scale, color=COLOURS[name], lw=1.0, marker="o", ms=3)
-        ax.set_xlabel(words)
-        ax.set_title(f"{100 * d.share:.0f} % of the power", fontsize=8)
-    axes[0].set_ylabel(f"mean residual\nof {label} [{unit}]")
+def _draw_means(c: Comparison, name: str, kinds: Sequence[str], by: dict[str, Depends]) -> list[Panel]:
+    unit, scale = choose_drawn_unit(name, max((d.size for d in by.values()), key=abs, default=0.0))
+    floor = NOISE_BAND_RATIO * c.signals[name].floor.value * scale
+    return [[band(-floor, floor, GREEN, alpha=0.15),
+             call("errorbar", by[kind].centres * QUANTITIES[kind][1], by[kind].means * scale, by[kind].half * scale,
+                  color=SIGNAL_COLOURS[name], lw=1.0, marker="o", ms=3),
+             axes(xlabel=QUANTITIES[kind][0], title=f"{100 * by[kind].share:.0f} % of the power",
+                  ylabel=f"mean residual\nof {SIGNAL_NAMES[name]} [{unit}]" if kind == kinds[0] else "")]
+            if kind in by else [] for kind in kinds]

@@ -3,13 +3,51 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
-from fdi.diagnosis.bands import Event
+import numpy as np
+
+from fdi.diagnosis.bands import (
+    Bands,
+    BandVerdict,
+    Event,
+    RampBand,
+    StepBand,
+    compute_half_range,
+    compute_speed,
+    find_lasting_peak,
+    read_columns,
+    select_ramp_rows,
+)
 from fdi.diagnosis.diagnosis import Diagnosis
 from fdi.diagnosis.faults import CLOGGING, FAULTS, FRICTION, Estimate, Fault, Level, compute_severity
 from fdi.diagnosis.joint_search import Beside, Explanation
-from fdi.diagnosis.precursors import format_precursor
+from fdi.diagnosis.precursors import Precursor, format_precursor
+from fdi.diagnosis.rms_grid import LOWER_CORNER, UPPER_CORNER, Grid, Map
+from fdi.report.drawing import (
+    BLUE,
+    COMMAND,
+    GREEN,
+    INK,
+    ORANGE,
+    RED,
+    Mark,
+    Panel,
+    area,
+    axes,
+    band,
+    call,
+    dot,
+    draw_panels,
+    instant,
+    legend,
+    levels,
+    line,
+    name_rows,
+    shade,
+    spans,
+)
 from fdi.report.numbers import NO_NUMBER, SIGNAL_NAMES, format_digits, format_interval, format_ratio, join_words
 from fdi.report.report import (
     Cell,
@@ -23,8 +61,13 @@ from fdi.report.report import (
     Report,
     Section,
     Table,
+    tabulate,
 )
 from fdi.sources import name_software
+from fdi.thresholds import BAND_NEAREST_LIMIT_SD
+from fdi.trace.sections import Section as CommandSection
+from fdi.trace.sections import find_sections
+from fdi.trace.trace import Trace
 from plant.model import find_quantity
 
 FAULT_NAMES = {CLOGGING.name: "filter clogging", FRICTION.name: "spool friction"}
@@ -44,19 +87,32 @@ SUSPECTS = {  # parameter: its name, SI unit or the unit shown, factor from SI
 
 def build_diagnosis_report(d: Diagnosis) -> Report:
     """Report on a diagnosis; its `data` is the answer of `rig fdi --json`."""
-    return Report(
-        command="fdi", title=d.source, verdict=d.verdict, mood=VERDICT_MOODS.get(d.verdict, "doubtful"),
-        sentence=describe_verdict(d), facts=_list_facts(d),
-        notes=[*describe_overruled_bands(d), *explain_grid(d), *d.notes],
-        sections=[Section("Faults", _show_faults(d)),
-                  Section("Other effects", _tabulate_effects(d)),
-                  Section("Response in its bands", _draw_bands(d)),
-                  Section("Events", _tabulate_events(d)),
-                  Section("RMS maps", _show_maps(d), medium=Medium.PAGE),
-                  Section("Precursors", _show_precursors(d)),
-                  Section("Fit", _describe_fit(d)),
-                  Section("Provenance of the bands", _list_bands_provenance(d), medium=Medium.PAGE)],
-        data=collect_data(d))
+    t, page = d.trace, Medium.PAGE
+    changes = [f"{name}={value:g}" for name, value in sorted(d.model.list_changes().items())]
+    facts = [("trace", f"{len(t) * t.period:.3f} s, {len(t)} cycles of {1e3 * t.period:g} ms"),
+             ("signals", ", ".join(SIGNAL_NAMES[name] for name in t.outputs)),
+             ("model", " ".join([d.model.name, *changes])), ("software", name_software())]
+    provenance = {} if d.bands is None else d.bands.provenance
+    sections = [
+        Section("Faults", [_tabulate_faults(d), Figure(
+            "Each estimate of the two sizes over the three levels: green acceptable, amber maintenance, red "
+            "non-nominal. Circle: fit with its 95 % interval; diamonds: the other methods.",
+            partial(draw_sizes, d.sizes, d.grid, d.band_verdict))]),
+        Section("Other effects", _show_effects(d)),
+        Section("Response in its bands", _show_bands(d)),
+        Section("Events", _tabulate_events(d)),
+        Section("RMS maps", _show_maps(d), medium=page),
+        Section("Precursors", _show_precursors(d)),
+        Section("Fit", [
+            Line("residual", describe_residual(d)),
+            Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; correlation of the two sizes "
+                        f"{d.refinement.correlation:+.2f}"),
+            *(Line("deviation", describe_deviation(name, size)) for name, size in d.others.items())]),
+        Section("Provenance of the bands", [tabulate(
+            sorted(provenance.items()), (Column(""), lambda row: Cell(row[0], "muted")),
+            (Column(""), lambda row: row[1]), is_list=True)], medium=page)]
+    return Report("fdi", d.source, d.verdict, VERDICT_MOODS.get(d.verdict, "doubtful"), describe_verdict(d), facts,
+                  [*describe_overruled_bands(d), *explain_grid(d), *d.notes], sections, data=collect_data(d))
 
 
 def build_bands_report(made: Mapping[str, Any]) -> Report:
@@ -79,25 +135,25 @@ def describe_verdict(d: Diagnosis) -> str:
         return (f"Neither fault explains this trace: the residual of the best fit is {describe_residual(d)}. Something "
                 "else is wrong; no fault is reported until the cause is known. rig fdi --with-effects searches for the "
                 "cause and sizes both faults beside it.")
-    if d.verdict == "CANNOT_TELL":
-        names = join_words(FAULT_NAMES[name] for name, level in d.levels.items() if level is None)
-        if d.beside is not None and d.beside.disputed:
-            return (f"The level of {names} depends on what else is wrong, and this trace does not tell "
-                    f"{_join_alternatives(d.beside)} apart." + _describe_other_deviations(d))
+    names = join_words(FAULT_NAMES[name] for name, level in d.levels.items() if level is None)
+    is_disputed = d.beside is not None and d.beside.disputed
+    if d.verdict == "CANNOT_TELL" and not is_disputed:
         return f"This trace does not determine {names}: a healthy unit and MidBand are both within the 95 % interval."
-    if d.verdict == "ACCEPTABLE":
-        return "Both faults are acceptable." + _describe_other_deviations(d)
-    worst = next(fault for fault in FAULTS if fault.name == d.ruling)
-    need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
-    rest = "; ".join(_describe_level(d, fault) for fault in FAULTS if fault is not worst)
-    return (f"{FAULT_NAMES[worst.name].capitalize()} {need}: {describe_size(worst, d.sizes[worst.name])}; {rest}."
-            + _describe_other_deviations(d))
-
-
-def _describe_level(d: Diagnosis, fault: Fault) -> str:
-    level = d.levels[fault.name]
-    verb = "" if level is None else "is "
-    return f"{FAULT_NAMES[fault.name]} {verb}{LEVEL_NAMES[level]}"
+    if d.verdict == "CANNOT_TELL" and d.beside is not None:
+        sentence = (f"The level of {names} depends on what else is wrong, and this trace does not tell "
+                    f"{_join_alternatives(d.beside)} apart.")
+    elif d.verdict == "ACCEPTABLE":
+        sentence = "Both faults are acceptable."
+    else:
+        worst = next(fault for fault in FAULTS if fault.name == d.ruling)
+        need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
+        rest = "; ".join(f"{FAULT_NAMES[name]} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
+                         for name, level in d.levels.items() if name != worst.name)
+        sentence = (f"{FAULT_NAMES[worst.name].capitalize()} {need}: {describe_size(worst, d.sizes[worst.name])}; "
+                    f"{rest}.")
+    if d.beside is not None and d.beside.is_explained and d.beside.effects:
+        sentence += f" Beside the faults: {_join_alternatives(d.beside)}."
+    return sentence + (f" Other deviations: {_list_others(d)}." if d.others else "")
 
 
 def describe_size(fault: Fault, size: Estimate) -> str:
@@ -164,8 +220,7 @@ def describe_overruled_bands(d: Diagnosis) -> list[str]:
         by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
         level = d.levels[fault.name]
         if by_bands is not None and level is not None and by_bands > level:
-            others = "; ".join(describe_deviation(name, size) for name, size in d.others.items())
-            cause = f", with {others}" if others else ""
+            cause = f", with {_list_others(d)}" if d.others else ""
             sentences.append(f"The bands call {FAULT_NAMES[fault.name]} {LEVEL_NAMES[by_bands]}; the fit, which models "
                              f"the whole plant, finds it {LEVEL_NAMES[level]}{cause}. Trust the fit.")
     return sentences
@@ -176,22 +231,22 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
 
     `far`: cells of the grid outside the interval of the fit.
     """
-    sentences = []
+    sentences: list[str] = []
     g = d.grid
-    for fault, axis in zip(FAULTS, (g.kintas, g.fss) if g else (), strict=False):
-        assert g is not None
+    if g is None:
+        return sentences
+    for fault, axis in zip(FAULTS, (g.kintas, g.fss), strict=True):
         size, found = d.sizes[fault.name], float(getattr(g.merged, fault.symbol))
         outside = max(size.low - found, found - size.high)
         if outside <= far * float(axis[1] - axis[0]):
             continue
         parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.symbol)))}"
                  for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
-        symbol, unit = SIZE_SYMBOLS[fault.name], "" if fault.unit == "1" else f" {fault.unit}"
-        sentence = (f"The grid gives {symbol} {format_digits(found)}{unit} (minima: {', '.join(parts)}), the fit "
-                    f"{format_size(fault, size)}: the grid matches the position alone with a plant that has only "
-                    "these two faults")
+        at = f"{SIZE_SYMBOLS[fault.name]} {format_digits(found)} {_name_unit(fault)}".rstrip()
+        sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the grid "
+                    "matches the position alone with a plant that has only these two faults")
         if d.others:
-            sentence += f", here with {'; '.join(describe_deviation(name, e) for name, e in d.others.items())}"
+            sentence += f", here with {_list_others(d)}"
         if "xj" in d.refinement.errors:
             sentence += (f"; its best cell leaves {1e6 * g.joint.minimum.rms:.3g} um of the position, the fit "
                          f"{1e6 * d.refinement.errors['xj']:.3g} um")
@@ -200,14 +255,8 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
     return sentences
 
 
-def _describe_other_deviations(d: Diagnosis) -> str:
-    words = ""
-    if d.beside is not None and d.beside.is_explained and d.beside.effects:
-        words = f" Beside the faults: {_join_alternatives(d.beside)}."
-    if not d.others:
-        return words
-    others = "; ".join(describe_deviation(name, e) for name, e in d.others.items())
-    return f"{words} Other deviations: {others}."
+def _list_others(d: Diagnosis) -> str:
+    return "; ".join(describe_deviation(name, size) for name, size in d.others.items())
 
 
 def _join_alternatives(b: Beside) -> str:
@@ -232,48 +281,37 @@ def describe_deviation(parameter: str, size: Estimate) -> str:
     return f"{name} {format_interval(scale * size.value, scale * size.low, scale * size.high, unit)}"
 
 
-def _list_facts(d: Diagnosis) -> list[tuple[str, str]]:
-    c = d.trace
-    changes = [f"{name}={value:g}" for name, value in sorted(d.model.list_changes().items())]
-    return [("trace", f"{len(c) * c.period:.3f} s, {len(c)} cycles of {1e3 * c.period:g} ms"),
-            ("signals", ", ".join(SIGNAL_NAMES[name] for name in c.outputs)),
-            ("model", " ".join([d.model.name, *changes])), ("software", name_software())]
+def _tabulate_faults(d: Diagnosis) -> Table:
+    by_bands = d.band_verdict.levels if d.band_verdict else {}
 
+    def show_grid(fault: Fault) -> str:
+        if d.grid is None:
+            return NO_NUMBER
+        return f"{format_digits(float(getattr(d.grid.merged, fault.symbol)))} {_name_unit(fault)}".rstrip()
 
-def _show_faults(d: Diagnosis) -> list[Item]:
-    columns = [Column("fault"), Column("level"), Column("size (95 % interval)", align="right"),
-               Column("MidBand", align="right", medium=Medium.PAGE),
-               Column("MaxBand", align="right", medium=Medium.PAGE), Column("grid", align="right"), Column("by bands")]
-    rows = [_list_fault_cells(d, fault) for fault in FAULTS]
+    def show_bands(fault: Fault) -> Cell:
+        level = by_bands.get(fault.name)
+        return Cell("not judged" if level is None else LEVEL_NAMES[level], LEVEL_MOODS[level])
+
     limits = "; ".join(f"{SIZE_SYMBOLS[f.name]} {' and '.join(format_limits_of_fault(f))}" for f in FAULTS)
-    caption = (f"Size: fitted by replay of the measured current. Grid: minimum of the RMS maps. By bands: level by the "
-               f"response alone. Limits (MidBand and MaxBand): {limits}.")
-    if d.ruling:
-        caption += " * marks the ruling fault."
-
-    def draw() -> str:
-        from fdi.report import diagnosis_figures  # here: matplotlib takes half a second to import
-
-        return diagnosis_figures.draw_sizes(d.sizes, d.grid, d.band_verdict)
-
-    return [Table(columns, rows, caption),
-            Figure("Each estimate of the two sizes over the three levels: green acceptable, amber maintenance, red "
-                   "non-nominal. Circle: fit with its 95 % interval; diamonds: the other methods.", draw)]
+    return tabulate(
+        FAULTS, (Column("fault"), lambda f: FAULT_NAMES[f.name] + (" *" if d.ruling == f.name else "")),
+        (Column("level"), lambda f: Cell(LEVEL_NAMES[d.levels[f.name]], LEVEL_MOODS[d.levels[f.name]])),
+        (Column("size (95 % interval)", align="right"),
+         lambda f: Cell(format_size(f, d.sizes[f.name]), is_strong=True)),
+        (Column("MidBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[0]),
+        (Column("MaxBand", align="right", medium=Medium.PAGE), lambda f: format_limits_of_fault(f)[1]),
+        (Column("grid", align="right"), show_grid), (Column("by bands"), show_bands),
+        caption=f"Size: fitted by replay of the measured current. Grid: minimum of the RMS maps. By bands: level by "
+                f"the response alone. Limits (MidBand and MaxBand): {limits}."
+                + (" * marks the ruling fault." if d.ruling else ""))
 
 
-def _list_fault_cells(d: Diagnosis, fault: Fault) -> list[Cell | str]:
-    level = d.levels[fault.name]
-    by_bands = d.band_verdict.levels.get(fault.name) if d.band_verdict else None
-    at_grid = float(getattr(d.grid.merged, fault.symbol)) if d.grid else math.nan
-    unit = "" if fault.unit == "1" or d.grid is None else f" {fault.unit}"
-    mark = " *" if d.ruling == fault.name else ""
-    return [FAULT_NAMES[fault.name] + mark, Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]),
-            Cell(format_size(fault, d.sizes[fault.name]), is_strong=True), *format_limits_of_fault(fault),
-            format_digits(at_grid) + unit,
-            Cell("not judged" if by_bands is None else LEVEL_NAMES[by_bands], LEVEL_MOODS[by_bands])]
+def _name_unit(fault: Fault) -> str:
+    return "" if fault.unit == "1" else fault.unit
 
 
-def _tabulate_effects(d: Diagnosis) -> list[Item]:
+def _show_effects(d: Diagnosis) -> list[Item]:
     """One row for each explanation that may be right: its effects with sizes, and what it makes of both faults."""
     b = d.beside
     if b is None:
@@ -284,58 +322,41 @@ def _tabulate_effects(d: Diagnosis) -> list[Item]:
                Column("residual / noise", align="right", medium=Medium.PAGE)]
     rows: list[list[Cell | str]] = []
     for e in b.explanations:
-        sizes = "; ".join(_format_parameter(name, size) for name, size in e.parameters.items())
-        cells: list[Cell | str] = []
-        for f in FAULTS:
-            level = e.levels[f.name] if d.refinement.is_explained else None
-            cells += [format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level])]
-        rows.append([name_explanation(e), f"{100 * e.weight:.0f}", sizes or NO_NUMBER, *cells,
-                     format_ratio(max(e.refinement.ratio.values()))])
-    words = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
-             b.is_ambiguous else "What the search found beside the faults, fitted together with them.")
+        levels = {f: e.levels[f.name] if d.refinement.is_explained else None for f in FAULTS}
+        rows.append([
+            name_explanation(e), f"{100 * e.weight:.0f}", _format_parameters(e.parameters) or NO_NUMBER,
+            *(cell for f, level in levels.items() for cell in (
+                format_size(f, e.sizes[f.name]), Cell(LEVEL_NAMES[level], LEVEL_MOODS[level]))),
+            format_ratio(max(e.refinement.ratio.values()))])
+    caption = ("Explanations that fit the trace about equally well; the sizes above are averaged over them." if
+               b.is_ambiguous else "What the search found beside the faults, fitted together with them.")
     if not b.is_explained:
-        words = "The best that the search found; it leaves more than noise, so no level follows from it."
-    found: list[Item] = [Table(columns, rows, words)]
-    for effect, parameters in b.marks.items():
-        sizes = "; ".join(_format_parameter(name, size) for name, size in parameters.items())
-        found.append(Line(effect, f"{sizes}, read off without noise"))
-    found += [Paragraph(f"The level of {FAULT_NAMES[name]} depends on which of these is right: cannot be judged.")
-              for name in b.disputed]
-    return found
+        caption = "The best that the search found; it leaves more than noise, so no level follows from it."
+    return [Table(columns, rows, caption),
+            *(Line(effect, f"{_format_parameters(own)}, read off without noise") for effect, own in b.marks.items()),
+            *(Paragraph(f"The level of {FAULT_NAMES[name]} depends on which of these is right: cannot be judged.")
+              for name in b.disputed)]
 
 
-def _format_parameter(name: str, size: Estimate) -> str:
-    unit = find_quantity(name).unit
-    return f"{name} {format_interval(size.value, size.low, size.high, unit)}"
+def _format_parameters(sizes: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name} {format_interval(size.value, size.low, size.high, find_quantity(name).unit)}"
+                     for name, size in sizes.items())
 
 
-def _draw_bands(d: Diagnosis) -> list[Item]:
+def _show_bands(d: Diagnosis) -> list[Item]:
     judged, bands = d.band_verdict, d.bands
     if judged is None:
         return []
-
-    def draw_overview() -> str:
-        from fdi.report import diagnosis_figures
-
-        return diagnosis_figures.draw_overview(d.trace, judged)
-
-    def draw_steps() -> str:
-        from fdi.report import diagnosis_figures
-
-        return "" if bands is None else diagnosis_figures.draw_steps(d.trace, bands, judged)
-
-    def draw_ramps() -> str:
-        from fdi.report import diagnosis_figures
-
-        return "" if bands is None else diagnosis_figures.draw_ramps(d.trace, bands, judged)
-
-    return [Figure("Command and ram position. Shaded: times outside MidBand (amber) and MaxBand (red).",
-                   draw_overview),
-            Figure("Steps judge filter clogging: measured position less that of a healthy unit with the friction that "
-                   "the ramps show. Green: scatter of healthy units; amber and red: limits, drawn where clogging is "
-                   "distinguishable from healthy scatter.", draw_steps),
-            Figure("Ramps judge spool friction: following error (top) and speed beyond the demand (bottom). Green: "
-                   "scatter of healthy units; amber and red: limits.", draw_ramps)]
+    items: list[Item] = [Figure("Command and ram position. Shaded: times outside MidBand (amber) and MaxBand (red).",
+                                partial(draw_overview, d.trace, judged))]
+    if bands is not None:
+        items += [Figure(
+            "Steps judge filter clogging: measured position less that of a healthy unit with the friction that the "
+            "ramps show. Green: scatter of healthy units; amber and red: limits, drawn where clogging is "
+            "distinguishable from healthy scatter.", partial(draw_steps, d.trace, bands, judged)), Figure(
+            "Ramps judge spool friction: following error (top) and speed beyond the demand (bottom). Green: scatter of "
+            "healthy units; amber and red: limits.", partial(draw_ramps, d.trace, bands, judged))]
+    return items
 
 
 def _tabulate_events(d: Diagnosis) -> list[Item]:
@@ -343,15 +364,24 @@ def _tabulate_events(d: Diagnosis) -> list[Item]:
         return []
     if not d.events:
         return [Paragraph("None: the response stays within MidBand.", medium=Medium.PAGE)]
-    columns = [Column("band"), Column("signal"), Column("section"), Column("events", align="right"),
-               Column("first begins", "s", "right"), Column("last ends", "s", "right"),
-               Column("time outside", "ms", "right"), Column("furthest", align="right", medium=Medium.PAGE)]
-    rows = [_summarise_events(group) for group in group_events(d.events)]
-    return [Table(columns, rows, "Times outside a band, by band, signal and section of the command. rig fdi --json "
-                                 "lists every event with its distance from the band.", terminal_rows=10)]
+
+    def show_furthest(group: Sequence[Event]) -> str:
+        scale, unit = (1e6, "um") if group[0].signal == "position" else (1e3, "mm/s")
+        return f"{max(abs(event.excess) for event in group) * scale:.3g} {unit}"
+
+    return [tabulate(
+        _group_events(d.events), (Column("band"), lambda group: BAND_NAMES[group[0].band]),
+        (Column("signal"), lambda group: group[0].signal), (Column("section"), lambda group: group[0].section),
+        (Column("events", align="right"), lambda group: str(len(group))),
+        (Column("first begins", "s", "right"), lambda group: f"{group[0].t_in:.3f}"),
+        (Column("last ends", "s", "right"), lambda group: f"{group[-1].t_out:.3f}"),
+        (Column("time outside", "ms", "right"), lambda group: f"{1e3 * sum(e.t_out - e.t_in for e in group):.0f}"),
+        (Column("furthest", align="right", medium=Medium.PAGE), show_furthest),
+        caption="Times outside a band, by band, signal and section of the command. rig fdi --json lists every event "
+                "with its distance from the band.", terminal_rows=10)]
 
 
-def group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Event]]:
+def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Event]]:
     """Events of one band, signal and section together; one that is more than `apart` s later starts a new group.
 
     A command may have several sections of the same name.
@@ -366,25 +396,10 @@ def group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Event
     return groups
 
 
-def _summarise_events(group: Sequence[Event]) -> list[Cell | str]:
-    first = group[0]
-    scale, unit = (1e6, "um") if first.signal == "position" else (1e3, "mm/s")
-    furthest = max(abs(event.excess) for event in group)
-    return [BAND_NAMES[first.band], first.signal, first.section, str(len(group)), f"{first.t_in:.3f}",
-            f"{group[-1].t_out:.3f}", f"{1e3 * sum(event.t_out - event.t_in for event in group):.0f}",
-            f"{furthest * scale:.3g} {unit}"]
-
-
 def _show_maps(d: Diagnosis) -> list[Item]:
     grid = d.grid
     if grid is None:
         return []
-
-    def draw() -> str:
-        from fdi.report.diagnosis_figures import draw_maps
-
-        return draw_maps(grid)
-
     found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
     rows = [[name, f"{m.minimum.kintas:.3f}", f"{m.minimum.fss:.3g}", f"{m.minimum.rms * 1e6:.2f}"]
             for name, m in found if m]
@@ -394,56 +409,36 @@ def _show_maps(d: Diagnosis) -> list[Item]:
                Column("RMS", "um", "right")]
     return [Figure("RMS difference between the measured position and that of the monitor model, for every pair of "
                    "fault sizes (logarithmic colour scale). The minima A (steps) and B (ramps) are merged into G; "
-                   "dashed: the first bisector.", draw),
+                   "dashed: the first bisector.", partial(draw_maps, grid)),
             Table(columns, rows, "Where each map has its minimum.", is_list=True)]
 
 
 def _show_precursors(d: Diagnosis) -> list[Item]:
     if not d.precursors:
         return []
-    clogging, friction = f"Kintas {CLOGGING.middle:g} adds", f"FSS {FRICTION.middle:g} N adds"
-    columns = [Column("precursor"), Column("measured", align="right"),
-               Column("healthy", "", "right", Medium.PAGE), Column("healthy s.d.", "", "right", Medium.PAGE),
-               Column("deviation", "s.d.", "right"),
-               Column(clogging, "", "right", Medium.PAGE), Column("in s.d.", "", "right", Medium.PAGE),
-               Column(friction, "", "right", Medium.PAGE), Column("in s.d.", "", "right", Medium.PAGE)]
-    rows: list[list[Cell | str]] = []
-    for name, p in d.precursors.items():
-        is_far = math.isfinite(p.departure) and abs(p.departure) > 4.0
-        rows.append([p.words, Cell(p.shown, is_strong=True), format_precursor(p.healthy, name),
-                     format_precursor(p.noise, name),
-                     Cell(_format_deviation(p.departure), "bad" if is_far else ""), format_precursor(p.clogging, name),
-                     _format_deviation(p.clogging_ratio), format_precursor(p.friction, name),
-                     _format_deviation(p.friction_ratio)])
 
-    def draw() -> str:
-        from fdi.report import diagnosis_figures
+    def show_deviation(x: float) -> str:
+        return f"{x:+.1f}" if math.isfinite(x) else NO_NUMBER
 
-        return diagnosis_figures.draw_precursor_shifts(d.precursors)
+    def number(title: str) -> Column:
+        return Column(title, "", "right", Medium.PAGE)
 
-    return [Table(columns, rows, "Deviation: measured minus healthy mean, in standard deviations of healthy units; red "
-                                 "beyond 4."),
-            Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer "
-                   "bars discriminate better; below the dotted line (3) a single test does not show the fault.", draw)]
-
-
-def _format_deviation(x: float) -> str:
-    return f"{x:+.1f}" if math.isfinite(x) else NO_NUMBER
-
-
-def _describe_fit(d: Diagnosis) -> list[Item]:
-    lines: list[Item] = [
-        Line("residual", describe_residual(d)),
-        Line("fit", f"{d.refinement.method}, {d.refinement.simulations} simulations; correlation of the two sizes "
-                    f"{d.refinement.correlation:+.2f}")]
-    return [*lines, *(Line("deviation", describe_deviation(name, size)) for name, size in d.others.items())]
-
-
-def _list_bands_provenance(d: Diagnosis) -> list[Item]:
-    if d.bands is None or not d.bands.provenance:
-        return []
-    rows: list[list[Cell | str]] = [[Cell(name, "muted"), text] for name, text in sorted(d.bands.provenance.items())]
-    return [Table([Column(""), Column("")], rows, is_list=True)]
+    found = d.precursors
+    return [tabulate(
+        found, (Column("precursor"), lambda name: found[name].words),
+        (Column("measured", align="right"), lambda name: Cell(found[name].shown, is_strong=True)),
+        (number("healthy"), lambda name: format_precursor(found[name].healthy, name)),
+        (number("healthy s.d."), lambda name: format_precursor(found[name].noise, name)),
+        (Column("deviation", "s.d.", "right"), lambda name: Cell(
+            show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
+        (number(f"Kintas {CLOGGING.middle:g} adds"), lambda name: format_precursor(found[name].clogging, name)),
+        (number("in s.d."), lambda name: show_deviation(found[name].clogging_ratio)),
+        (number(f"FSS {FRICTION.middle:g} N adds"), lambda name: format_precursor(found[name].friction, name)),
+        (number("in s.d."), lambda name: show_deviation(found[name].friction_ratio)),
+        caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."),
+        Figure("How far a fault at MidBand moves each precursor, in standard deviations of healthy units: longer bars "
+               "discriminate better; below the dotted line (3) a single test does not show the fault.",
+               partial(draw_precursor_shifts, found))]
 
 
 def collect_data(d: Diagnosis) -> dict[str, Any]:
@@ -458,9 +453,10 @@ def collect_data(d: Diagnosis) -> dict[str, Any]:
         "bands": {"level": {name: level.word for name, level in d.band_verdict.levels.items()},
                   "ruling": d.band_verdict.ruling} if d.band_verdict else None,
         "precursors": {name: p._asdict() for name, p in d.precursors.items()},
-        "grid": {"step": _collect_point(g.step and g.step.minimum), "ramp": _collect_point(g.ramp and g.ramp.minimum),
-                 "joint": _collect_point(g.joint.minimum), "merged": g.merged._asdict(), "simulations": g.simulations}
-        if g else None,
+        "grid": None if g is None else {
+            **{name: None if found is None else found.minimum._asdict()
+               for name, found in (("step", g.step), ("ramp", g.ramp), ("joint", g.joint))},
+            "merged": g.merged._asdict(), "simulations": g.simulations},
         "refined": {"kintas": d.sizes[CLOGGING.name]._asdict(), "fss": d.sizes[FRICTION.name]._asdict(),
                     "correlation": r.correlation, "method": r.method, "simulations": r.simulations,
                     "reached": r.is_explained},
@@ -488,5 +484,165 @@ def _collect_beside(b: Beside) -> dict[str, Any]:
     }
 
 
-def _collect_point(point: Any) -> dict[str, float] | None:
-    return dict(point._asdict()) if point else None
+SHADES = {"middle": ORANGE, "most": RED}
+MAP_CONTOURS = 7
+UM, MM, MS = 1e6, 1e3, 1e3
+ENDS = {CLOGGING.name: 0.5, FRICTION.name: 100.0}  # of the axes, at least
+
+
+def draw_overview(trace: Trace, judged: BandVerdict) -> str:
+    """Command and position of the whole trace, times outside the bands shaded."""
+    limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
+    return draw_panels("overview", [[[
+        line(trace.t, trace.com * MM, COMMAND, "Com, command", 2.2),
+        line(trace.t, trace.mask_unusable("xj") * MM, BLUE, "XJ, ram"), *_shade_events(judged.events, limits),
+        axes(xlim=limits, ylabel="position [mm]", xlabel="time [s]"), legend(2)]]], 2.4)
+
+
+def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
+    """Each judged step: position less the healthy response, healthy units' scatter, limits, and events."""
+    if not bands.steps:
+        return ""
+    place = _find_sections(trace, bands)
+    panels: list[Panel] = [_draw_step(trace, bands, step, place[step.section], judged) for step in bands.steps]
+    across = min(2, len(panels))
+    panels += [[]] * (-len(panels) % across)
+    rows = [panels[i:i + across] for i in range(0, len(panels), across)]
+    return draw_panels("steps", rows, 2.5 * len(rows), common_legend=True)
+
+
+def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, judged: BandVerdict) -> Panel:
+    t, begin, side = step.t * MS, float(trace.t[s.start]), np.sign(step.middle)
+    centre, spread = step.compute_centre(judged.friction, bands.friction)
+    middle, most, there = bands.compute_margins(step, spread)
+    rows = np.minimum(s.start + np.rint(step.t / trace.period).astype(int), s.stop - 1)
+    healthy = BAND_NEAREST_LIMIT_SD * spread * UM
+    return [area(t, -healthy, healthy, GREEN, "healthy", 0.15),
+            *(line(t, np.where(there, side * limit, np.nan) * UM, colour, label, 1.6)
+              for limit, colour, label in ((middle, ORANGE, "MidBand"), (most, RED, "MaxBand"))),
+            line(t, (trace.mask_unusable("xj")[rows] - centre) * UM, INK, "measured"),
+            *_shade_events(judged.events, (0.0, float(t[-1])), "position", MS, begin),
+            axes(xlim=(0.0, float(t[-1])), title=f"step of {(s.last - s.first) * MM:+.3g} mm at {begin:.4g} s",
+                 xlabel="time from the step [ms]", ylabel="off the healthy\nresponse [um]")]
+
+
+def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict) -> str:
+    """Each judged ramp: following error and speed within their limits, and events."""
+    if not bands.ramps:
+        return ""
+    place = _find_sections(trace, bands)
+    pairs = [_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0)
+             for number, ramp in enumerate(bands.ramps)]
+    return draw_panels("ramps", list(zip(*pairs, strict=True)), 4.6, common_legend=True, sharex="col", sharey="row")
+
+
+def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> list[Panel]:
+    rows, way, xj = select_ramp_rows(s, trace.period), np.sign(s.rate), trace.mask_unusable("xj")
+    error = way * (trace.com[rows] - xj[rows])
+    fast = way * compute_speed(xj, trace.period)[rows] - abs(s.rate)
+    scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
+    limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
+    above = axes(title=f"ramp at {s.rate * MM:+.3g} mm/s, judged from {limits[0]:.4g} s",
+                 ylabel="error [um]" if is_first else "")
+    below = axes(xlabel="time [s]", ylabel="speed beyond the\ndemand's [mm/s]" if is_first else "")
+    panels: list[Panel] = []
+    for values, width, unit, nearer, name, labels in ((error, ramp.position, UM, 1 / scale, "position", above),
+                                                      (fast, ramp.speed, MM, 1.0, "speed", below)):
+        middle, healthy = width.centre * unit, width.healthy * unit
+        panels.append([
+            band(middle - healthy, middle + healthy, GREEN, "healthy", 0.15),
+            *(mark for limit, colour, label in ((width.middle, ORANGE, "MidBand"), (width.most, RED, "MaxBand"))
+              if np.isfinite(limit) for mark in levels(nearer * limit * unit, colour, label, 1.2, middle=middle)),
+            line(trace.t[rows], values * unit, INK, "measured", 0.8), *_shade_events(judged.events, limits, name),
+            axes(xlim=limits), labels])
+    return panels
+
+
+def _find_sections(trace: Trace, bands: Bands) -> dict[int, CommandSection]:
+    """The trace's sections by their number in the bands."""
+    com = read_columns(trace)[0]
+    own = [s for s in find_sections(com, trace.period) if s.kind in ("step", "ramp")]
+    return dict(zip([i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")], own, strict=True))
+
+
+def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: str = "", unit: float = 1.0,
+                  begin: float = 0.0) -> list[Mark]:
+    """The times outside over the whole height; `limits` are those of the panel, in `unit` from `begin`."""
+    ends = [(e.band, (e.t_in - begin) * unit, (e.t_out - begin) * unit) for e in events if signal in ("", e.signal)]
+    return [spans([(a, b) for name, a, b in ends if name == shown and b > limits[0] and a < limits[1]], colour,
+                  alpha=0.18, lw=0, zorder=-1) for shown, colour in SHADES.items()]
+
+
+def draw_sizes(sizes: Mapping[str, Estimate], grid: Grid | None, judged: BandVerdict | None) -> str:
+    """Both faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
+    points = () if grid is None else (
+        ("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
+        ("grid, ramps", grid.ramp and grid.ramp.minimum))
+    panels = []
+    for fault in FAULTS:
+        found = [(label, float(getattr(point, fault.symbol))) for label, point in points if point]
+        if judged is not None and fault == FRICTION:
+            found.append(("bands, ramps", judged.friction))
+        panels.append(_draw_sizes_of_fault(fault, sizes[fault.name], found))
+    return draw_panels("estimates", [panels], 1.9)
+
+
+def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str, float]]) -> Panel:
+    end = max(ENDS[fault.name], 1.05 * fit.high, *(1.05 * size for _, size in found))
+    interval = [[max(fit.value - fit.low, 0.0)], [max(fit.high - fit.value, 0.0)]]
+    return [*(shade(low, high, colour, 0.13) for low, high, colour in (
+                (0.0, fault.middle, GREEN), (fault.middle, fault.most, ORANGE), (fault.most, end, RED))),
+            call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
+            *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
+            *name_rows(["refined", *(label for label, _ in found)]),
+            axes(xlim=(0.0, end), xlabel="Kintas" if fault == CLOGGING else "FSS [N]")]
+
+
+def draw_precursor_shifts(found: Mapping[str, Precursor]) -> str:
+    """How many healthy standard deviations Table 2's lesser faults move each precursor by; "" without bands."""
+    known = [p for p in found.values() if math.isfinite(p.clogging_ratio) and math.isfinite(p.friction_ratio)]
+    if not known:
+        return ""
+    rows = np.arange(len(known))
+    return draw_panels("telling", [[[
+        call("barh", rows - 0.2, [abs(p.clogging_ratio) for p in known], height=0.38, color=BLUE,
+             label=f"Kintas {CLOGGING.middle:g}"),
+        call("barh", rows + 0.2, [abs(p.friction_ratio) for p in known], height=0.38, color=ORANGE,
+             label=f"FSS {FRICTION.middle:g} N"),
+        instant(3.0, INK, width=0.8, style=":"), *name_rows([p.words for p in known]), call("set_xscale", "log"),
+        call("set_xlim", left=0.1), legend(2),
+        axes(xlabel="shift / healthy standard deviation [1] (dotted: 3, below it one test does not show the fault)")]]],
+        0.8 + 0.3 * len(known))
+
+
+def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
+    """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
+
+    Args:
+        grid: from `fdi.diagnosis.rms_grid.search_grid`.
+        truth: the faults' sizes (Kintas, FSS in N), where they are known.
+    """
+    maps = (("step sections", grid.step, "A"), ("ramp sections", grid.ramp, "B"), ("both", grid.joint, "C"))
+    panels = [[*_draw_map(grid, m, letter), axes(title=f"{name}: {m.minimum.rms * 1e6:.1f} um at {letter}"),
+               *([dot(*truth, "white", "injected", marker="X", ms=9, mec=INK, mew=0.8)] if truth else [])]
+              for name, m, letter in maps if m]
+    panels[-1].append(dot(grid.best.kintas, grid.best.fss, "#ffd33d", "between cells", marker="*", ms=9, mec=INK))
+    if grid.step and grid.ramp:
+        kintas, fss = zip(LOWER_CORNER, UPPER_CORNER, strict=True)
+        for panel in panels[:2]:
+            panel += [line(kintas, fss, "white", width=0.8, ls="--"),
+                      dot(grid.merged.kintas, grid.merged.fss, "#ffd33d", "G", marker="D", ms=5, mec=INK)]
+    panels[0].append(axes(ylabel="FSS [N]"))
+    below = legend(3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    return draw_panels("maps", [[[*panel, below] for panel in panels]], 3.5, 3.7 * len(panels), sharey=True)
+
+
+def _draw_map(grid: Grid, m: Map, letter: str) -> list[Mark]:
+    """One map as an image of its logarithm, with contours and its minimum."""
+    half_k, half_f = (0.5 * float(axis[1] - axis[0]) if len(axis) > 1 else 0.5 for axis in (grid.kintas, grid.fss))
+    box = (grid.kintas[0] - half_k, grid.kintas[-1] + half_k, grid.fss[0] - half_f, grid.fss[-1] + half_f)
+    size: Any = np.log10(m.rms.T * 1e6)
+    contours = call("contour", grid.kintas, grid.fss, size, MAP_CONTOURS, colors="white", linewidths=0.4, alpha=0.6)
+    return [call("imshow", size, origin="lower", extent=box, aspect="auto", cmap="viridis", interpolation="none"),
+            *([contours] if min(size.shape) > 1 else []), call("grid", False), axes(xlabel="Kintas"),
+            dot(m.minimum.kintas, m.minimum.fss, RED, letter, mec="white")]

@@ -1,6 +1,8 @@
-"""What all figures share: style, colours, thinning of long lines, and SVG text that stands inside a page.
+"""The vocabulary of all figures, and how a figure becomes SVG text that stands inside a page.
 
-Nothing here loads matplotlib before a figure is drawn.
+A panel is a list of marks, and a mark is a call on matplotlib's axes: `line(t, x, BLUE)`, `band(-floor, floor, GREEN)`,
+`axes(ylabel="error [um]")`, `call("barh", ...)` for anything else. `draw_over_time` stacks panels on one time axis,
+`draw_panels` sets them in rows. Nothing here loads matplotlib before a figure is drawn.
 """
 from __future__ import annotations
 
@@ -8,17 +10,22 @@ import html
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
+from itertools import chain
+from operator import methodcaller
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.report.numbers import SIGNAL_UNITS, choose_unit
+from fdi.output import write_text, write_whole
+from fdi.report.numbers import SIGNAL_NAMES, SIGNAL_UNITS, choose_unit
+from fdi.thresholds import NOISE_BAND_RATIO
 from fdi.trace.sections import find_sections
-from fdi.trace.trace import Trace
+from fdi.trace.trace import Trace, rms
+from plant.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,21 +33,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
+Mark = Callable[[Any], Any]
+Panel = Sequence[Mark]
 INK, COMMAND, RED, GREEN = "#24292f", "#8b949e", "#c93c37", "#2b8a3e"
+BLUE, ORANGE, AMBER, GREY, TEAL, PINK = "#1f6feb", "#d9730d", "#b7791f", "#57606a", "#0f8b8d", "#bf3989"
+BEFORE, AFTER = "#9aa4b1", BLUE  # the model as it was, and as it is found
 FAULT = "#ffd8a8"  # an injected fault
+SIGNAL_COLOURS = {"xj": BLUE, "p12": TEAL, "xs": PINK}
 STYLE: Any = {  # matplotlib's types want each key as a literal
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9, "axes.edgecolor": "#b6bcc4",
     "axes.grid": True, "axes.spines.top": False, "axes.spines.right": False, "grid.color": "#e4e7eb", "text.color": INK,
     "text.parse_math": False,  # a name in a log may have a dollar sign
     "path.simplify_threshold": 0.06,  # points; what may be lost shows when a figure is zoomed 20 times
-    "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True}
+    "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.axisbelow": True, "axes.titlesize": 9}
 DRAWN_UNITS = {"xj": ("um", 1e6), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}  # of small differences: unit, scale of SI
 LEVELS = {"xj": ("mm", 1e3), "cor": ("mA", 1e3), "load": ("kN", 1e-3), "p12": ("bar", 1e-5), "xs": ("um", 1e6)}
 """Unit and scale of a signal itself."""
-ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "frameon": False, "borderaxespad": 0.0}
-"""Place of a legend above the axes, off the data."""
 LINE_COLUMNS = 7300  # a line is drawn by its extremes in this many columns: each sample of a run of 14 s, for zooming
-_keeps_all_points = ContextVar("keeps_all_points", default=False)
 
 
 def choose_drawn_unit(name: str, size: float) -> tuple[str, float]:
@@ -53,6 +62,159 @@ def choose_drawn_unit(name: str, size: float) -> tuple[str, float]:
     return unit, 1.0 / scale
 
 
+def call(method: str, *args: Any, **style: Any) -> Mark:
+    """A call of a method of matplotlib's `Axes`."""
+    return methodcaller(method, *args, **style)
+
+
+def line(x: Any, y: Any, colour: str, label: str | None = None, width: float = 1.0, **style: Any) -> Mark:
+    """A line through points."""
+    return call("plot", x, y, color=colour, label=label, lw=width, **style)
+
+
+def dot(x: float, y: float, colour: str, label: str | None = None, **style: Any) -> Mark:
+    """A marker at one point."""
+    return line([x], [y], colour, label, ls="", **{"marker": "o", "ms": 6, **style})
+
+
+def level(y: float, colour: str, label: str | None = None, width: float = 1.0, style: str = "-") -> Mark:
+    """A horizontal line through the whole panel."""
+    return call("axhline", y, color=colour, label=label, lw=width, ls=style)
+
+
+def levels(y: float, colour: str, label: str | None = None, width: float = 1.0, style: str = "-", middle: float = 0.0
+           ) -> list[Mark]:
+    """Horizontal lines on both sides of `middle`, with one label."""
+    return [level(middle + y, colour, label, width, style), level(middle - y, colour, None, width, style)]
+
+
+def instant(x: float, colour: str, label: str | None = None, width: float = 1.0, style: str = "-") -> Mark:
+    """A vertical line through the whole panel."""
+    return call("axvline", x, color=colour, label=label, lw=width, ls=style)
+
+
+def band(low: float, high: float, colour: str, label: str | None = None, alpha: float = 0.25) -> Mark:
+    """A shaded range of values through the whole panel."""
+    return call("axhspan", low, high, color=colour, alpha=alpha, lw=0, label=label)
+
+
+def shade(start: float, end: float, colour: str, alpha: float = 1.0) -> Mark:
+    """A shaded range of x through the whole panel, behind all else."""
+    return call("axvspan", start, end, color=colour, alpha=alpha, lw=0, zorder=-1)
+
+
+def spans(ends: Sequence[tuple[float, float]], colour: str, height: float = 1.0, **style: Any) -> Mark:
+    """Shaded spans of time from the foot of the panel up to a share of its height: one artist for hundreds of them."""
+    widths = [(start, end - start) for start, end in ends]
+    return lambda ax: ax.broken_barh(widths, (0.0, height), transform=ax.get_xaxis_transform(), color=colour, **style)
+
+
+def area(x: Floats, low: Floats, high: Floats, colour: str, label: str | None = None, alpha: float = 0.25) -> Mark:
+    """The shaded area between two curves."""
+    return call("fill_between", x, low, high, color=colour, alpha=alpha, lw=0, label=label)
+
+
+def axes(**settings: Any) -> Mark:
+    """Labels, limits, scales and title, as matplotlib's `Axes.set` takes them."""
+    return call("set", **settings)
+
+
+def legend(columns: int = 1, **place: Any) -> Mark:
+    """A legend above the panel, off the data."""
+    return call("legend", ncols=columns, frameon=False,
+                **place or {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0})
+
+
+def name_rows(names: Sequence[str]) -> list[Mark]:
+    """Names at y = 0, 1, .. from the top, in place of numbers."""
+    return [call("set_yticks", range(len(names)), names), call("grid", False, axis="y"),
+            axes(ylim=(len(names) - 0.5, -0.5))]
+
+
+def shade_sections(trace: Trace) -> list[Mark]:
+    """The ramps (blue) and the dynamic sections (violet) of the command."""
+    colours = {"ramp": "#f1f3f8", "dynamic": "#f7f1fa"}
+    return [shade(float(trace.t[section.start]), float(trace.t[section.stop - 1]), colours[section.kind])
+            for section in find_sections(trace.com, trace.period) if section.kind in colours]
+
+
+def draw_panels(salt: str, rows: Sequence[Sequence[Panel]], height: float, width: float = 11.0,
+                common_legend: bool = False, layout: str | None = "constrained", **grid: Any) -> Drawing:
+    """A figure of rows of panels, in inches; an empty panel stays blank.
+
+    Args:
+        salt: keeps the ids of the figure apart from those of other figures of a page.
+        rows: the panels, row by row.
+        height: of the figure.
+        width: of the figure.
+        common_legend: whether one legend, that of the last panel of the first row, stands above all.
+        layout: as matplotlib's figures take it.
+        grid: further arguments of `Figure.subplots`.
+    """
+    with start_figure(height, width, layout) as figure:
+        places = figure.subplots(len(rows), len(rows[0]), squeeze=False, **grid)
+        for ax, panel in zip(places.flat, chain.from_iterable(rows), strict=True):
+            _draw_panel(ax, panel)
+        if common_legend:
+            figure.legend(*places[0, -1].get_legend_handles_labels(), loc="outside upper right", ncols=4, frameon=False)
+        return to_svg(figure, salt)
+
+
+def draw_over_time(salt: str, trace: Trace, panels: Sequence[Panel], heights: Sequence[float], gap: float = 0.22,
+                   xlabel: str = "time [s]") -> Drawing:
+    """Panels above each other on the time axis of a trace, as high as `heights` says (inches), with its sections.
+
+    The margins are fixed: a layout that measures every tick label first takes as long as the drawing.
+    """
+    width, left, right, top, bottom = 11.0, 0.95, 0.1, 0.3, 0.5
+    height = top + sum(heights) + gap * (len(heights) - 1) + bottom
+    place = {"left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height,
+             "hspace": gap * len(heights) / sum(heights)}
+    with start_figure(height, width, layout=None) as figure:
+        column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights,
+                                 gridspec_kw=place)[:, 0]
+        for ax, panel in zip(column, panels, strict=True):
+            _draw_panel(ax, [*panel, *shade_sections(trace)])
+            ax.yaxis.set_label_coords(-0.6 / (width - left - right), 0.5)
+        # a row lasts one period; one alone is no empty axis
+        column[-1].set(xlabel=xlabel, xlim=(float(trace.t[0]), float(trace.t[-1]) + trace.period))
+        column[-1].xaxis.set_label_coords(0.5, -0.3 / heights[-1])
+        return to_svg(figure, salt)
+
+
+def _draw_panel(ax: Axes, panel: Panel) -> None:
+    if not panel:
+        ax.set_axis_off()
+    for mark in panel:
+        mark(ax)
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log":
+            label_log_axis(axis)
+
+
+def draw_residuals(salt: str, trace: Trace, models: Sequence[tuple[str, str, Floats]], floor: Mapping[str, float],
+                   is_cut: bool = False) -> Drawing:
+    """The residual, measured minus model, of each signal over time with one or two models, below the command.
+
+    Args:
+        salt: as for `draw_panels`.
+        trace: the run.
+        models: (label, colour, model minus measured (s, n) in SI) of each model.
+        floor: RMS of the noise of each signal, SI; dotted lines at twice of it.
+        is_cut: whether the last model's residual sets the height of a panel.
+    """
+    panels: list[Panel] = [[line(trace.t, trace.com * 1e3, COMMAND, width=1.6), axes(ylabel="Com [mm]")]]
+    for i, name in enumerate(trace.outputs):
+        unit, scale = choose_drawn_unit(name, rms(models[0][2][i]))
+        half = scale * max(8.0 * floor[name], 1.2 * float(np.nanmax(np.abs(models[-1][2][i]))))
+        panels.append([*(line(trace.t, -misfit[i] * scale, colour, label, 0.9) for label, colour, misfit in models),
+                       *levels(NOISE_BAND_RATIO * floor[name] * scale, GREEN, "two noise floors", 0.8, ":"),
+                       axes(ylabel=f"{SIGNAL_NAMES[name]} [{unit}]", **{"ylim": (-half, half)} if is_cut else {}),
+                       *([legend(3)] if i == 0 else [])])
+    return draw_over_time(salt, trace, panels, [0.8] + [1.3] * len(trace.outputs),
+                          xlabel="time [s]; what is beyond an axis is cut off" if is_cut else "time [s]")
+
+
 class Drawing(str):
     """A figure as SVG text, and the matplotlib figure that it was made from."""
 
@@ -60,31 +222,13 @@ class Drawing(str):
 
 
 @contextmanager
-def keep_all_points() -> Iterator[None]:
-    """Draw lines with all their points: a figure that is zoomed shows more than a page does."""
-    token = _keeps_all_points.set(True)
-    try:
-        yield
-    finally:
-        _keeps_all_points.reset(token)
-
-
-@contextmanager
-def start_figure(height: float, width: float = 11.0) -> Iterator[Figure]:
+def start_figure(height: float, width: float = 11.0, layout: Any = "constrained") -> Iterator[Figure]:
     """An empty figure of this size in inches; the style of all reports holds while it is drawn."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        yield Figure(figsize=(width, height), layout="constrained")
-
-
-def shade_sections(ax: Axes, trace: Trace) -> None:
-    """Shade the ramps (blue) and the dynamic sections (violet) of the command."""
-    for section in find_sections(trace.com, trace.period):
-        if section.kind in ("ramp", "dynamic"):
-            ax.axvspan(float(trace.t[section.start]), float(trace.t[section.stop - 1]),
-                       color="#f1f3f8" if section.kind == "ramp" else "#f7f1fa", lw=0, zorder=-1)
+        yield Figure(figsize=(width, height), layout=layout)
 
 
 def label_log_axis(axis: Axis) -> None:
@@ -92,53 +236,67 @@ def label_log_axis(axis: Axis) -> None:
 
     Where it shows less than two decades, 2 and 5 times the powers of ten have labels too.
     """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     low, high = sorted(axis.get_view_interval())
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     """The smallest and largest value in each of `LINE_COLUMNS` pieces, in order of time: looks like the whole line."""
-    if len(t) <= 2 * LINE_COLUMNS or _keeps_all_points.get():
+    if len(t) <= 2 * LINE_COLUMNS:
         return t, values
-    starts = _piece_starts(len(t))
-    length = np.diff(starts, append=len(t))
-    missing = np.isnan(values)
-    low = np.minimum.reduceat(np.where(missing, np.inf, values), starts)
-    high = np.maximum.reduceat(np.where(missing, -np.inf, values), starts)
-    # the first row of a piece that has its extreme, and the first that is missing
-    candidates = (values == np.repeat(low, length), values == np.repeat(high, length), missing)
-    pieces = np.repeat(np.arange(len(starts)), length)
-    rows = [found[np.unique(pieces[found], return_index=True)[1]] for found in map(np.flatnonzero, candidates)]
-    chosen = np.unique(np.concatenate(rows))
+    width = -(-len(t) // LINE_COLUMNS)
+    rows = np.minimum(np.arange(width * LINE_COLUMNS), len(t) - 1).reshape(-1, width)
+    missing = np.isnan(values)[rows]
+    # of each piece the first row that has its extreme, and the first that is missing
+    picked = (np.where(missing, np.inf, values[rows]).argmin(1), np.where(missing, -np.inf, values[rows]).argmax(1),
+              missing.argmax(1))
+    chosen = np.unique(np.concatenate([rows[np.arange(len(rows)), at] for at in picked]))
     return t[chosen], values[chosen]
-
-
-def _piece_starts(rows: int) -> NDArray[np.intp]:
-    """First row of each of LINE_COLUMNS pieces of nearly equal length, as `numpy.array_split` cuts them."""
-    short, longer = divmod(rows, LINE_COLUMNS)
-    return np.cumsum([0, *[short + 1] * longer, *[short] * (LINE_COLUMNS - longer - 1)])
 
 
 def to_svg(figure: Figure, salt: str) -> Drawing:
     """A figure as text that stands inside a page; `salt` keeps its ids apart from those of other figures.
 
-    An attribute data-axes tells the page's script (figure.js) what it needs for zoom and cursor.
+    Long lines are thinned in the text alone. An attribute data-axes tells the page's script (figure.js) what it needs
+    for zoom and cursor.
     """
     from matplotlib import rc_context
 
     _name_artists(figure, salt)
+    lines = [(drawn, drawn.get_data(orig=False)) for ax in figure.axes for drawn in ax.lines]
+    for drawn, whole in lines:
+        drawn.set_data(*thin_line(*map(np.asarray, whole)))
     out = io.StringIO()
     with rc_context(STYLE | {"svg.hashsalt": salt}):
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    for drawn, whole in lines:
+        drawn.set_data(*whole)
     text = shorten_svg(out.getvalue(), 2)
     notes = html.escape(json.dumps(_describe_axes(figure, salt), separators=(",", ":")))
     drawing = Drawing(f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}')
     drawing.figure = figure
     return drawing
+def save_drawing(drawing: Drawing, path: Path, option: str) -> None:
+    """Write a figure: .svg as a page shows it; .png, .pdf and what else matplotlib writes.
+
+    Raises:
+        InputError: a path that cannot be written, or a format that matplotlib does not know; it names `option`.
+    """
+    known = drawing.figure.canvas.get_supported_filetypes()
+    if path.suffix in ("", ".svg"):
+        write_text(path, drawing, option)
+        return
+    if path.suffix[1:] not in known:
+        raise InputError(option, str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
+    try:
+        with write_whole(path) as part:
+            drawing.figure.savefig(part, dpi=150)
+    except OSError as error:
+        raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
 
 
 def _name_artists(figure: Figure, salt: str) -> None:
@@ -178,15 +336,13 @@ def _describe_axes(figure: Figure, salt: str) -> list[dict[str, Any]]:
 def _find_limits(axis: Axis, limits: tuple[float, float]) -> tuple[str, list[float]]:
     """Kind of an axis (linear, log, date, names) and its limits; decimal logarithms of them on a logarithmic axis."""
     from matplotlib.dates import DateLocator
-    from matplotlib.ticker import FixedFormatter
+    from matplotlib.ticker import FixedLocator
 
-    low, high = (float(x) for x in limits)
     if axis.get_scale() == "log":
-        return "log", [float(np.log10(low)), float(np.log10(high))]
-    if isinstance(axis.get_major_locator(), DateLocator):
-        return "date", [low, high]
-    is_named = isinstance(axis.get_major_formatter(), FixedFormatter) or not len(axis.get_majorticklocs())
-    return "names" if is_named else "linear", [low, high]
+        return "log", np.log10(limits).tolist()
+    kinds = {DateLocator: "date", FixedLocator: "names"}  # ticks at fixed places have names, or there are none
+    kind = next((word for locator, word in kinds.items() if isinstance(axis.get_major_locator(), locator)), "linear")
+    return kind, [float(x) for x in limits]
 
 
 def shorten_svg(drawing: str, decimals: int = 1) -> str:

@@ -42,5 +42,5 @@ def load_templates() -> Environment:
 
 
 def _group_by_kind(items: Sequence[Item]) -> list[tuple[str, list[Item]]]:
-    """Runs of items of the same kind: neighbouring lines share a table."""
-    return [(kind, list(group)) for kind, group in groupby(items, key=lambda item: item.kind)]
+    """Runs of items of the same type, by its name: neighbouring lines share a table."""
+    return [(kind.__name__, list(group)) for kind, group in groupby(items, key=type)]

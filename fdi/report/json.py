@@ -28,22 +28,18 @@ def to_plain(value: Any) -> Any:
     Raises:
         TypeError: a value of another type, which an answer must not hold.
     """
-    if value is None or isinstance(value, bool | str):
-        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return to_plain(value.tolist())
     if isinstance(value, Enum):
         return to_plain(value.value)
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return [to_plain(item) for item in value.tolist()]
     if isinstance(value, list | tuple | set | frozenset):
         return [to_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, Path):
         return str(value)
+    if value is None or isinstance(value, bool | int | str):
+        return value
     raise TypeError(f"{type(value).__name__} in an answer: {value!r}")

@@ -5,7 +5,7 @@ Every printed estimate goes through here, so that it has the same digits and uni
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 
 from fdi.trace.signals import SIGNALS
 
@@ -40,15 +40,6 @@ def format_signal(value: float, signal: str) -> str:
     '18.0 um'
     """
     return format_amount(value, SIGNAL_UNITS[signal])
-
-
-def format_signals(by_signal: Mapping[str, float]) -> str:
-    """A value of each signal in one line.
-
-    >>> format_signals({"xj": 1.8e-5, "p12": 4.2e4})
-    'XJ 18.0 um, P12 0.420 bar'
-    """
-    return ", ".join(f"{SIGNAL_NAMES[s]} {format_signal(x, s)}" for s, x in by_signal.items())
 
 
 def format_interval(value: float, low: float, high: float, unit: str, most_digits: int = 6) -> str:
@@ -163,6 +154,16 @@ def join_words(words: Iterable[str], conjunction: str = "and") -> str:
     if len(every) < 2:
         return "".join(every)
     return f"{', '.join(every[:-1])} {conjunction} {every[-1]}"
+
+
+def list_first(words: Sequence[str], most: int) -> str:
+    """The first of many words, and how many more there are.
+
+    >>> list_first(["a", "b", "c"], 2), list_first(["a", "b"], 2)
+    ('a, b and 1 more', 'a, b')
+    """
+    rest = len(words) - most
+    return ", ".join(words[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def count_nouns(count: int, noun: str) -> str:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 Mood = Literal["", "good", "doubtful", "bad", "neutral", "muted"]
-Align = Literal["left", "right"]
+T = TypeVar("T")
 
 
 class Medium(Enum):
@@ -46,7 +46,7 @@ class Column:
 
     title: str
     unit: str = ""
-    align: Align = "left"
+    align: Literal["left", "right"] = "left"
     medium: Medium = Medium.BOTH
 
     @property
@@ -63,6 +63,8 @@ class Column:
 class Table:
     """Rows under columns. Each row has a cell for every column; a plain string is a cell without mood.
 
+    A table without rows is not shown.
+
     Args:
         columns: the columns, from the left.
         rows: the rows, from the top.
@@ -72,7 +74,6 @@ class Table:
         medium: where the table is shown.
     """
 
-    kind: ClassVar[str] = "table"
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell | str]]
     caption: str = ""
@@ -80,37 +81,30 @@ class Table:
     is_list: bool = False
     medium: Medium = Medium.BOTH
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise ValueError(f"a row of {len(row)} cells in a table of {len(self.columns)} columns: {row}")
-
     def select_columns(self, medium: Medium) -> Table:
         """The same table with the columns of one medium; cells are `Cell` values."""
-        shown = [i for i, column in enumerate(self.columns) if column.medium.includes(medium)]
-        rows = [[_as_cell(row[i]) for i in shown] for row in self.rows]
-        return replace(self, columns=[self.columns[i] for i in shown], rows=rows)
+        rows = [[cell if isinstance(cell, Cell) else Cell(cell)
+                 for column, cell in zip(self.columns, row, strict=True) if column.medium.includes(medium)]
+                for row in self.rows]
+        return replace(self, columns=[column for column in self.columns if column.medium.includes(medium)], rows=rows)
 
 
-def _as_cell(cell: Cell | str) -> Cell:
-    return cell if isinstance(cell, Cell) else Cell(cell)
+def tabulate(values: Iterable[T], *columns: tuple[Column, Callable[[T], Cell | str]], **fields: Any) -> Table:
+    """A table with a row for each value; beside each column stands the function that makes its cell of a value.
 
+    `fields` are further fields of `Table`.
 
-Row = TypeVar("Row")
-
-
-def tabulate(items: Iterable[Row], caption: str, *columns: tuple[Column, Callable[[Row], Cell | str]],
-             terminal_rows: int | None = None) -> list[Table]:
-    """A table with a row for each item, each column with the function that makes its cell; none without items."""
-    rows = [[make_cell(item) for _, make_cell in columns] for item in items]
-    return [Table([column for column, _ in columns], rows, caption, terminal_rows)] if rows else []
+    >>> tabulate([0.5, 2.0], (Column("size", "N"), "{:.1f}".format), (Column("far"), lambda x: str(x > 1))).rows
+    [['0.5', 'False'], ['2.0', 'True']]
+    """
+    return Table([column for column, _ in columns], [[show(value) for _, show in columns] for value in values],
+                 **fields)
 
 
 @dataclass(frozen=True)
 class Line:
     """A label and what it says: "floor     from 1 repeat of the test"."""
 
-    kind: ClassVar[str] = "line"
     label: str
     text: str
     mood: Mood = ""
@@ -121,7 +115,6 @@ class Line:
 class Paragraph:
     """Running text."""
 
-    kind: ClassVar[str] = "paragraph"
     text: str
     mood: Mood = ""
     medium: Medium = Medium.BOTH
@@ -134,7 +127,6 @@ class Figure:
     The caption says what to see. The terminal never calls `draw`.
     """
 
-    kind: ClassVar[str] = "figure"
     caption: str
     draw: Callable[[], str]
     medium: Medium = Medium.PAGE
@@ -147,7 +139,6 @@ class Listing:
     With a `title` the page folds the listing behind it.
     """
 
-    kind: ClassVar[str] = "listing"
     text: str
     title: str = ""
     medium: Medium = Medium.BOTH
@@ -176,9 +167,8 @@ class Section:
 
     def select_items(self, medium: Medium) -> list[Item]:
         """The items that one medium shows; none if it does not show the section."""
-        if not self.medium.includes(medium):
-            return []
-        return [item for item in self.items if item.medium.includes(medium)]
+        return [item for item in self.items if self.medium.includes(medium) and item.medium.includes(medium)
+                and (not isinstance(item, Table) or item.rows)]
 
 
 @dataclass(frozen=True)

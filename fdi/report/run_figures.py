@@ -1,137 +1,98 @@
-"""The figures of a run, as SVG text for an HTML page: signals over time, and timing."""
+"""The figures of a run, as SVG text for an HTML page: signals over time, timing, close-ups of failed checks."""
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
-from numpy.typing import NDArray
 
 from fdi.report.drawing import (
-    ABOVE,
+    AMBER,
+    BLUE,
     COMMAND,
     FAULT,
     GREEN,
+    GREY,
     INK,
+    ORANGE,
+    PINK,
     RED,
-    STYLE,
-    shade_sections,
-    start_figure,
-    thin_line,
-    to_svg,
+    TEAL,
+    Floats,
+    Mark,
+    Panel,
+    axes,
+    call,
+    dot,
+    draw_over_time,
+    draw_panels,
+    instant,
+    legend,
+    level,
+    line,
+    shade,
+    spans,
 )
 from fdi.trace.trace import Check, Trace
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-Floats = NDArray[np.float64]
 BRIDGED = 5  # cycles
-PANELS = (("xj", "position [mm]", 1e3, "#1f6feb"), ("error", "error [um]", 1e6, "#d9730d"),
-          ("close", "error, close up [um]", 1e6, "#d9730d"), ("cor", "current [mA]", 1e3, "#8250df"),
-          ("p12", "P12 [bar]", 1e-5, "#0f8b8d"), ("xs", "XS [um]", 1e6, "#bf3989"),
-          ("load", "load [kN]", 1e-3, "#57606a"))
+PANELS = (("xj", "position [mm]", 1e3, BLUE), ("error", "error [um]", 1e6, ORANGE),
+          ("close", "error, close up [um]", 1e6, ORANGE), ("cor", "current [mA]", 1e3, "#8250df"),
+          ("p12", "P12 [bar]", 1e-5, TEAL), ("xs", "XS [um]", 1e6, PINK), ("load", "load [kN]", 1e-3, GREY))
 
 
 def draw_signals(trace: Trace) -> str:
     """Command and position, error, current, pressure and spool over one time axis, with sections and checks."""
-    error, calm = trace.com - trace.xj, _choose_close_up(trace)
-    values: dict[str, Floats] = {"xj": trace.xj, "error": error, "cor": trace.cor, "p12": trace.p12, "xs": trace.xs}
-    if np.nan_to_num(trace.load).any():
-        values["load"] = trace.load
-    if calm:
-        values["close"] = error
-    panels = [panel for panel in PANELS if panel[0] in values and not np.isnan(values[panel[0]]).all()]
-    heights = [1.7] * len(panels) + [0.15 * len(trace.sequence_checks) + 0.25] * bool(trace.sequence_checks)
-    with rc_context(STYLE):
-        figure, axes = _stack_panels(heights)
-        for ax, (name, label, scale, colour) in zip(axes, panels, strict=False):
-            if name == "xj":
-                ax.plot(*thin_line(trace.t, trace.com * scale), color=COMMAND, lw=2.4, label="Com, command")
-            line = thin_line(trace.t, _bridge_short_gaps(values[name]) * scale)
-            ax.plot(*line, color=colour, lw=1.0, label="XJ, ram" if name == "xj" else None)
-            _mark_missing(ax, trace, values[name])
-            ax.set_ylabel(label)
-            if name == "close":
-                ax.set_ylim(-calm * scale, calm * scale)
-            shade_sections(ax, trace)
-            for fault, t0, t1 in list_faults(trace):
-                ax.axvspan(t0, t1, color=FAULT, lw=0, alpha=0.5, zorder=-1)
-                if ax is axes[0]:
-                    foot = ax.get_xaxis_transform()
-                    ax.text(t0, 0.07, f" {fault}", transform=foot, color=INK, fontsize=7, clip_on=True)
-        axes[0].legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2, frameon=False)  # above, not on the line
-        if trace.sequence_checks:
-            _draw_checks(axes[-1], trace)
-        axes[-1].set_xlabel("time from the start of the main phase [s]")
-        axes[-1].set_xlim(trace.t[0], trace.t[-1] + trace.period)  # a row lasts one period; one alone is no empty axis
-        return to_svg(figure, "signals")
-
-
-def _stack_panels(heights: Sequence[float]) -> tuple[Figure, Sequence[Axes]]:
-    """A figure of panels above each other, each as high as `heights` says (inches), on one time axis.
-
-    The margins are fixed: a layout that measures every tick label first takes as long as the drawing.
-    """
-    width, left, right, top, bottom, gap = 11.0, 0.85, 0.1, 0.3, 0.5, 0.12
-    height = top + sum(heights) + gap * (len(heights) - 1) + bottom
-    figure = Figure(figsize=(width, height))
-    mean = sum(heights) / len(heights)
-    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights, gridspec_kw={
-        "left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height,
-        "hspace": gap / mean})[:, 0]
-    for panel in axes:
-        panel.yaxis.set_label_coords(-0.6 / (width - left - right), 0.5)
-    axes[-1].xaxis.set_label_coords(0.5, -0.3 / heights[-1])
-    return figure, list(axes)
+    t, error, half = trace.t, trace.com - trace.xj, _choose_close_up(trace)
+    values = {"xj": trace.xj, "error": error, "close": error if half else np.full_like(error, math.nan),
+              "cor": trace.cor, "p12": trace.p12, "xs": trace.xs,
+              "load": np.where(np.nan_to_num(trace.load).any(), trace.load, math.nan)}
+    faults = list_faults(trace)
+    panels = [[line(t, _bridge_short_gaps(values[name]) * scale, colour, "XJ, ram" if name == "xj" else None),
+               _mark_missing(trace, values[name]), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
+               axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if name == "close" else {})]
+              for name, label, scale, colour in PANELS if not np.isnan(values[name]).all()]
+    panels[0] = [line(t, trace.com * 1e3, COMMAND, "Com, command", 2.4), *panels[0], legend(2),
+                 *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
+                   for fault, t0, _ in faults)]
+    checks = trace.sequence_checks
+    heights = [1.7] * len(panels) + [0.15 * len(checks) + 0.25] * bool(checks)
+    return draw_over_time("signals", trace, [*panels, *([_draw_checks(trace)] if checks else [])], heights, gap=0.12,
+                          xlabel="time from the start of the main phase [s]")
 
 
 def list_faults(trace: Trace) -> list[tuple[str, float, float]]:
     """The faults that the run injected: name, begin and end in s; one that never ends lasts to the end of the trace."""
     begun: dict[str, float] = {}
-    spans = []
+    found = []
     for event in trace.events:
         name, _, word = event.text.rpartition(" ")
         if event.kind == "fault" and word == "begins":
             begun[name] = event.t
         elif event.kind == "fault" and name in begun:
-            spans.append((name, begun.pop(name), event.t))
-    return spans + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
+            found.append((name, begun.pop(name), event.t))
+    return found + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
 
 
 def draw_timing(trace: Trace) -> str:
     """Histograms of lateness, response and work; "" for a trace without timing."""
-    columns = (("SYNC lateness", trace.timing.lateness, "#1f6feb"),
-               ("controller's response", trace.timing.response, "#d9730d"),
-               ("bench's own work", trace.timing.work, "#57606a"))
+    columns = (("SYNC lateness", trace.timing.lateness, BLUE), ("controller's response", trace.timing.response, ORANGE),
+               ("bench's own work", trace.timing.work, GREY))
     shortest_time = 0.1  # us, the left end of a histogram: the resolution of the clock
-    drawn = [(name, np.maximum(values[~np.isnan(values)] * 1e6, shortest_time), colour)
-             for name, values, colour in columns if (values > 0).any()]
-    if not drawn:
+    panels: list[Panel] = []
+    for name, values, colour in columns:
+        if (values > 0).any():
+            known = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
+            bins = np.logspace(math.log10(known.min()), math.log10(max(float(known.max()), 1.0)) + 0.02, 60)
+            panels.append([call("hist", known, bins=bins.tolist(), color=colour, log=True),
+                           instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
+                           axes(xscale="log", xlabel=f"{name} [us]",
+                                ylabel="" if panels else "cycles (dotted: p99)")])
+    if not panels:
         return ""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11, 2.5))
-        axes = figure.subplots(1, len(drawn), squeeze=False, gridspec_kw={
-            "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})[0]
-        for ax, (name, values, colour) in zip(axes, drawn, strict=True):
-            low, high = math.log10(values.min()), math.log10(max(float(values.max()), 1.0))
-            ax.hist(values, bins=np.logspace(low, high + 0.02, 60).tolist(), color=colour, log=True)
-            ax.set_xscale("log")
-            for axis in (ax.xaxis, ax.yaxis):  # plain numbers: the powers of ten take longer to set than to draw
-                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-                axis.set_minor_locator(NullLocator())
-            ax.xaxis.set_label_coords(0.5, -0.14)
-            ax.axvline(float(np.percentile(values, 99)), color=INK, lw=0.8, ls=":")
-            ax.set_xlabel(f"{name} [us]")
-        axes[0].set_ylabel("cycles (dotted: p99)")
-        axes[0].yaxis.set_label_coords(-0.06 * len(drawn), 0.5)
-        return to_svg(figure, "timing")
+    return draw_panels("timing", [panels], 2.5, layout=None, gridspec_kw={
+        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})
 
 
 def _bridge_short_gaps(values: Floats) -> Floats:
@@ -146,58 +107,52 @@ def _bridge_short_gaps(values: Floats) -> Floats:
     return np.where(near, np.interp(rows, known, values[known]), values)
 
 
-def _mark_missing(ax: Axes, trace: Trace, values: Floats, columns: int = 1400) -> None:
+def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
     """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
     pieces = np.array_split(np.isnan(values), min(columns, len(values)))
     lost = np.array([piece.any() for piece in pieces])
     starts = np.cumsum([0, *map(len, pieces)])
     edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
-    spans = [(float(trace.t[starts[a]]), float(starts[b] - starts[a]) * trace.period) for a, b in edges]
-    if spans:
-        ax.broken_barh(spans, (0.0, 0.04), transform=ax.get_xaxis_transform(), color=RED, lw=0.5, zorder=3)
+    ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period) for a, b in edges]
+    return spans(ends, RED, 0.04, lw=0.5, zorder=3)
 
 
 def _choose_close_up(trace: Trace) -> float:
     """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
-    ramps = [np.arange(s.start, s.stop) for s in trace.sections() if s.kind == "ramp"]
-    error = np.abs(trace.com - trace.xj)[np.concatenate(ramps)] if ramps else np.empty(0)
-    error = error[~np.isnan(error)]
-    return 2.0 * float(np.percentile(error, 99)) if len(error) else 0.0
+    ramps = [np.abs(trace.com - trace.xj)[s.start:s.stop] for s in trace.sections() if s.kind == "ramp"]
+    error = np.concatenate([np.empty(0), *ramps])
+    return 0.0 if np.isnan(error).all() else 2.0 * float(np.nanpercentile(error, 99))
 
 
-def _draw_checks(ax: Axes, trace: Trace) -> None:
+def _draw_checks(trace: Trace) -> Panel:
     """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
     first, last = float(trace.t[0]), float(trace.t[-1])
-    room, span = 0.005 * (last - first), last - first
+    room, far = 0.005 * (last - first), 0.25 * (last - first)
+    panel = [axes(ylim=(len(trace.sequence_checks) - 0.4, -0.6), yticks=[], ylabel="checks")]
     for row, check in enumerate(trace.sequence_checks):
         t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
+        name, x, side, colour = check.name, t0 + room, "left", "white"
         if math.isnan(check.t0) and math.isnan(check.value):
-            x, side, colour, name = first + room, "left", RED, f"{check.name}: not measured"
+            name, colour = f"{check.name}: not measured", RED
         else:
-            ax.barh(row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED)
-            name = check.name
-            if last - t1 > 0.25 * span:
-                x, side, colour = t1 + room, "left", INK
-            elif t0 - first > 0.25 * span:
+            panel.append(call("barh", row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED))
+            if last - t1 > far:
+                x, colour = t1 + room, INK
+            elif t0 - first > far:
                 x, side, colour = t0 - room, "right", INK
-            else:
-                x, side, colour = t0 + room, "left", "white"
-        ax.text(x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True).set_in_layout(False)
-    ax.set_ylim(len(trace.sequence_checks) - 0.4, -0.6)
-    ax.set_yticks([])
-    ax.set_ylabel("checks")
+        panel.append(call("text", x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True))
+    return panel
 
 
 UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 1.0, "bar": 1e5, "MPa": 1e6, "N": 1.0,
               "kN": 1e3, "A": 1.0, "mA": 1e-3, "s": 1.0, "ms": 1e-3}
 SHOWN_UNITS = {"com": "mm", "xj": "mm", "error": "um", "speed": "mm/s", "cor": "mA", "p12": "bar", "xs": "um",
                "load": "kN"}
-REACTIONS = ("response_within", "shut_off", "recovers")  # kinds of check that measure the time of a reaction
-BLUE, LIMIT = "#1f6feb", "#b7791f"
+BOTH = (1.0, -1.0)  # sides of zero
 
 
 class _View(NamedTuple):
-    """The rows of a check, and the span of time that its close-up shows."""
+    """The rows of a check, which its close-up shows."""
 
     trace: Trace
     check: Check
@@ -209,23 +164,21 @@ class _View(NamedTuple):
 
     def read(self, name: str) -> Floats:
         """A signal over the window; `error` is Com - XJ, `speed` that of the ram over 20 cycles. SI."""
-        if name == "error":
-            return (self.trace.com - self.trace.xj)[self.rows]
+        trace = self.trace
         if name == "speed":
-            return _compute_speed(self.trace.xj, self.trace.period)[self.rows]
-        return self.trace.column(name)[self.rows]
+            return _compute_speed(trace.xj, trace.period)[self.rows]
+        return (trace.com - trace.xj if name == "error" else trace.column(name))[self.rows]
 
     @property
-    def target(self) -> tuple[float, float]:
-        """Demand before the window and at its end, m."""
-        before = self.trace.com[self.rows.start - 1] if self.rows.start else self.trace.xj[0]
-        return float(before), float(self.trace.com[self.rows.stop - 1])
+    def step(self) -> tuple[float, float]:
+        """Demand before the window, and what the step adds to it, m."""
+        before = float(self.trace.com[self.rows.start - 1] if self.rows.start else self.trace.xj[0])
+        return before, float(self.trace.com[self.rows.stop - 1]) - before
 
-    @property
-    def has_step(self) -> bool:
-        """Whether the demand steps at the window's begin, and there is a measured value or at least a time limit."""
-        before, target = self.target
-        return abs(target - before) > 1e-6 and not (self.check.kind == "overshoot" and math.isnan(self.check.value))
+    def compute_share(self) -> Floats:
+        """How much of the step XJ has done, %; filtered as the checks do it."""
+        before, size = self.step
+        return 100.0 * (_filter_median(self.read("xj")) - before) / size
 
 
 def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
@@ -233,160 +186,92 @@ def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
 
     `salt` keeps the ids of the figure apart from those of other figures of the page.
     """
-    if math.isnan(check.t0):
+    draw = DRAWERS.get(check.kind)
+    if draw is None or math.isnan(check.t0):
         return ""
     first, stop = np.searchsorted(trace.t, [check.t0 - 0.5 * trace.period, check.t1 - 0.5 * trace.period])
-    draw = DRAWERS.get(check.kind)
-    is_reaction = check.kind in REACTIONS
-    if draw is None or stop - first < 2 or (check.signal not in (*SHOWN_UNITS, "") and not is_reaction):
-        return ""
     view = _View(trace, check, slice(int(first), int(stop)))
-    if check.signal and not is_reaction and np.isnan(view.read(check.signal)).all():
+    if stop - first < 2:
         return ""
-    if check.kind in ("overshoot", "rise_time", "settling_time") and not view.has_step:
+    if draw is not _draw_reaction and check.signal and (
+            check.signal not in SHOWN_UNITS or np.isnan(view.read(check.signal)).all()):
+        return ""
+    if draw in STEP_DRAWERS and (abs(view.step[1]) <= 1e-6 or (draw is _draw_overshoot and math.isnan(check.value))):
         draw = _draw_response
-    with start_figure(2.3) as figure:
-        ax = figure.subplots()
-        ax.set_xlim(check.t0, check.t1)
-        draw(ax, view)
-        ax.set_xlabel("time [s]")
-        ax.legend(ncols=6, **ABOVE)
-        return to_svg(figure, salt)
+    return draw_panels(salt, [[[axes(xlim=(check.t0, check.t1), xlabel="time [s]"), *draw(view), legend(6)]]], 2.3)
 
 
-def _draw_overshoot(ax: Axes, view: _View) -> None:
+def _draw_overshoot(view: _View) -> Panel:
     """Beyond the target, % of the step; from 20 ms before the step until four times the time to the peak."""
-    before, target = view.target
-    beyond = 100.0 * (_filter_median(view.read("xj")) - target) / (target - before)
-    peak = int(np.nanargmax(beyond))
-    ax.plot(*thin_line(view.t, beyond), color=BLUE, lw=1.2, label="XJ beyond the target")
-    _draw_limits(ax, view.check)
-    ax.plot([view.t[peak]], [view.check.value], "o", color=RED, ms=6, label=f"measured {view.check.value:.4g} %")
-    high = 1.5 * max(view.check.value, np.nan_to_num(view.check.high))
-    ax.set_ylim(-high, high)
-    ax.set_xlim(view.t[0], min(view.t[-1], view.t[0] + max(0.06, 4.0 * (view.t[peak] - view.t[0]))))
-    ax.set_ylabel("beyond the\ntarget [%]")
+    check, t, beyond = view.check, view.t, view.compute_share() - 100.0
+    peak = t[int(np.nanargmax(beyond))]
+    high = 1.5 * max(check.value, np.nan_to_num(check.high))
+    return [line(t, beyond, BLUE, "XJ beyond the target", 1.2), *_draw_limits(check),
+            dot(peak, check.value, RED, _name_value(check)),
+            axes(ylim=(-high, high), xlim=(t[0], min(t[-1], t[0] + max(0.06, 4.0 * (peak - t[0])))),
+                 ylabel="beyond the\ntarget [%]")]
 
 
-def _draw_rise_time(ax: Axes, view: _View) -> None:
+def _draw_rise_time(view: _View) -> Panel:
     """Share of the step that is done, with the times of 10 % and 90 %."""
-    before, target = view.target
-    done = 100.0 * (_filter_median(view.read("xj")) - before) / (target - before)
-    ax.plot(*thin_line(view.t, done), color=BLUE, lw=1.2, label="XJ, share of the step")
-    for level in (10.0, 90.0):
-        ax.axhline(level, color=COMMAND, lw=0.8, ls=":")
-    reached = np.flatnonzero(done >= 10.0)
-    ax.set_ylim(-10.0, 125.0)
-    ax.set_ylabel("done [%]")
-    if len(reached):
-        start = float(view.t[reached[0]])
-        _draw_times(ax, view.check, start)
-        ax.axvline(start, color=COMMAND, lw=0.8, ls=":")
-        _show_time(ax, view, start)
+    done = view.compute_share()
+    start = next(iter(view.t[done >= 10.0]), math.nan)
+    return [line(view.t, done, BLUE, "XJ, share of the step", 1.2),
+            *(level(share, COMMAND, width=0.8, style=":") for share in (10.0, 90.0)),
+            *([] if math.isnan(start) else [instant(start, COMMAND, width=0.8, style=":"), *_draw_times(view, start)]),
+            axes(ylim=(-10.0, 125.0), ylabel="done [%]")]
 
 
-def _draw_settling_time(ax: Axes, view: _View) -> None:
+def _draw_settling_time(view: _View) -> Panel:
     """Distance from the target; the position has to stay near it after the time limit."""
-    before, target = view.target
-    beyond = 100.0 * (_filter_median(view.read("xj")) - target) / abs(target - before)
-    ax.plot(*thin_line(view.t, beyond), color=BLUE, lw=1.2, label="XJ less the target")
-    start = float(view.t[0])
-    _draw_times(ax, view.check, start)
+    check = view.check
+    beyond = math.copysign(1.0, view.step[1]) * (view.compute_share() - 100.0)
+    panel = [line(view.t, beyond, BLUE, "XJ less the target", 1.2), *_draw_times(view, float(view.t[0]))]
     size = 110.0
-    if not math.isnan(view.check.value) and view.check.value > 0.0:
-        last_outside = round(_to_seconds(view.check, view.check.value) / view.trace.period) - 1
+    if check.value > 0.0:
+        last_outside = round(_to_seconds(check, check.value) / view.trace.period) - 1
         band = abs(float(beyond[min(max(last_outside, 0), len(beyond) - 1)]))
-        for side in (-1.0, 1.0):
-            ax.axhline(side * band, color=COMMAND, lw=0.8, ls=":", label="band" if side > 0 else None)
+        panel += _draw_sides(band, COMMAND, "band", BOTH, style=":", width=0.8)
         size = min(6.0 * band, 110.0)
-    ax.set_ylim(-size, size)
-    ax.set_ylabel("off the target\n[% of the step]")
-    _show_time(ax, view, start)
+    return [*panel, axes(ylim=(-size, size), ylabel="off the target\n[% of the step]")]
 
 
-def _draw_times(ax: Axes, check: Check, start: float) -> None:
-    """Vertical lines at the time limits and at the measured time, s after `start`."""
-    for limit, word in ((check.low, "least"), (check.high, "most")):
-        if not math.isnan(limit):
-            ax.axvline(start + _to_seconds(check, limit), color=LIMIT, lw=1.4, ls="--",
-                       label=f"{word} {limit:g} {check.unit}")
-    if not math.isnan(check.value):
-        ax.axvline(start + _to_seconds(check, check.value), color=RED, lw=1.4,
-                   label=f"measured {check.value:.4g} {check.unit}")
+def _draw_size(view: _View) -> Panel:
+    """Position error or a signal with its limits and the measured mean, RMS, band or largest size.
 
-
-def _show_time(ax: Axes, view: _View, start: float) -> None:
-    """Show three times the longest of measured value and limit, or the whole window if nothing was measured."""
-    times = [_to_seconds(view.check, x) for x in (view.check.value, view.check.high, view.check.low)]
-    if not math.isnan(times[0]):
-        ax.set_xlim(view.t[0], min(float(view.t[-1]), start + 3.0 * max(x for x in times if not math.isnan(x))))
-
-
-def _to_seconds(check: Check, value: float) -> float:
-    return value * UNIT_SIZES.get(check.unit, 1.0)
-
-
-def _draw_error_level(ax: Axes, view: _View) -> None:
-    """Position error with the measured mean, RMS or largest size and the limits, on both sides where size counts."""
-    check, size = view.check, UNIT_SIZES[view.check.unit]
-    error = view.read("error") / size
-    ax.set_ylabel(f"error [{check.unit}]")
-    ax.plot(*thin_line(view.t, error), color=BLUE, lw=0.9, label="error, Com - XJ")
-    way = 1.0
-    if check.kind == "steady_error":
-        way = float(np.sign(np.nanmean(error)))
-    if check.kind == "ramp_error":
+    Limits stand on both sides of zero where the size counts; around the middle of the band at break-away.
+    """
+    check, is_error = view.check, view.check.kind != "never_exceeds"
+    name = "error" if is_error else check.signal
+    values = view.read(name) / UNIT_SIZES[check.unit]
+    filtered = _filter_median(values) if is_error else values
+    middle = 0.0
+    sides: tuple[float, ...] = BOTH
+    if check.kind == "break_away":
+        values, middle = filtered, 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum())
+    elif check.kind in ("steady_error", "ramp_error"):
         com = view.read("com")
-        way = float(np.sign(com[-1] - com[0]))
-    both = check.kind in ("max_error", "rms_error")
-    _draw_limits(ax, check, sides=(1.0, -1.0) if both else (way,))
-    if check.kind == "max_error":
-        filtered = _filter_median(error)
+        sides = (float(np.sign(com[-1] - com[0] if check.kind == "ramp_error" else np.nanmean(values))),)
+    panel = [line(view.t, values, BLUE, "error, Com - XJ" if is_error else name, 0.9),
+             axes(ylabel=f"{name} [{check.unit}]"), *_draw_limits(check, sides, middle)]
+    if check.kind in ("max_error", "never_exceeds"):
         row = int(np.nanargmax(np.abs(filtered)))
-        ax.plot([view.t[row]], [filtered[row]], "o", color=RED, ms=6, label=_name_value(check))
-        return
-    _draw_value(ax, check, (1.0, -1.0) if both else (way,))
+        return [*panel, dot(view.t[row], filtered[row], RED, _name_value(check))]
+    return [*panel, *_draw_sides(check.value, RED, _name_value(check), sides, middle)]
 
 
-def _draw_break_away(ax: Axes, view: _View) -> None:
-    """Position error with the measured band and the widest one allowed, around its middle."""
-    check, size = view.check, UNIT_SIZES[view.check.unit]
-    error = _filter_median(view.read("error")) / size
-    low, high = np.nanpercentile(error, (1, 99))
-    ax.plot(*thin_line(view.t, error), color=BLUE, lw=0.9, label="error, Com - XJ")
-    _draw_limits(ax, check, (1.0, -1.0), middle=0.5 * float(low + high))
-    _draw_value(ax, check, (1.0, -1.0), middle=0.5 * float(low + high))
-    ax.set_ylabel(f"error [{check.unit}]")
-
-
-def _draw_largest(ax: Axes, view: _View) -> None:
-    """The signal with limits on both sides and its largest value."""
-    check, size = view.check, UNIT_SIZES[view.check.unit]
-    values = view.read(check.signal) / size
-    ax.plot(*thin_line(view.t, values), color=BLUE, lw=0.9, label=check.signal)
-    _draw_limits(ax, check, (1.0, -1.0))
-    row = int(np.nanargmax(np.abs(values)))
-    ax.plot([view.t[row]], [values[row]], "o", color=RED, ms=6, label=_name_value(check))
-    ax.set_ylabel(f"{check.signal} [{check.unit}]")
-
-
-def _draw_response(ax: Axes, view: _View) -> None:
+def _draw_response(view: _View) -> Panel:
     """Demand and position; for a gain also the amplitudes that the limits allow."""
-    com, xj = 1e3 * view.read("com"), 1e3 * view.read("xj")
-    ax.plot(*thin_line(view.t, com), color=COMMAND, lw=1.6, label="Com")
-    ax.plot(*thin_line(view.t, xj), color=BLUE, lw=1.0, label="XJ")
+    com, check = 1e3 * view.read("com"), view.check
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
-    if view.check.kind == "amplitude_ratio":
-        for limit in (view.check.low, view.check.high):
-            if not math.isnan(limit):
-                for side in (1.0, -1.0):
-                    ax.axhline(middle + side * limit * amplitude, color=LIMIT, lw=1.2, ls="--",
-                               label=f"{limit:g} of Com" if side > 0 else None)
-    ax.plot([], [], " ", label=_name_value(view.check))
-    ax.set_ylabel("position [mm]")
+    limits = (check.low, check.high) if check.kind == "amplitude_ratio" else ()
+    return [line(view.t, com, COMMAND, "Com", 1.6), line(view.t, 1e3 * view.read("xj"), BLUE, "XJ"),
+            *(mark for limit in limits
+              for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of Com", BOTH, middle, "--")),
+            _write_in_legend(_name_value(check)), axes(ylabel="position [mm]")]
 
 
-def _draw_reaction(ax: Axes, view: _View) -> None:
+def _draw_reaction(view: _View) -> Panel:
     """The signal, or the current where the check is about none, around the instant from which the reaction counts.
 
     Vertical lines: that instant, the latest time that the limits allow, and when the reaction came. Of a log without
@@ -397,21 +282,15 @@ def _draw_reaction(ax: Axes, view: _View) -> None:
     unit = SHOWN_UNITS[name]
     if not math.isnan(check.after):
         view = view._replace(rows=_find_reaction_rows(view))
-    ax.plot(*thin_line(view.t, view.read(name) / UNIT_SIZES[unit]), color=BLUE, lw=1.2, label=name)
-    ax.set_ylabel(f"{name} [{unit}]")
+    panel = [line(view.t, view.read(name) / UNIT_SIZES[unit], BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
     if math.isnan(check.after):
-        ax.plot([], [], " ", label=f"{_name_value(check)}; limits in the table")
-        return
-    ax.set_xlim(view.t[0], view.t[-1])
-    ax.axvline(check.after, color=COMMAND, lw=1.2, ls=":",
-               label="clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s")
-    for level, word in ((check.above, "above"), (check.below, "below")):
-        if not math.isnan(level):
-            ax.axhline(level / UNIT_SIZES[unit], color=COMMAND, lw=1.2, ls="--",
-                       label=f"{word} {level / UNIT_SIZES[unit]:g} {unit}")
-    _draw_times(ax, check, check.after)
-    if math.isnan(check.value):
-        ax.plot([], [], " ", label=_name_value(check))
+        return [*panel, _write_in_legend(f"{_name_value(check)}; limits in the table")]
+    unmeasured = [_write_in_legend(_name_value(check))] if math.isnan(check.value) else []
+    begin = "clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s"
+    bounds = ((x / UNIT_SIZES[unit], word) for x, word in ((check.above, "above"), (check.below, "below")))
+    return [*panel, instant(check.after, COMMAND, begin, 1.2, ":"),
+            *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
+            *_draw_times(view, check.after), *unmeasured, axes(xlim=(view.t[0], view.t[-1]))]
 
 
 def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
@@ -427,18 +306,40 @@ def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
     return slice(int(first), int(stop)) if stop - first > 1 else view.rows
 
 
-def _draw_limits(ax: Axes, check: Check, sides: tuple[float, ...] = (1.0,), middle: float = 0.0) -> None:
-    for limit, word in ((check.low, "least"), (check.high, "most")):
-        if not math.isnan(limit):
-            for i, side in enumerate(sides):
-                ax.axhline(middle + side * limit, color=LIMIT, lw=1.4, ls="--",
-                           label=None if i else f"{word} {limit:g} {_shorten_unit(check)}".rstrip())
+def _draw_times(view: _View, start: float) -> list[Mark]:
+    """Vertical lines at the time limits and at the measured time, s after `start`.
+
+    The panel then shows three times the longest of these; the whole window if nothing was measured.
+    """
+    check = view.check
+    marks = [instant(start + _to_seconds(check, limit), AMBER, f"{word} {limit:g} {check.unit}", 1.4, "--")
+             for limit, word in ((check.low, "least"), (check.high, "most")) if not math.isnan(limit)]
+    if math.isnan(check.value):
+        return marks
+    longest = _to_seconds(check, float(np.nanmax([check.value, check.high, check.low])))
+    return [*marks, instant(start + _to_seconds(check, check.value), RED, _name_value(check), 1.4),
+            axes(xlim=(view.t[0], min(float(view.t[-1]), start + 3.0 * longest)))]
 
 
-def _draw_value(ax: Axes, check: Check, sides: tuple[float, ...], middle: float = 0.0) -> None:
-    if not math.isnan(check.value):
-        for i, side in enumerate(sides):
-            ax.axhline(middle + side * check.value, color=RED, lw=1.4, label=None if i else _name_value(check))
+def _to_seconds(check: Check, value: float) -> float:
+    return value * UNIT_SIZES.get(check.unit, 1.0)
+
+
+def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], middle: float = 0.0, style: str = "-",
+                width: float = 1.4) -> list[Mark]:
+    """A level on each of these sides of `middle`, with one label; none for NaN."""
+    return [level(middle + side * size, colour, label if side == sides[0] else None, width, style)
+            for side in sides if not math.isnan(size)]
+
+
+def _draw_limits(check: Check, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
+    return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
+            for mark in _draw_sides(limit, AMBER, f"{word} {limit:g} {_shorten_unit(check)}".rstrip(), sides, middle,
+                                    "--")]
+
+
+def _write_in_legend(text: str) -> Mark:
+    return line([], [], INK, text, ls="")
 
 
 def _name_value(check: Check) -> str:
@@ -465,9 +366,10 @@ def _compute_speed(position: Floats, period: float, span: int = 20) -> Floats:
     return speed
 
 
-DRAWERS: Mapping[str, Callable[[Axes, _View], None]] = {
+STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)
+DRAWERS: Mapping[str, Callable[[_View], Panel]] = {
     "overshoot": _draw_overshoot, "rise_time": _draw_rise_time, "settling_time": _draw_settling_time,
-    "steady_error": _draw_error_level, "ramp_error": _draw_error_level, "max_error": _draw_error_level,
-    "rms_error": _draw_error_level, "break_away": _draw_break_away, "never_exceeds": _draw_largest,
-    "amplitude_ratio": _draw_response, "phase_lag": _draw_response, "response_within": _draw_reaction,
-    "shut_off": _draw_reaction, "recovers": _draw_reaction}
+    **dict.fromkeys(("steady_error", "ramp_error", "max_error", "rms_error"), _draw_size),
+    **dict.fromkeys(("break_away", "never_exceeds"), _draw_size),
+    **dict.fromkeys(("amplitude_ratio", "phase_lag"), _draw_response),
+    **dict.fromkeys(("response_within", "shut_off", "recovers"), _draw_reaction)}

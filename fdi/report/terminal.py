@@ -1,6 +1,7 @@
 """The terminal writer: verdict, tables and labelled lines, for a person at a console of 80 columns or more."""
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from io import StringIO
 
@@ -95,30 +96,23 @@ def _flush_lines(lines: list[Line], console: Console, whole: Collection[str] = (
 
 
 def _print_table(table: Table, console: Console) -> None:
-    rows = [[_as_cell(cell) for cell in row] for row in table.rows]
-    shown = rows if table.terminal_rows is None else rows[:table.terminal_rows]
+    cells = [[cell for cell in row if isinstance(cell, Cell)] for row in table.rows]
+    shown = cells[:table.terminal_rows]
     for columns in split_columns(table.columns, shown, console.width):
         block = [[row[i] for i in columns] for row in shown]
         console.print(_build_table([table.columns[i] for i in columns], block, console.width))
-    if len(shown) < len(rows):
-        console.print(Text(f"and {len(rows) - len(shown)} more", "dim"))
+    if len(shown) < len(cells):
+        console.print(Text(f"and {len(cells) - len(shown)} more", "dim"))
     if table.caption:
         console.print(Text(table.caption, "dim italic"))
 
 
-def _as_cell(cell: Cell | str) -> Cell:
-    return cell if isinstance(cell, Cell) else Cell(cell)
-
-
 def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> RichTable:
     out = RichTable(box=None, pad_edge=False, padding=(0, GAP, 0, 0), show_header=any(c.heading for c in columns))
-    widths = choose_widths(columns, rows, width)
-    for column, own in zip(columns, widths, strict=True):
-        if column.align == "right":
-            heading = Text("\n".join(wrap_heading(column.heading, own)))
-            out.add_column(heading, justify="right", no_wrap=True, width=own)
-        else:
-            out.add_column(Text(column.heading), overflow="fold", width=own)
+    for column, own in zip(columns, choose_widths(columns, rows, width), strict=True):
+        is_number = column.align == "right"
+        heading = textwrap.fill(column.heading, own, break_on_hyphens=False) if is_number else column.heading
+        out.add_column(Text(heading), justify=column.align, no_wrap=is_number, overflow="fold", width=own)
     for row in rows:
         out.add_row(*(Text(cell.text, style_of(cell)) for cell in row))
     return out
@@ -160,21 +154,6 @@ def minimal_width(column: Column, cells: Sequence[Cell]) -> int:
     if column.align == "left":
         texts = [word for text in texts for word in text.split()]
     return max([heading, *map(cell_len, texts)], default=0)
-
-
-def wrap_heading(heading: str, width: int) -> list[str]:
-    """The words of a heading in lines of at most `width` characters.
-
-    >>> wrap_heading("from the command alone", 8)
-    ['from the', 'command', 'alone']
-    """
-    lines: list[str] = []
-    for word in heading.split():
-        if lines and cell_len(lines[-1]) + 1 + cell_len(word) <= width:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines
 
 
 def split_columns(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> Iterator[list[int]]:

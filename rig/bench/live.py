@@ -228,14 +228,15 @@ def _tabulate_ratios(ratios: Sequence[Mapping[str, Any]]) -> list[Table]:
     def show_interval(ratio: Mapping[str, Any]) -> str:
         return f"{_format_ratio(ratio['low'])} .. {_format_ratio(ratio['high'])}" if isfinite(ratio["low"]) else ""
 
-    return tabulate(
-        ratios, f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same runs once more, '
-                "which is the noise. All intervals together hold with 95 %.",
+    return [tabulate(
+        ratios,
         (Column("percentile"), lambda ratio: f"{ratio['quantity'].replace('_', ' ')} {ratio['share']}"),
         (Column("run"), lambda ratio: ratio["contender"]),
         (Column("ratio", align="right"), lambda ratio: _format_ratio(ratio["ratio"])),
         (Column("interval", align="right"), show_interval),
-        (Column(""), lambda ratio: Cell(ratio["word"], _MOODS[ratio["word"]])))
+        (Column(""), lambda ratio: Cell(ratio["word"], _MOODS[ratio["word"]])),
+        caption=f'To the runs without the screen: geometric means over the blocks. "{AGAIN}": the same runs once more, '
+                "which is the noise. All intervals together hold with 95 %.")]
 
 
 def _format_ratio(ratio: float) -> str:
@@ -250,9 +251,11 @@ def _tabulate_times(times: Mapping[str, Mapping[str, float]], blocks: Mapping[st
         values = [block[share] for block in blocks[name] if block]
         return f"{min(values):.1f} .. {max(values):.1f}"
 
-    return tabulate(
-        [name for name, found in times.items() if found], caption, (Column("run"), str),
+    return [tabulate(
+        [name for name, found in times.items() if found],
+        (Column("run"), str),
         (Column("p50", "us", "right"), lambda name: f"{times[name]['p50']:.1f}"),
         (Column("p99", "us", "right"), lambda name: f"{times[name]['p99']:.1f}"),
         (Column("p50 by block", "us", "right"), lambda name: show_spread(name, "p50")),
-        (Column("p99 by block", "us", "right"), lambda name: show_spread(name, "p99")))
+        (Column("p99 by block", "us", "right"), lambda name: show_spread(name, "p99")),
+        caption=caption)]

@@ -218,10 +218,11 @@ def _list_costs(figures: Mapping[str, Any]) -> list[Item]:
 
 
 def _tabulate_accuracy(accuracy: Sequence[Mapping[str, float]]) -> list[Table]:
-    return tabulate(
-        accuracy, "Error of XJ over the closed-loop preflight, against steps of 0.2 us.",
+    return [tabulate(
+        accuracy,
         (Column("step", "us", "right"), lambda row: f"{1000 / row['steps']:g}"),
         (Column("friction off: RMS", "um", "right"), lambda row: f"{row['rms']:.4f}"),
         (Column("max", "um", "right"), lambda row: f"{row['largest']:.4f}"),
         (Column("friction on: RMS", "um", "right"), lambda row: f"{row['rms_friction']:.2f}"),
-        (Column("max", "um", "right"), lambda row: f"{row['largest_friction']:.2f}"))
+        (Column("max", "um", "right"), lambda row: f"{row['largest_friction']:.2f}"),
+        caption="Error of XJ over the closed-loop preflight, against steps of 0.2 us.")]

@@ -233,20 +233,22 @@ def _tabulate_targets(targets: Sequence[Mapping[str, Any]]) -> list[Table]:
         failed = "not measured" if target["value"] is None else "NOT met"
         return Cell("met", "good") if target["is_met"] else Cell(failed, "bad")
 
-    return tabulate(
-        targets, "Ratios are those of the percentiles over all blocks.",
+    return [tabulate(
+        targets,
         (Column("target"), lambda target: target["name"]),
         (Column("measured", align="right"),
          lambda target: "" if target["value"] is None else format_digits(target["value"])),
         (Column("limit", align="right"), lambda target: f"<= {target['limit']:g}"),
-        (Column("unit"), lambda target: target["unit"]), (Column(""), judge))
+        (Column("unit"), lambda target: target["unit"]), (Column(""), judge),
+        caption="Ratios are those of the percentiles over all blocks.")]
 
 
 def _tabulate_times(times: Mapping[str, Mapping[str, float]], names: Mapping[str, str], caption: str) -> list[Table]:
-    return tabulate(
-        [(name, times[key]) for key, name in names.items() if times.get(key)], caption,
+    return [tabulate(
+        [(name, times[key]) for key, name in names.items() if times.get(key)],
         (Column(""), lambda row: row[0]),
         (Column("p50", "us", "right"), lambda row: f"{row[1]['p50']:.1f}"),
         (Column("p99", "us", "right"), lambda row: f"{row[1]['p99']:.1f}"),
         (Column("p99.9", "us", "right"), lambda row: f"{row[1]['p99_9']:.1f}"),
-        (Column("max", "us", "right"), lambda row: f"{row[1]['max']:.1f}"))
+        (Column("max", "us", "right"), lambda row: f"{row[1]['max']:.1f}"),
+        caption=caption)]

@@ -116,15 +116,16 @@ def _start_rig(command: str, file: Path) -> subprocess.Popen[bytes]:
 def build_long_recordings_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.recordings.measure_long_recordings`."""
     costs = figures["costs"]
-    table = tabulate(
-        costs, "CPU time: user and system time of the whole process. Memory: largest resident set.",
+    table = [tabulate(
+        costs,
         (Column("command"), lambda cost: cost["command"]),
         (Column("recording", align="right"), lambda cost: f"{cost['length']:g} s"),
         (Column("CPU time", align="right"), lambda cost: f"{cost['cpu']:.1f} s"),
         (Column("memory", align="right"), lambda cost: f"{1e-9 * cost['memory']:.2f} GB"),
         (Column("verdict"), lambda cost: cost["verdict"]),
         (Column("ends after Ctrl-C", align="right"),
-         lambda cost: "" if cost["interrupted"] is None else f"{cost['interrupted']:.1f} s"))
+         lambda cost: "" if cost["interrupted"] is None else f"{cost['interrupted']:.1f} s"),
+        caption="CPU time: user and system time of the whole process. Memory: largest resident set.")]
     largest, longest = (max(cost[key] for cost in costs) for key in ("memory", "length"))
     return Report("bench", "recordings",
                   sentence=f"{longest:g} s of recording at 1 kHz take {1e-9 * largest:.2f} GB at most.",

@@ -78,12 +78,11 @@ def _start_process() -> subprocess.Popen[str]:
 def main() -> None:
     """Load what a page needs and say so, then write the page that a line of standard input names; without one, none."""
     gc.disable()  # this process ends with its page; looking through matplotlib's objects takes a tenth of its time
-    import fdi.report.run_figures  # noqa: F401 - loads matplotlib
     from fdi.report.drawing import start_figure, to_svg
     from fdi.report.html import load_templates
     from fdi.report.run_report import write_run_page
 
-    with start_figure(1.0) as figure:  # loads the fonts and the SVG writer
+    with start_figure(1.0) as figure:  # loads matplotlib, the fonts and the SVG writer
         figure.text(0.5, 0.5, "0")
         to_svg(figure, "none")
     load_templates().get_template("page.html")

@@ -63,27 +63,28 @@ def _list_notes(dry: DryRun) -> list[str]:
 
 
 def _tabulate_demands(demands: Sequence[Demand]) -> list[Table]:
-    return tabulate(
+    return [tabulate(
         [each for each in demands if each.value >= 1e-9],
-        "A jump between two sections is a step and counts neither as speed nor as acceleration.",
         (Column("largest"), lambda each: each.name),
         (Column("value", align="right"),
          lambda each: Cell(each.show(each.value), "bad" if each.is_violated else "", True)),
         (Column("limit", align="right"), lambda each: "" if each.limit is None else each.show(each.limit)),
         (Column("unit"), lambda each: SHOWN_UNITS[each.unit][0]),
         (Column("limit from"), lambda each: "" if each.limit is None else each.parameter),
-        (Column("section"), lambda each: each.section), (Column("t", "s", "right"), lambda each: f"{each.t:.3f}"))
+        (Column("section"), lambda each: each.section), (Column("t", "s", "right"), lambda each: f"{each.t:.3f}"),
+        caption="A jump between two sections is a step and counts neither as speed nor as acceleration.")]
 
 
 def _tabulate_faults(faults: Sequence[PlannedFault]) -> list[Table]:
-    return tabulate(
-        faults, "Times count from the start of main; all faults end with it.",
+    return [tabulate(
+        faults,
         (Column("fault"), lambda each: each.name), (Column("kind", medium=Medium.PAGE), lambda each: each.kind),
         (Column("target"), lambda each: each.target),
         (Column("from", "s", "right"), lambda each: f"{each.t0:.3f}"),
         (Column("to", "s", "right"), lambda each: f"{each.t1:.3f}"),
         (Column("duration", "s", "right", Medium.PAGE), lambda each: f"{each.duration:.3f}"),
-        (Column("size"), lambda each: each.size))
+        (Column("size"), lambda each: each.size),
+        caption="Times count from the start of main; all faults end with it.")]
 
 
 def describe_prediction(dry: DryRun) -> list[tuple[str, str]]:
@@ -106,14 +107,14 @@ def _tabulate_checks(checks: Sequence[CheckResult]) -> list[Table]:
         text = "none" if math.isnan(check.value) else f"{check.value:.4g}"
         return Cell(text, "good" if check.passed else "bad", True)
 
-    return tabulate(
-        checks, "",
+    return [tabulate(
+        checks,
         (Column("check"), lambda check: check.name),
         (Column("window", "s"), lambda check: "-" if math.isnan(check.t0) else f"{check.t0:.3f} .. {check.t1:.3f}"),
         (Column("predicted", align="right"), show_value),
         (Column("limits", align="right"), lambda check: format_limits(check.low, check.high)),
         (Column("unit"), lambda check: "" if check.unit == "1" else check.unit),
-        (Column("remark"), lambda check: check.detail))
+        (Column("remark"), lambda check: check.detail))]
 
 
 def collect_data(dry: DryRun) -> dict[str, Any]:

@@ -72,8 +72,8 @@ def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
 
 
 def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> list[Table]:
-    return tabulate(
-        results, "Checks: passed of all, protocol checks included. Time: wall-clock, with the page.",
+    return [tabulate(
+        results,
         (Column("case"), lambda result: Cell(result.case.name, link=_link(result, folder))),
         (Column("verdict"), lambda result: Cell(result.verdict, MOODS[result.verdict])),
         (Column("checks", align="right"), lambda result: f"{len(result.checks) - len(result.failed)}/"
@@ -81,7 +81,8 @@ def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> list[Table]:
         (Column("time", "s", "right"), lambda result: f"{result.seconds:.1f}" if result.seconds else "-"),
         (Column("reason"), lambda result: result.reason),
         (Column("differs from nominal", medium=Medium.PAGE),
-         lambda result: Cell("" if result.differences == "nothing" else result.differences, "muted")))
+         lambda result: Cell("" if result.differences == "nothing" else result.differences, "muted")),
+        caption="Checks: passed of all, protocol checks included. Time: wall-clock, with the page.")]
 
 
 def _link(result: CaseResult, folder: Path) -> str:
@@ -91,15 +92,15 @@ def _link(result: CaseResult, folder: Path) -> str:
 
 
 def _tabulate_failures(results: Sequence[CaseResult], folder: Path) -> list[Table]:
-    return tabulate(
-        [(result, check) for result in results for check in result.failed], "",
+    return [tabulate(
+        [(result, check) for result in results for check in result.failed],
         (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder))),
         (Column("check"), lambda row: row[1].name),
         (Column("measured", align="right"),
          lambda row: Cell(_format_value(row[1]), "bad" if row[0].verdict == "FAIL" else "doubtful")),
         (Column("limits", align="right"), lambda row: format_limits(row[1].low, row[1].high)),
         (Column("unit"), lambda row: "" if row[1].unit == "1" else row[1].unit),
-        (Column("requirement"), lambda row: ", ".join(row[1].requirement)), terminal_rows=30)
+        (Column("requirement"), lambda row: ", ".join(row[1].requirement)), terminal_rows=30)]
 
 
 def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]:
@@ -114,15 +115,16 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
         word = result.fdi["verdict"] if result else ""
         return Cell(word, VERDICT_MOODS.get(word, "bad" if result and result.has_fault else "doubtful"))
 
-    return tabulate(
-        rows, "A fault beyond acceptable, or another deviation, fails the case.",
+    return [tabulate(
+        rows,
         (Column("case"), lambda row: Cell(row[0].case.name, link=_link(row[0], folder)) if row[0] else ""),
         (Column("rig fdi"), lambda row: show_verdict(row[0])),
         (Column("fault", medium=Medium.PAGE), lambda row: row[1].name),
         (Column("level"), lambda row: Cell(row[1].level, moods.get(row[1].level, ""))),
         (Column("size (95 % interval)", align="right"), lambda row: row[1].size),
         (Column("finding", medium=Medium.PAGE), lambda row: row[0].fdi["sentence"] if row[0] else ""),
-        terminal_rows=30)
+        terminal_rows=30,
+        caption="A fault beyond acceptable, or another deviation, fails the case.")]
 
 
 def _format_value(check: CheckResult) -> str:
@@ -130,14 +132,15 @@ def _format_value(check: CheckResult) -> str:
 
 
 def _tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
-    return tabulate(
-        requirements, "OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.",
+    return [tabulate(
+        requirements,
         (Column("requirement"), lambda each: each.id),
         (Column("text", medium=Medium.PAGE), lambda each: each.text),
         (Column("verdict"), lambda each: Cell(each.verdict, MOODS[each.verdict])),
         (Column("checks", align="right"), lambda each: f"{sum(proof.verdict == 'PASS' for proof in each.evidence)}/"
                                                        f"{len(each.evidence)}"),
-        (Column("verified by", medium=Medium.PAGE), lambda each: describe_evidence(each.evidence)))
+        (Column("verified by", medium=Medium.PAGE), lambda each: describe_evidence(each.evidence)),
+        caption="OPEN: a check that verifies it was not judged. NOT_COVERED: no check verifies it.")]
 
 
 def describe_evidence(evidence: Sequence[Evidence], most: int = 3) -> str:

@@ -20,6 +20,7 @@ from short_runs import HIDDEN, write_measured_runs
 import fdi
 from fdi.analysis import Plot, Result
 from fdi.diagnosis.refine import SUSPECTS
+from fdi.report.drawing import Drawing
 from fdi.report.report import Figure, Report, Section
 from plant import InputError, Model
 from plant.effects import CATALOGUE
@@ -103,7 +104,9 @@ def test_a_plot_converts_to_plotly(lines: dict[str, Any], tmp_path: Path) -> Non
     assert any(np.allclose(curve.y, 1e6 * residual, equal_nan=True) for curve in curves)
     assert found.layout.xaxis3.matches == "x" and found.layout.yaxis3.title.text == "residual of<br>XJ [um]"
     assert {curve.name for curve in found.data if curve.showlegend} >= {"measured", "model, from the current"}
-    assert [shape for shape in found.layout.shapes if shape.xref == "x3 domain"], "the band of the noise floor"
+    floor = 2e6 * comparison.comparison.signals["xj"].floor.value
+    assert any(curve.fill == "toself" and max(curve.y) == pytest.approx(floor) for curve in found.data
+               if curve.yaxis == "y3"), "the band of the noise floor"
     shares = comparison.plot("Where")
     shares.write(tmp_path / "where.html")
     assert "Plotly.newPlot" in (tmp_path / "where.html").read_text()
@@ -149,7 +152,7 @@ def test_a_figure_without_data_is_an_error() -> None:
     result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty])]))
     with pytest.raises(InputError, match="for which the trace has data"):
         result.plot()
-    drawn = Figure("a line", lambda: "<svg></svg>")
+    drawn = Figure("a line", lambda: Drawing("<svg></svg>"))
     result = Result(Report("compare", "run 7", sections=[Section("Empty", [empty, drawn])]))
     assert result.figures == ("Empty", "Empty 2")
     assert result.plot() == result.plot("Empty 2") == "<svg></svg>" and result.plot().caption == "a line"

@@ -11,7 +11,7 @@ from fdi import Trace
 from fdi.diagnosis.bands import find_excursions
 from fdi.diagnosis.learn_bands import choose_bands
 from fdi.diagnosis.rms_grid import search_grid
-from fdi.report.diagnosis_figures import draw_maps
+from fdi.report.diagnosis_report import draw_maps
 from plant import Model, simulate
 from plant.profile import build_profile
 from plant.segments import Chirp, Hold, Step

@@ -20,7 +20,7 @@ from fdi.diagnosis.precursors import (
     measure_precursors,
     smooth_spikes,
 )
-from fdi.report.diagnosis_figures import draw_precursor_shifts, draw_sizes
+from fdi.report.diagnosis_report import draw_precursor_shifts, draw_sizes
 from fdi.trace.sections import Section, find_sections
 from fdi.trace.trace import Trace
 from plant import load_model, simulate

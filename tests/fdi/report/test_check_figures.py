@@ -4,7 +4,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -33,13 +32,9 @@ def make_check(kind: str, value: float, unit: str, high: float, window: tuple[fl
     return Check(kind, kind, signal, value, unit, low, high, False, *window, "")
 
 
-def draw(monkeypatch: pytest.MonkeyPatch, check: Check) -> Any:
+def draw(check: Check) -> Any:
     """Axes of the close-up of a check."""
-    kept: list[matplotlib.figure.Figure] = []
-    convert = run_figures.to_svg
-    monkeypatch.setattr(run_figures, "to_svg", lambda figure, salt: kept.append(figure) or convert(figure, salt))
-    assert run_figures.draw_failed_check(make_trace(), check).startswith("<svg")
-    return kept[0].axes[0]
+    return vars(run_figures.draw_failed_check(make_trace(), check))["figure"].axes[0]
 
 
 def list_levels(ax: Any) -> list[float]:
@@ -48,11 +43,11 @@ def list_levels(ax: Any) -> list[float]:
                   and line.get_ydata()[0] == line.get_ydata()[1])
 
 
-def test_overshoot_is_marked_at_its_peak_beside_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overshoot_is_marked_at_its_peak_beside_its_limit() -> None:
     trace = make_trace()
     peak = int(np.argmax(trace.xj[500:700])) + 500
     value = 100 * (trace.xj[peak] / 5e-3 - 1)
-    ax = draw(monkeypatch, make_check("overshoot", value, "%", 11.0, (0.5, 1.5)))
+    ax = draw(make_check("overshoot", value, "%", 11.0, (0.5, 1.5)))
     (mark,) = [line for line in ax.lines if line.get_marker() == "o"]
     assert list_levels(ax) == [11.0] and abs(mark.get_xdata()[0] - trace.t[peak]) < 0.003
     assert mark.get_ydata()[0] == pytest.approx(value) and "[%]" in ax.get_ylabel()
@@ -60,8 +55,8 @@ def test_overshoot_is_marked_at_its_peak_beside_its_limit(monkeypatch: pytest.Mo
     assert np.nanmax(curve.get_ydata()) == pytest.approx(value, rel=0.02)  # the curve reaches the mark
 
 
-def test_times_are_lines_after_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    ax = draw(monkeypatch, make_check("settling_time", 94.0, "ms", 78.0, (0.5, 1.5)))
+def test_times_are_lines_after_the_step() -> None:
+    ax = draw(make_check("settling_time", 94.0, "ms", 78.0, (0.5, 1.5)))
     across = {round(float(line.get_xdata()[0]), 3) for line in ax.lines if len(line.get_xdata()) == 2
               and line.get_xdata()[0] == line.get_xdata()[1]}
     assert across == {0.578, 0.594} and ax.get_xlim()[1] > 0.6
@@ -70,17 +65,17 @@ def test_times_are_lines_after_the_step(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(("kind", "value", "levels"), [
     ("ramp_error", 20.0, [14.0, 20.0]), ("rms_error", 21.5, [-21.5, -14.0, 14.0, 21.5]),
     ("break_away", 8.0, [12.0, 14.0, 26.0, 28.0])])
-def test_levels_stand_in_the_unit_of_the_check(monkeypatch: pytest.MonkeyPatch, kind: str, value: float,
+def test_levels_stand_in_the_unit_of_the_check(kind: str, value: float,
                                                levels: list[float]) -> None:
     high = 6.0 if kind == "break_away" else 14.0
-    ax = draw(monkeypatch, make_check(kind, value, "um", high, (1.6, 2.9)))
+    ax = draw(make_check(kind, value, "um", high, (1.6, 2.9)))
     assert list_levels(ax) == pytest.approx(levels, abs=0.5) and "[um]" in ax.get_ylabel()
     curve = max(ax.lines, key=lambda line: len(line.get_xdata()))
     assert 10.0 < np.nanmedian(curve.get_ydata()) < 30.0  # um, not m
 
 
-def test_largest_size_and_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    ax = draw(monkeypatch, make_check("never_exceeds", 20.0, "mA", 8.0, (0.5, 1.5), "cor"))
+def test_largest_size_and_its_place() -> None:
+    ax = draw(make_check("never_exceeds", 20.0, "mA", 8.0, (0.5, 1.5), "cor"))
     (mark,) = [line for line in ax.lines if line.get_marker() == "o"]
     assert mark.get_xdata()[0] == pytest.approx(0.5) and mark.get_ydata()[0] == pytest.approx(20.0)
     assert list_levels(ax) == [-8.0, 8.0]
@@ -94,10 +89,10 @@ def list_times(ax: Any) -> list[float]:
 
 @pytest.mark.parametrize(("kind", "signal"), [("shut_off", ""), ("recovers", ""), ("response_within", "xj"),
                                               ("response_within", "node 2 0x8250")])
-def test_a_reaction_stands_between_its_begin_and_its_limit(monkeypatch: pytest.MonkeyPatch, kind: str, signal: str
+def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: str
                                                            ) -> None:
     check = make_check(kind, 12.0, "ms", 5.0, (0.2, 1.5), signal)._replace(after=0.5, above=4e-3)
-    ax = draw(monkeypatch, check)
+    ax = draw(check)
     assert list_times(ax) == pytest.approx([0.5, 0.505, 0.512]) and list_levels(ax) == [4.0]
     assert 0.45 < ax.get_xlim()[0] < 0.5 and 0.52 < ax.get_xlim()[1] < 0.6  # of a window of 1.3 s
     assert ax.get_ylabel() == ("xj [mm]" if signal == "xj" else "cor [mA]")
@@ -105,8 +100,8 @@ def test_a_reaction_stands_between_its_begin_and_its_limit(monkeypatch: pytest.M
     assert {"most 5 ms", "measured 12 ms"} <= {*labels}
 
 
-def test_a_reaction_that_did_not_come_has_its_limit_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    ax = draw(monkeypatch, make_check("shut_off", NAN, "ms", 5.0, (0.2, 1.5), "")._replace(after=0.5))
+def test_a_reaction_that_did_not_come_has_its_limit_alone() -> None:
+    ax = draw(make_check("shut_off", NAN, "ms", 5.0, (0.2, 1.5), "")._replace(after=0.5))
     assert list_times(ax) == pytest.approx([0.5, 0.505]) and ax.get_xlim()[1] == pytest.approx(0.55, abs=2e-3)
     assert "not measurable" in [text.get_text() for text in ax.get_legend().get_texts()]
 

@@ -26,6 +26,7 @@ from fdi.report.explain_report import (
 )
 from fdi.report.html import render_html
 from fdi.report.json import to_plain
+from fdi.report.report import Figure
 from fdi.report.terminal import print_report
 from plant import Model
 
@@ -155,7 +156,7 @@ def _without_figures(report: Any) -> Any:
     """Their drawing needs whole traces; the commands' own tests draw them."""
     from dataclasses import replace
 
-    sections = [replace(s, items=[i for i in s.items if i.kind != "figure"]) for s in report.sections]
+    sections = [replace(s, items=[i for i in s.items if not isinstance(i, Figure)]) for s in report.sections]
     return replace(report, sections=sections)
 
 

@@ -123,15 +123,6 @@ def test_a_real_run_has_a_report(preflight: Path) -> None:
     assert "section main: rest" in text.replace("section", "section ").replace("  ", " ")
 
 
-def test_a_late_run_says_how_late(log: Path) -> None:
-    trace = Trace.read(log, all=True)
-    said = {**trace.provenance, "verdict.verdict": "INVALID_TIMING", "verdict.overruns": "70", "max_overruns": "0.001"}
-    assert str(read_verdict(replace(trace, provenance=said))) == \
-        "INVALID_TIMING: the bench itself was late: 70 overruns in 14000 cycles, more than 0.1 %"
-    said["verdict.why"] = "a guard"
-    assert read_verdict(replace(trace, provenance=said)).why.endswith("0.1 %; a guard")
-
-
 def test_a_failed_run_names_its_checks(log: Path) -> None:
     trace = Trace.read(log)
     assert read_verdict(trace) == ("FAIL", "1 of 4 checks failed: ramp error")
