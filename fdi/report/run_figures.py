@@ -98,8 +98,6 @@ def draw_timing(trace: Trace) -> str:
 def _bridge_short_gaps(values: Floats) -> Floats:
     """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
     known = np.flatnonzero(~np.isnan(values))
-    if not len(known):
-        return values
     rows = np.arange(len(values))
     after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
     before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]

@@ -1,12 +1,11 @@
 """Reports of explanations and of model updates: each verdict in a sentence, each error beside its noise floor."""
 from __future__ import annotations
 
-from io import StringIO
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from rich.console import Console
 
 from fdi.discovery.detectable import Blind
 from fdi.discovery.explain import Marks
@@ -26,13 +25,12 @@ from fdi.report.explain_report import (
 )
 from fdi.report.html import render_html
 from fdi.report.json import to_plain
-from fdi.report.report import Figure
-from fdi.report.terminal import print_report
+from fdi.report.report import Figure, Report
+from fdi.report.terminal import format_report
 from plant import Model
 
 FLOOR = {"xj": 2e-6, "p12": 2e4}
 ERROR = {"xj": 45e-6, "p12": 3e5}
-NONE: dict[str, float] = {}
 
 
 def candidate(effect: str, *beside: str, word: str = "explains") -> Candidate:
@@ -75,14 +73,12 @@ def test_a_sentence_has_error_and_noise_floor(case: str) -> None:
     assert "XJ error 45.0 um" in sentence and "noise floor 2.00 um" in sentence
 
 
-def test_sizes_of_several_effects_are_told_apart() -> None:
-    sentence = describe_verdict(CASES["EXPLAINED by two"][0])
-    assert "a: current 150 uA (140 .. 160); b: current 150 uA (140 .. 160)" in sentence
-
-
-@pytest.mark.parametrize("case", ["EXPLAINED", "EXPLAINED by two", "PARTLY", "NOT_RESOLVABLE"])
-def test_a_size_has_its_interval(case: str) -> None:
-    assert "current 150 uA (140 .. 160)" in describe_verdict(CASES[case][0])
+@pytest.mark.parametrize(("case", "words"), [
+    ("EXPLAINED", "current 150 uA (140 .. 160)"), ("PARTLY", "current 150 uA (140 .. 160)"),
+    ("NOT_RESOLVABLE", "current 150 uA (140 .. 160)"),
+    ("EXPLAINED by two", "a: current 150 uA (140 .. 160); b: current 150 uA (140 .. 160)")])
+def test_a_size_has_its_interval(case: str, words: str) -> None:
+    assert words in describe_verdict(CASES[case][0])
 
 
 def test_another_firmware_is_said_to_be_one() -> None:
@@ -95,13 +91,13 @@ def test_all_verdicts_have_a_mood() -> None:
 
 
 def test_findings() -> None:
-    lines = {line.label: line.text for line in describe_findings(CASES["AMBIGUOUS"][0])}
-    assert lines["to discriminate"].startswith("no sensor and no command")
-    assert lines["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
-        "a stop would reveal sensor_gain and sensor_offset"
     by = {"by": "measure XS too", "between": ("a", "b")}
-    lines = {line.label: line.text for line in describe_findings(answer(
-        "AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force"))}
+    told = answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force")
+    plain, lines = ({line.label: line.text for line in describe_findings(given)}
+                    for given in (CASES["AMBIGUOUS"][0], told))
+    assert plain["to discriminate"].startswith("no sensor and no command")
+    assert plain["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
+        "a stop would reveal sensor_gain and sensor_offset"
     assert lines["to discriminate"] == "measure XS too: in simulation this discriminates between a and b"
     assert lines["residual"] == "a force"
 
@@ -123,41 +119,31 @@ def test_an_actuator_far_from_the_model_is_to_be_identified(verdict: str) -> Non
 
 
 def test_long_lists_name_four_and_count_the_rest() -> None:
-    found = [Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)]
-    text = describe_suspicious(found)
+    text = describe_suspicious([Suspicious(f"group.field_{i}", 1.0, "N", 4.0 + i) for i in range(6)])
     assert text.startswith("group.field_5 1.00 N (+9.0 tolerances)") and " and 2 more: outside the range" in text
     unseen = tuple(Blind(f"e{i}", "g.f", 1.0, "N", "a gauge") for i in range(2))
     two = Answer(cast(Any, None), (), {}, unseen, (), (), ())
     assert describe_blind(two) == "e0 (up to 1.00 N) and e1 (up to 1.00 N); a gauge would reveal e0 and e1"
 
 
+def render_without_figures(report: Report) -> str:
+    """Drawing a figure needs whole traces; the commands' own tests draw them."""
+    sections = [replace(s, items=[i for i in s.items if not isinstance(i, Figure)]) for s in report.sections]
+    return render_html(replace(report, sections=sections))
+
+
 def test_the_report_of_an_explanation_in_all_forms() -> None:
-    given, _ = CASES["EXPLAINED"]
     sources = [Source("est.csv", "1"), Source("repeat.csv", "2"), Source("holdout.csv", "3")]
-    report = build_explanation_report(given, "est.csv", "eha", sources, "rig explain est.csv", "rig add a est.csv",
-                                      notes=["3 rows left out"])
-    out = StringIO()
-    print_report(report, Console(file=out, width=80, highlight=False))
-    text = out.getvalue()
+    report = build_explanation_report(CASES["EXPLAINED"][0], "est.csv", "eha", sources, "rig explain est.csv",
+                                      "rig add a est.csv", notes=["3 rows left out"])
+    text, page, data = format_report(report, 80), render_without_figures(report), to_plain(report.data)
     assert "no effect" in text and "explains" in text and "<1e-99" not in text and "1e-30" in text
     assert "note            3 rows left out" in text and "next            rig add a est.csv" in text
-    report = build_explanation_report(given, "est.csv", "eha", sources, "rig explain est.csv")
-    page = render_html(_without_figures(report))
-    for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "not detectable up to", "rig explain est.csv"):
-        assert words in page
-    data = to_plain(report.data)
+    assert not [words for words in ("held-out run", "holdout.csv", "150 uA (140 .. 160)", "not detectable up to",
+                                    "rig explain est.csv") if words not in page]
     assert data["verdict"] == "EXPLAINED" and data["candidates"][0]["with"] == [] and "ledger" not in data
     assert data["blind_to"][1]["smallest_visible"] is None
-    several = build_explanation_report(CASES["EXPLAINED by two"][0], "est.csv", "eha", sources)
-    assert "ledger" in several.data
-
-
-def _without_figures(report: Any) -> Any:
-    """Their drawing needs whole traces; the commands' own tests draw them."""
-    from dataclasses import replace
-
-    sections = [replace(s, items=[i for i in s.items if not isinstance(i, Figure)]) for s in report.sections]
-    return replace(report, sections=sections)
+    assert "ledger" in build_explanation_report(CASES["EXPLAINED by two"][0], "est.csv", "eha", sources).data
 
 
 @pytest.mark.parametrize(("count", "has_holdout", "roles"), [
@@ -168,31 +154,25 @@ def test_roles_of_runs(count: int, has_holdout: bool, roles: list[str]) -> None:
     assert [role for role, _ in list_sources(sources, has_holdout)] == roles
 
 
-def update(helps: bool, removed: str = "") -> ModelUpdate:
-    steps = [SimpleNamespace(error=ERROR, holdout=ERROR, hypothesis=None),
-             SimpleNamespace(error=FLOOR, holdout=FLOOR, hypothesis=None)]
+def update(helps: bool) -> ModelUpdate:
+    steps = [SimpleNamespace(error=by, holdout=by, hypothesis=None) for by in (ERROR, FLOOR)]
     refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
                             search=SimpleNamespace(problem=SimpleNamespace(trace=None)))
-    rows = (Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR, bool(removed)))
-    known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR, ledger=rows,
-                       history=("rig add a",), effects=("a",))
-    return ModelUpdate(Model(), known, () if removed else ("a",), removed, cast(Any, refit),
+    known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
+                       ledger=(Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR)), history=("rig add a",), effects=("a",))
+    return ModelUpdate(Model(), known, ("a",), "", cast(Any, refit),
                        {"a.current": Value(1.5e-4, 1.4e-4, 1.6e-4, "A")}, (), ())
 
 
 def test_the_report_of_a_model_update_in_all_forms(tmp_path: Any) -> None:
     report = build_model_report(update(True), tmp_path / "m.toml", tmp_path / "m.toml.bak", tmp_path / "m.html")
+    text, page = format_report(report, 80), render_without_figures(report)
     assert report.sentence == ("a added: XJ error 45.0 um -> 2.00 um, noise floor 2.00 um; held-out run 45.0 um -> "
                                "2.00 um.")
-    out = StringIO()
-    print_report(report, Console(file=out, width=80, highlight=False))
-    text = out.getvalue()
-    for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak", "m.html"):
-        assert words in text.replace("\n", "")
+    assert not [words for words in ("model as it was", "+ a", "noise floor", "150 uA (140 .. 160)", "m.toml.bak",
+                                    "m.html") if words not in text.replace("\n", "")]
     assert max(line.count("█") for line in text.splitlines()) == 30
-    page = render_html(_without_figures(report))
-    assert "held-out" in page and "22.5" in page and "█" not in page
-    assert to_plain(report.data)["helps"] is True
+    assert "held-out" in page and "22.5" in page and "█" not in page and to_plain(report.data)["helps"] is True
 
 
 def test_an_update_that_does_not_help_says_so() -> None:
@@ -202,7 +182,6 @@ def test_an_update_that_does_not_help_says_so() -> None:
 
 
 def test_a_removal_without_a_run_has_nothing_to_show() -> None:
-    nothing = ModelUpdate(Model(), Provenance(), (), "a", None, NONE, (), ("the rest stays",))  # type: ignore[arg-type]
-    report = build_model_report(nothing)
+    report = build_model_report(ModelUpdate(Model(), Provenance(), (), "a", None, {}, (), ("the rest stays",)))
     assert (report.verdict, report.sentence, report.data["helps"]) == ("", "a removed.", None)
     assert "<svg" not in render_html(report)
