@@ -48,7 +48,15 @@ from fdi.report.drawing import (
     shade,
     spans,
 )
-from fdi.report.numbers import NO_NUMBER, SIGNAL_NAMES, format_digits, format_interval, format_ratio, join_words
+from fdi.report.numbers import (
+    NO_NUMBER,
+    SIGNAL_NAMES,
+    attach_unit,
+    format_digits,
+    format_interval,
+    format_ratio,
+    join_words,
+)
 from fdi.report.report import (
     Cell,
     Column,
@@ -160,7 +168,7 @@ def describe_size(fault: Fault, size: Estimate) -> str:
     """A fault size with its 95 % interval and the two limits.
 
     >>> describe_size(CLOGGING, Estimate(0.2512, 0.204, 0.299))
-    'Kintas 0.251 (0.204 .. 0.299), MidBand 0.25, MaxBand 0.35'
+    'Kintas 0.25 (0.20 .. 0.30), MidBand 0.25, MaxBand 0.35'
     """
     middle, most = format_limits_of_fault(fault)
     return f"{SIZE_SYMBOLS[fault.name]} {format_size(fault, size)}, MidBand {middle}, MaxBand {most}"
@@ -170,7 +178,7 @@ def format_size(fault: Fault, size: Estimate) -> str:
     """A fault size with its 95 % interval, in the fault's unit.
 
     >>> format_size(FRICTION, Estimate(45.01, 42.02, 48.2))
-    '45.0 N (42.0 .. 48.2)'
+    '45 N (42 .. 48)'
     """
     return format_interval(size.value, size.low, size.high, fault.unit)
 
@@ -203,8 +211,7 @@ def format_limits_of_fault(fault: Fault) -> tuple[str, str]:
     >>> format_limits_of_fault(FRICTION)
     ('35 N', '70 N')
     """
-    unit = "" if fault.unit == "1" else f" {fault.unit}"
-    return f"{fault.middle:g}{unit}", f"{fault.most:g}{unit}"
+    return attach_unit(f"{fault.middle:g}", fault.unit), attach_unit(f"{fault.most:g}", fault.unit)
 
 
 def describe_residual(d: Diagnosis) -> str:
@@ -242,7 +249,7 @@ def explain_grid(d: Diagnosis, far: float = 2.0) -> list[str]:
             continue
         parts = [f"{words} {format_digits(float(getattr(part.minimum, fault.symbol)))}"
                  for words, part in (("steps", g.step), ("ramps", g.ramp)) if part is not None]
-        at = f"{SIZE_SYMBOLS[fault.name]} {format_digits(found)} {_name_unit(fault)}".rstrip()
+        at = f"{SIZE_SYMBOLS[fault.name]} {attach_unit(format_digits(found), fault.unit)}"
         sentence = (f"The grid gives {at} (minima: {', '.join(parts)}), the fit {format_size(fault, size)}: the grid "
                     "matches the position alone with a plant that has only these two faults")
         if d.others:
@@ -275,7 +282,7 @@ def describe_deviation(parameter: str, size: Estimate) -> str:
     """A parameter that differs from a healthy unit's, with its 95 % interval.
 
     >>> describe_deviation("null_bias.current", Estimate(2.4e-4, 2.3e-4, 2.5e-4))
-    'null bias 0.240 mA (0.230 .. 0.250)'
+    'null bias 0.24 mA (0.23 .. 0.25)'
     """
     name, unit, scale = SUSPECTS[parameter]
     return f"{name} {format_interval(scale * size.value, scale * size.low, scale * size.high, unit)}"
@@ -287,7 +294,7 @@ def _tabulate_faults(d: Diagnosis) -> Table:
     def show_grid(fault: Fault) -> str:
         if d.grid is None:
             return NO_NUMBER
-        return f"{format_digits(float(getattr(d.grid.merged, fault.symbol)))} {_name_unit(fault)}".rstrip()
+        return attach_unit(format_digits(float(getattr(d.grid.merged, fault.symbol))), fault.unit)
 
     def show_bands(fault: Fault) -> Cell:
         level = by_bands.get(fault.name)
@@ -305,10 +312,6 @@ def _tabulate_faults(d: Diagnosis) -> Table:
         caption=f"Size: fitted by replay of the measured current. Grid: minimum of the RMS maps. By bands: level by "
                 f"the response alone. Limits (MidBand and MaxBand): {limits}."
                 + (" * marks the ruling fault." if d.ruling else ""))
-
-
-def _name_unit(fault: Fault) -> str:
-    return "" if fault.unit == "1" else fault.unit
 
 
 def _show_effects(d: Diagnosis) -> list[Item]:

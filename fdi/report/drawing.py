@@ -286,17 +286,14 @@ def save_drawing(drawing: Drawing, path: Path, option: str) -> None:
     Raises:
         InputError: a path that cannot be written, or a format that matplotlib does not know; it names `option`.
     """
-    known = drawing.figure.canvas.get_supported_filetypes()
     if path.suffix in ("", ".svg"):
         write_text(path, drawing, option)
         return
-    if path.suffix[1:] not in known:
-        raise InputError(option, str(path), f"a name that ends in .html or .{', .'.join(sorted(known))}")
     try:
         with write_whole(path) as part:
             drawing.figure.savefig(part, dpi=150)
-    except OSError as error:
-        raise InputError(option, str(path), f"a file that can be written ({error.strerror})") from error
+    except (OSError, ValueError) as error:
+        raise InputError(option, str(path), f"a file of a known kind that can be written ({error})") from error
 
 
 def _name_artists(figure: Figure, salt: str) -> None:

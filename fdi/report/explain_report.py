@@ -200,7 +200,8 @@ def describe_findings(a: Answer) -> list[Line]:
         separation = "no sensor and no command that was tried discriminates between them"
     is_another = a.verdict in ("PARTLY", "UNEXPLAINED") and a.best.is_far
     lines = [Line("to discriminate", separation), Line("residual", a.pattern),
-             *([] if a.law is None else _describe_law(a.law)),
+             *([] if a.law is None else [Line("law", _describe_law(a.law)), *(
+                 Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
              Line("suspicious", describe_suspicious(a.suspicious)),
              Line("another actuator?", OTHER_ACTUATOR if is_another else ""),
              Line("held-out run", _describe_undecided(a)), Line("not detectable", describe_blind(a))]
@@ -408,13 +409,8 @@ def _list_law_sections(found: LawSearch) -> list[Section]:
             "bins. The law holds where the line passes through the bars.", partial(draw_law, found.curve))])]
 
 
-def _describe_law(found: LawSearch) -> list[Line]:
-    """Labelled lines: the law or why there is none, and what the signals do not show."""
-    return [Line("law", _describe_result(found)),
-            *(Line("not observable", f"{PLACES[place]}: {why}") for place, why in found.hidden.items())]
-
-
-def _describe_result(found: LawSearch) -> str:
+def _describe_law(found: LawSearch) -> str:
+    """The law, or why there is none."""
     law = found.law
     if law is None:
         return "no term lowers the error of pieces of the run that its fit did not see; none is written"

@@ -1,12 +1,11 @@
 """What `rig import` did with each signal, and what `rig import --guess` takes each column for."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from fdi.report.numbers import SIGNAL_NAMES, choose_unit, count_nouns, format_digits
-from fdi.report.report import Cell, Column, Line, Report, Section, Table
+from fdi.report.numbers import SIGNAL_NAMES, choose_unit, count_nouns, format_digits, list_first
+from fdi.report.report import Cell, Column, Line, Mood, Report, Section, tabulate
 from fdi.trace.importing.conversion import Imported, ImportedSignal
 from fdi.trace.importing.formats import Measurement
 from fdi.trace.importing.guess import GuessedMap
@@ -16,16 +15,19 @@ MISSING = {"p12": "the forces on the ram are not judged by themselves",
            "xs": "the servovalve is not judged by itself",
            "load": "it is taken as 0; a load that did act is then a force that the model lacks"}
 """Signals that a trace may lack, and what this means for the answers."""
+MOST = 12  # channels that a note names; a recording may have hundreds
 
 
 def build_import_report(imported: Imported, measurement: Measurement, out: Path) -> Report:
     """Rows and period of the trace; a table of its signals."""
     trace = imported.trace
-    columns = [Column("signal"), Column("source"), Column("unit"), Column("rate", "Hz", "right"),
-               Column("range", align="right"), Column("gaps", align="right"), Column("missing", "rows", "right")]
-    rows = [[SIGNAL_NAMES[s.name], s.source, s.unit, f"{s.rate:.6g}", _format_range(s), str(s.gaps or "none"),
-             str(s.missing or "none")] for s in imported.signals]
-    table = Table(columns, rows, "Rate and gaps: in the source. Range and missing: in the trace.")
+    table = tabulate(
+        imported.signals, (Column("signal"), lambda s: SIGNAL_NAMES[s.name]), (Column("source"), lambda s: s.source),
+        (Column("unit"), lambda s: s.unit), (Column("rate", "Hz", "right"), lambda s: f"{s.rate:.6g}"),
+        (Column("range", align="right"), _format_range),
+        (Column("gaps", align="right"), lambda s: str(s.gaps or "none")),
+        (Column("missing", "rows", "right"), lambda s: str(s.missing or "none")),
+        caption="Rate and gaps: in the source. Range and missing: in the trace.")
     lines = [Line(SIGNAL_NAMES[s.name], s.how) for s in imported.signals]
     sentence = (f"{out}: {count_nouns(len(trace), 'row')} of {1e3 * trace.period:.6g} ms from {measurement.path.name} "
                 f"({measurement.format})")
@@ -39,16 +41,17 @@ def build_import_report(imported: Imported, measurement: Measurement, out: Path)
 
 def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path) -> Report:
     """Which column is taken for which signal."""
-    moods = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
-    rows: list[list[Cell | str]] = []
-    for name, (source, confidence) in guessed.chosen.items():
-        rows.append([SIGNAL_NAMES.get(name, name), source, Cell(confidence, moods[confidence])])  # type: ignore[arg-type]
+    moods: dict[str, Mood] = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
+    chosen = guessed.chosen
     missing = [SIGNAL_NAMES[name] for name in ("com", "xj", "cor") if name not in guessed.chosen]
     notes = [f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []
     if guessed.left:
-        notes.append(f"columns left out: {_shorten([f'{name} ({why})' for name, why in guessed.left.items()])}")
-    table = Table([Column("signal"), Column("source"), Column("confidence")], rows,
-                  "The map says why in comments. Check what is not sure.")
+        notes.append(f"columns left out: {list_first([f'{name} ({why})' for name, why in guessed.left.items()], MOST)}")
+    table = tabulate(
+        chosen, (Column("signal"), lambda name: SIGNAL_NAMES.get(name, name)),
+        (Column("source"), lambda name: chosen[name][0]),
+        (Column("confidence"), lambda name: Cell(chosen[name][1], moods[chosen[name][1]])),
+        caption="The map says why in comments. Check what is not sure.")
     return Report("import", str(measurement.path), notes=notes, sections=[Section("Guess", [table])],
                   sentence=f"{out}: first map of {measurement.path.name} ({measurement.format}); check it",
                   next_command=f"rig import {measurement.path} --map {out}",
@@ -62,14 +65,8 @@ def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     notes = [f"no {SIGNAL_NAMES[name]}: {MISSING[name]}" for name in missing]
     unused = [name for name in measurement.units if name not in imported.used]
     if unused:
-        notes.append(f"not in the map, not imported: {_shorten(unused)}")
+        notes.append(f"not in the map, not imported: {list_first(unused, MOST)}")
     return notes
-
-
-def _shorten(names: Sequence[str], most: int = 12) -> str:
-    """A list in words; of a recording of hundreds of channels the first few."""
-    rest = len(names) - most
-    return ", ".join([*names[:most], *([f"and {rest} more"] if rest > 0 else [])])
 
 
 def _format_range(s: ImportedSignal) -> str:

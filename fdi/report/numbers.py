@@ -131,6 +131,15 @@ def choose_unit(unit: str, size: float) -> tuple[float, str]:
     return found
 
 
+def attach_unit(text: str, unit: str) -> str:
+    """A number with its unit; without one where the unit is 1.
+
+    >>> attach_unit("35", "N"), attach_unit("0.25", "1")
+    ('35 N', '0.25')
+    """
+    return text if unit == "1" else f"{text} {unit}"
+
+
 def format_duration(seconds: float) -> str:
     """A duration in seconds, minutes or hours.
 

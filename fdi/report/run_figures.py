@@ -34,6 +34,7 @@ from fdi.report.drawing import (
     shade,
     spans,
 )
+from fdi.report.numbers import attach_unit
 from fdi.trace.trace import Check, Trace
 
 BRIDGED = 5  # cycles
@@ -332,8 +333,7 @@ def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], mi
 
 def _draw_limits(check: Check, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
     return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
-            for mark in _draw_sides(limit, AMBER, f"{word} {limit:g} {_shorten_unit(check)}".rstrip(), sides, middle,
-                                    "--")]
+            for mark in _draw_sides(limit, AMBER, attach_unit(f"{word} {limit:g}", check.unit), sides, middle, "--")]
 
 
 def _write_in_legend(text: str) -> Mark:
@@ -343,11 +343,7 @@ def _write_in_legend(text: str) -> Mark:
 def _name_value(check: Check) -> str:
     if math.isnan(check.value):
         return "not measurable"
-    return f"measured {check.value:.4g} {_shorten_unit(check)}".rstrip()
-
-
-def _shorten_unit(check: Check) -> str:
-    return "" if check.unit == "1" else check.unit
+    return attach_unit(f"measured {check.value:.4g}", check.unit)
 
 
 def _filter_median(signal: Floats) -> Floats:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from io import StringIO
 
 from rich.cells import cell_len
@@ -96,20 +96,42 @@ def _flush_lines(lines: list[Line], console: Console, whole: Collection[str] = (
 
 
 def _print_table(table: Table, console: Console) -> None:
-    cells = [[cell for cell in row if isinstance(cell, Cell)] for row in table.rows]
-    shown = cells[:table.terminal_rows]
-    for columns in split_columns(table.columns, shown, console.width):
-        block = [[row[i] for i in columns] for row in shown]
-        console.print(_build_table([table.columns[i] for i in columns], block, console.width))
-    if len(shown) < len(cells):
-        console.print(Text(f"and {len(cells) - len(shown)} more", "dim"))
+    rows = [[cell for cell in row if isinstance(cell, Cell)] for row in table.rows]  # all are, once columns are chosen
+    shown = rows[:table.terminal_rows]
+    needed = [_find_least_width(column, [row[i] for row in shown]) for i, column in enumerate(table.columns)]
+    for block in _split_columns(needed, console.width):
+        console.print(_build_table([table.columns[i] for i in block], [[row[i] for i in block] for row in shown],
+                                   [needed[i] for i in block], console.width))
+    if len(shown) < len(rows):
+        console.print(Text(f"and {len(rows) - len(shown)} more", "dim"))
     if table.caption:
         console.print(Text(table.caption, "dim italic"))
 
 
-def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> RichTable:
+def _find_least_width(column: Column, cells: Sequence[Cell]) -> int:
+    """Characters that a column needs: its widest number, or its longest word where text may wrap; and its heading."""
+    texts = [part for cell in cells for part in (cell.text.split() if column.align == "left" else
+                                                 cell.text.split("\n"))]
+    return max(map(cell_len, [*column.heading.split(), *texts]), default=0)
+
+
+def _split_columns(needed: Sequence[int], width: int) -> list[list[int]]:
+    """Numbers of the columns of each block that fits into `width` characters; each block begins with the first column.
+
+    A single column that is wider than the console makes a block of its own.
+    """
+    blocks = [[0]]
+    for i in range(1, len(needed)):
+        if len(blocks[-1]) > 1 and sum(needed[j] + GAP for j in blocks[-1]) + needed[i] > width:
+            blocks.append([0])
+        blocks[-1].append(i)
+    return blocks
+
+
+def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], needed: Sequence[int], width: int
+                 ) -> RichTable:
     out = RichTable(box=None, pad_edge=False, padding=(0, GAP, 0, 0), show_header=any(c.heading for c in columns))
-    for column, own in zip(columns, choose_widths(columns, rows, width), strict=True):
+    for column, own in zip(columns, _choose_widths(columns, rows, needed, width), strict=True):
         is_number = column.align == "right"
         heading = textwrap.fill(column.heading, own, break_on_hyphens=False) if is_number else column.heading
         out.add_column(Text(heading), justify=column.align, no_wrap=is_number, overflow="fold", width=own)
@@ -118,55 +140,26 @@ def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], widt
     return out
 
 
-def choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> list[int]:
+def _choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], needed: Sequence[int], width: int
+                   ) -> list[int]:
     """Characters of each column: what it needs, and what it would like where the table has room for that.
 
     rich itself would shrink the widest column first, below the width of its longest word, and crop the table.
     """
-    needed = [minimal_width(column, [row[i] for row in rows]) for i, column in enumerate(columns)]
-    liked = [max([own, cell_len(column.heading), *(cell_len(line) for row in rows for line in row[i].text.split("\n"))])
-             for i, (column, own) in enumerate(zip(columns, needed, strict=True))]
+    spare = [max(0, *(cell_len(line) - needed[i] for row in rows for line in row[i].text.split("\n")),
+                 cell_len(column.heading) - needed[i]) for i, column in enumerate(columns)]
     out, room = list(needed), max(0, width - sum(needed) - GAP * (len(columns) - 1))
-    words = [i for i, column in enumerate(columns) if column.align == "left"]
-    words.sort(key=lambda i: liked[i] - needed[i])
-    for position, i in enumerate(words):  # narrow columns first, so that one long text does not fold the others
-        more = min(liked[i] - needed[i], room // (len(words) - position))
+    words = sorted((i for i, column in enumerate(columns) if column.align == "left"), key=lambda i: spare[i])
+    numbers = [i for i, column in enumerate(columns) if column.align == "right"]
+    for place, i in enumerate([*words, *numbers]):
+        more = spare[i] if spare[i] <= room else 0  # of a number the whole heading in one line, or as many as it takes
+        if place < len(words):  # narrow columns first, so that one long text does not fold the others
+            more = min(spare[i], room // (len(words) - place))
         out[i] += more
         room -= more
-    for i, column in enumerate(columns):
-        more = liked[i] - needed[i]
-        if column.align == "right" and more <= room:  # the whole heading in one line, or as many lines as it takes
-            out[i] += more
-            room -= more
     return out
 
 
 def style_of(cell: Cell) -> str:
     """The rich style of a cell: its colour, and bold where it matters."""
-    is_bold = cell.is_strong or cell.mood == "bad"
-    return " ".join(word for word in ("bold" if is_bold else "", STYLES[cell.mood]) if word)
-
-
-def minimal_width(column: Column, cells: Sequence[Cell]) -> int:
-    """Characters that a column needs: its widest number, or its longest word where text may wrap; and its heading."""
-    heading = max(map(cell_len, column.heading.split()), default=0)
-    texts = [line for cell in cells for line in cell.text.split("\n")]
-    if column.align == "left":
-        texts = [word for text in texts for word in text.split()]
-    return max([heading, *map(cell_len, texts)], default=0)
-
-
-def split_columns(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], width: int) -> Iterator[list[int]]:
-    """Numbers of the columns of each block that fits into `width` characters; each block begins with the first column.
-
-    A single column that is wider than the console makes a block of its own.
-    """
-    needed = [minimal_width(column, [row[i] for row in rows]) for i, column in enumerate(columns)]
-    block, used = [0], needed[0]
-    for i in range(1, len(columns)):
-        if len(block) > 1 and used + GAP + needed[i] > width:
-            yield block
-            block, used = [0], needed[0]
-        block.append(i)
-        used += GAP + needed[i]
-    yield block
+    return f"{'bold ' if cell.is_strong or cell.mood == 'bad' else ''}{STYLES[cell.mood]}".strip()

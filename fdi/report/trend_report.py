@@ -29,7 +29,7 @@ from fdi.report.drawing import (
     level,
     line,
 )
-from fdi.report.numbers import count_nouns, format_digits, format_interval
+from fdi.report.numbers import attach_unit, count_nouns, format_digits, format_interval
 from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Mood, Report, Section, tabulate
 from fdi.thresholds import TREND_FEWEST_TRACES, TREND_MOST_TRACES
 
@@ -62,18 +62,19 @@ def build_trend_report(unit: UnitTrend) -> Report:
 def explain_level(trend: Trend) -> str:
     """Why a fault has its level: its size now, beside the limits that decide."""
     fault, level = trend.fault, trend.level
-    name, unit = fault.name.replace("_", " ").capitalize(), "" if fault.unit == "1" else f" {fault.unit}"
+    healthy, middle, most = (attach_unit(f"{x:g}", fault.unit) for x in (fault.healthy, fault.middle, fault.most))
+    name = fault.name.replace("_", " ").capitalize()
     words = f"{name} is {level.word.replace('_', '-')}: {_format_size(trend.now, fault.unit)} now"
     if judge_size(fault, trend.now) is None:
-        return (f"{words}; the interval holds both a healthy unit ({fault.healthy:g}{unit}) and MidBand "
-                f"({fault.middle:g}{unit}), so the value alone decides")
+        return (f"{words}; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value "
+                "alone decides")
     if level == Level.ACCEPTABLE:
-        return f"{words}, below MidBand ({fault.middle:g}{unit})"
+        return f"{words}, below MidBand ({middle})"
     if level == Level.NON_NOMINAL:
-        return f"{words}, above MidBand ({fault.middle:g}{unit}) and up to MaxBand ({fault.most:g}{unit}) or more"
+        return f"{words}, above MidBand ({middle}) and up to MaxBand ({most}) or more"
     if trend.now.value >= fault.middle:
-        return f"{words}, above MidBand ({fault.middle:g}{unit}), not surely at MaxBand ({fault.most:g}{unit})"
-    return f"{words}; its interval comes too near MidBand ({fault.middle:g}{unit}) to be acceptable"
+        return f"{words}, above MidBand ({middle}), not surely at MaxBand ({most})"
+    return f"{words}; its interval comes too near MidBand ({middle}) to be acceptable"
 
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
@@ -87,7 +88,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     items: list[Item] = [
         Line("level", explain_level(trend)),
         *(Line("" if i else "size", text) for i, text in enumerate(_describe_trend(trend, unit))),
-        *(Line(f"{LIMIT_NAMES[level]} ({remaining.limit:g}{'' if fault.unit == '1' else f' {fault.unit}'})",
+        *(Line(f"{LIMIT_NAMES[level]} ({attach_unit(f'{remaining.limit:g}', fault.unit)})",
                _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL) for level, remaining in left.items()),
         tabulate(
             left, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
@@ -147,7 +148,7 @@ def _explain_too_few(used: int) -> str:
 
 def _describe_break(found: Break, point: Point, size_unit: str, unit: UnitTrend) -> str:
     at = f"{point.trace}, {_collect_place(point.t, unit)}"
-    size = format_digits(abs(found.size), 2) + ("" if size_unit == "1" else f" {size_unit}")
+    size = attach_unit(format_digits(abs(found.size), 2), size_unit)
     side = "above" if found.size > 0 else "below"
     words = {"outlier": f"outlier, left out: {at}, {size} {side} the other traces",
              "step": f"step: from {at} on, the size is {size} larger",

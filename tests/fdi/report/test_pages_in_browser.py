@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import measure_page, needs_browser, print_page, take_picture
-from page_pictures import FIND_SCROLLING
 from PIL import Image  # comes with matplotlib
 
 from fdi.report.html import render_html
@@ -17,6 +16,8 @@ from fdi.trace.trace import Check, Trace
 
 pytestmark = needs_browser
 
+FIND_SCROLLING = """window.probeNotes = {scrolling: [...document.querySelectorAll(".scroll")]
+  .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.innerText.slice(0, 40)).join("; ")};"""
 ZOOM = """
 const svg = document.querySelector("svg[data-axes]"), r = svg.getBoundingClientRect();
 const k = r.width / svg.viewBox.baseVal.width;
