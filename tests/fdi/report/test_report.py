@@ -4,16 +4,14 @@ from __future__ import annotations
 import html
 import math
 import re
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import call_browser, needs_browser
 from html_page import HtmlPage
+from rig_command import rig
 from synthetic_run import record_run
 
 from fdi.report import drawing, run_figures
@@ -155,22 +153,8 @@ def test_thinned_line_keeps_its_extremes() -> None:
 
 
 def test_command(log: Path) -> None:
-    words = [sys.executable, "-m", "rig.cli.main", "report", str(log.parent)]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout == f"{log.parent / 'report.html'}\n", done.stderr
-
-
-@needs_browser
-def test_a_browser_draws_it(log: Path, tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    write_run_page(log, tmp_path / "report.html")
-    place = (tmp_path / "report.html").as_uri()
-    call_browser(f"--screenshot={tmp_path / 'page.png'}", "--window-size=1200,1600", place)
-    shades = (imread(str(tmp_path / "page.png"))[..., :3] * 255).astype(int)
-    for name, _, _, colour in run_figures.PANELS[:4]:
-        wanted = np.array([int(colour[i:i + 2], 16) for i in (1, 3, 5)])
-        assert (np.abs(shades - wanted).max(axis=2) < 30).sum() > 500, name
+    said = rig("report", log.parent)
+    assert said[:2] == (0, f"{log.parent / 'report.html'}\n"), said.err
 
 
 def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
