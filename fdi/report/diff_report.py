@@ -42,14 +42,13 @@ from fdi.report.run_report import format_limits, read_verdict
 from fdi.thresholds import NOISE_BAND_RATIO, RUN_DIFFERENCE_RATIO
 from fdi.trace.trace import Check, Trace
 
-Facts = Mapping[str, Sequence[str]]  # the text of each run
+Facts = dict[str, list[str]]  # the text of each run
 
 
 def build_diff_report(found: RunDifferences, files: Sequence[tuple[str, str]] = ()) -> Report:
     """The report of runs side by side; `files` are those that were written."""
-    traces = [run.trace for run in found.runs]
-    facts = (("Models, sequences and faults", "model", _describe_models(traces)),
-             ("Nodes and bench", "node", _describe_nodes(traces)), ("Timing", "timing", _describe_timing(traces)))
+    facts = _collect_facts([run.trace for run in found.runs])
+    titles = {"model": "Models, sequences and faults", "node": "Nodes and bench", "timing": "Timing"}
     return Report(
         "diff", join_words([run.source for run in found.runs]), found.verdict,
         "good" if found.verdict == "SAME" else "bad", describe_differences(found),
@@ -58,8 +57,8 @@ def build_diff_report(found: RunDifferences, files: Sequence[tuple[str, str]] = 
         [Section("Runs", [_tabulate_runs(found)]),
          Section("Signals", _show_signals(found)),
          Section("Checks", _show_checks(found)),
-         *(Section(title, _show_facts(found, heading, own)) for title, heading, own in facts)],
-        files=files, data=_collect_data(found))
+         *(Section(title, _show_facts(found, heading, facts[heading])) for heading, title in titles.items())],
+        files=files, data=_collect_data(found, facts))
 
 
 def describe_differences(found: RunDifferences) -> str:
@@ -180,9 +179,8 @@ def _show_facts(found: RunDifferences, heading: str, facts: Facts) -> list[Item]
             Table(columns, changed, medium=Medium.TERMINAL)]
 
 
-def _collect_data(found: RunDifferences) -> dict[str, Any]:
+def _collect_data(found: RunDifferences, facts: Mapping[str, Facts]) -> dict[str, Any]:
     """The answer of `rig diff --json`; SI units, checks in their own unit."""
-    traces = [run.trace for run in found.runs]
     return {
         "verdict": found.verdict, "reason": describe_differences(found),
         "runs": [{"label": run.label, "source": run.source, "verdict": read_verdict(run.trace).word,
@@ -200,7 +198,7 @@ def _collect_data(found: RunDifferences) -> dict[str, Any]:
             "limits_differ": check.has_other_limits,
             **{field: [getattr(result, field, None) for result in check.results]
                for field in ("value", "passed", "low", "high")}} for check in found.checks],
-        "models": _describe_models(traces), "nodes": _describe_nodes(traces), "timing": _describe_timing(traces)}
+        "models": facts["model"], "nodes": facts["node"], "timing": facts["timing"]}
 
 
 COLOURS = (BLUE, ORANGE, PINK, TEAL, "#8250df", GREY)  # of the runs, the reference first
@@ -239,39 +237,35 @@ def draw_differences(found: RunDifferences) -> str:
                           xlabel="time of A [s]")
 
 
-def _describe_timing(traces: Sequence[Trace]) -> Facts:
-    """Percentiles of lateness, response and work, and overruns, of each run; "" where a run has none."""
-    timings = (("SYNC lateness", "lateness"), ("controller's response", "response"), ("bench's own work", "work"))
-    return {"kind of timing": [trace.provenance.get("timing.kind", "") for trace in traces],
-            **{f"{words}, p50 / p99 / max": [_format_percentiles(getattr(trace.timing, field)) for trace in traces]
-               for words, field in timings},
-            "overruns": [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}" if len(trace.timing.t) else ""
-                         for trace in traces]}
+def _collect_facts(traces: Sequence[Trace]) -> dict[str, Facts]:
+    """What is recorded of each run, "" where it has none: of the model, of the nodes and the bench, of the timing.
+
+    What differs from nominal: by --set, effects and faults. A checksum tells attached files of one name apart. A node's
+    identity: CiA 301, objects 0x1000, 0x1008 to 0x100A, 0x1018.
+    """
+    fields = ("name", "hardware", "software", "vendor", "product", "revision", "serial")
+    keys = {
+        "model": {"sequence": "sequence", "model": "model", "differs from nominal": "differences.text", "seed": "seed"},
+        "node": {"controller": "controller",
+                 **{f"node {node}, {field}": f"node{node}.{field}" for node in (2, 3) for field in fields},
+                 "bus": "bus", "pace": "pace", "host": "host", "started": "started", "eha-rig": "version.eha-rig",
+                 "commit": "git.commit"},
+        "timing": {"kind of timing": "timing.kind"}}
+    facts = {heading: {name: [trace.provenance.get(key, "") for trace in traces] for name, key in own.items()}
+             for heading, own in keys.items()}
+    for name, start in (("sequence file", "sequence/"), ("effect files", "effects/"), ("model file", "model.toml")):
+        facts["model"][name] = [", ".join(f"{file.rpartition('/')[2]} (CRC {zlib.crc32(data):08x})"
+                                          for file, data in sorted(trace.attachments.items()) if file.startswith(start))
+                                for trace in traces]
+    for words, field in (("SYNC lateness", "lateness"), ("controller's response", "response"),
+                         ("bench's own work", "work")):
+        facts["timing"][f"{words}, p50 / p99 / max"] = [_format_percentiles(getattr(trace.timing, field))
+                                                        for trace in traces]
+    facts["timing"]["overruns"] = [f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}"
+                                   if len(trace.timing.t) else "" for trace in traces]
+    return facts
 
 
 def _format_percentiles(values: Any) -> str:
     known = values[~np.isnan(values)] * 1e6
     return " / ".join(f"{x:.0f}" for x in np.percentile(known, (50, 99, 100))) + " us" if known.any() else ""
-
-
-def _describe_nodes(traces: Sequence[Trace]) -> Facts:
-    """Identity of each node (CiA 301, objects 0x1000, 0x1008 to 0x100A, 0x1018), bus, machine and software versions."""
-    fields = ("name", "hardware", "software", "vendor", "product", "revision", "serial")
-    keys = {"controller": "controller",
-            **{f"node {node}, {field}": f"node{node}.{field}" for node in (2, 3) for field in fields},
-            "bus": "bus", "pace": "pace", "host": "host", "started": "started", "eha-rig": "version.eha-rig",
-            "commit": "git.commit"}
-    return {name: [trace.provenance.get(key, "") for trace in traces] for name, key in keys.items()}
-
-
-def _describe_models(traces: Sequence[Trace]) -> Facts:
-    """Sequence, model, seed, what differs from nominal (--set, effects, faults), and attached files of each run.
-
-    A checksum tells files of one name apart.
-    """
-    keys = {"sequence": "sequence", "model": "model", "differs from nominal": "differences.text", "seed": "seed"}
-    starts = {"sequence file": "sequence/", "effect files": "effects/", "model file": "model.toml"}
-    return {**{name: [trace.provenance.get(key, "") for trace in traces] for name, key in keys.items()},
-            **{name: [", ".join(f"{file.rpartition('/')[2]} (CRC {zlib.crc32(data):08x})"
-                                for file, data in sorted(trace.attachments.items()) if file.startswith(start))
-                      for trace in traces] for name, start in starts.items()}}

@@ -170,16 +170,13 @@ def draw_over_time(salt: str, trace: Trace, panels: Sequence[Panel], heights: Se
     height = top + sum(heights) + gap * (len(heights) - 1) + bottom
     place = {"left": left / width, "right": 1 - right / width, "top": 1 - top / height, "bottom": bottom / height,
              "hspace": gap * len(heights) / sum(heights)}
-    with start_figure(height, width, layout=None) as figure:
-        column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights,
-                                 gridspec_kw=place)[:, 0]
-        for ax, panel in zip(column, panels, strict=True):
-            _draw_panel(ax, [*panel, *shade_sections(trace)])
-            ax.yaxis.set_label_coords(-0.6 / (width - left - right), 0.5)
-        # a row lasts one period; one alone is no empty axis
-        column[-1].set(xlabel=xlabel, xlim=(float(trace.t[0]), float(trace.t[-1]) + trace.period))
-        column[-1].xaxis.set_label_coords(0.5, -0.3 / heights[-1])
-        return to_svg(figure, salt)
+    common = [*shade_sections(trace), lambda ax: ax.yaxis.set_label_coords(-0.6 / (width - left - right), 0.5)]
+    # a row lasts one period; one alone is no empty axis
+    below = [axes(xlabel=xlabel, xlim=(float(trace.t[0]), float(trace.t[-1]) + trace.period)),
+             lambda ax: ax.xaxis.set_label_coords(0.5, -0.3 / heights[-1])]
+    rows = [[[*panel, *common]] for panel in panels]
+    rows[-1][0] += below
+    return draw_panels(salt, rows, height, width, layout=None, sharex=True, height_ratios=heights, gridspec_kw=place)
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:

@@ -123,12 +123,8 @@ def choose_unit(unit: str, size: float) -> tuple[float, str]:
     >>> choose_unit("m", 2e-3), choose_unit("kg", 5.0), choose_unit("1", 0.2)
     ((0.001, 'mm'), (1.0, 'kg'), (1.0, ''))
     """
-    known = READABLE_UNITS.get(unit, ())
-    found = (1.0, "" if unit == "1" else unit)
-    for scale, name in known:
-        if size >= scale or scale == known[0][0]:
-            found = (scale, name)
-    return found
+    known = READABLE_UNITS.get(unit, ((1.0, "" if unit == "1" else unit),))
+    return next((found for found in reversed(known) if size >= found[0]), known[0])
 
 
 def attach_unit(text: str, unit: str) -> str:

@@ -22,7 +22,10 @@ def print_report(report: Report, console: Console) -> None:
 
     A table that is wider than the console is printed in blocks of columns; a number is never cut.
     """
-    _print_headline(report, console)
+    verdict = Text.assemble((report.verdict, style_of(Cell("", report.mood, True))), f"  {report.sentence}")
+    headline = verdict if report.verdict else Text(report.sentence, "bold")
+    if headline.plain:
+        console.print(headline, soft_wrap=not console.is_terminal)
     labels: list[Line] = []
     for section, items in report.select_sections(Medium.TERMINAL):
         if section.title_medium.includes(Medium.TERMINAL) or section.badge is not None:
@@ -50,14 +53,6 @@ def format_report(report: Report, width: int = 100) -> str:
     out = StringIO()
     print_report(report, Console(file=out, width=width, highlight=False, color_system=None))
     return out.getvalue()
-
-
-def _print_headline(report: Report, console: Console) -> None:
-    if report.verdict:
-        verdict = Text(report.verdict, style_of(Cell("", report.mood, True)))
-        console.print(Text.assemble(verdict, f"  {report.sentence}"), soft_wrap=not console.is_terminal)
-    elif report.sentence:
-        console.print(Text(report.sentence, "bold"), soft_wrap=not console.is_terminal)
 
 
 def _print_item(item: Item, console: Console) -> None:

@@ -65,16 +65,14 @@ def explain_level(trend: Trend) -> str:
     healthy, middle, most = (attach_unit(f"{x:g}", fault.unit) for x in (fault.healthy, fault.middle, fault.most))
     name = fault.name.replace("_", " ").capitalize()
     words = f"{name} is {level.word.replace('_', '-')}: {_format_size(trend.now, fault.unit)} now"
-    if judge_size(fault, trend.now) is None:
-        return (f"{words}; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value "
-                "alone decides")
-    if level == Level.ACCEPTABLE:
-        return f"{words}, below MidBand ({middle})"
-    if level == Level.NON_NOMINAL:
-        return f"{words}, above MidBand ({middle}) and up to MaxBand ({most}) or more"
-    if trend.now.value >= fault.middle:
-        return f"{words}, above MidBand ({middle}), not surely at MaxBand ({most})"
-    return f"{words}; its interval comes too near MidBand ({middle}) to be acceptable"
+    reasons = (
+        (judge_size(fault, trend.now) is None,
+         f"; the interval holds both a healthy unit ({healthy}) and MidBand ({middle}), so the value alone decides"),
+        (level == Level.ACCEPTABLE, f", below MidBand ({middle})"),
+        (level == Level.NON_NOMINAL, f", above MidBand ({middle}) and up to MaxBand ({most}) or more"),
+        (trend.now.value >= fault.middle, f", above MidBand ({middle}), not surely at MaxBand ({most})"),
+        (True, f"; its interval comes too near MidBand ({middle}) to be acceptable"))
+    return words + next(reason for holds, reason in reasons if holds)
 
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
