@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from fdi.prognosis.unit_trend import UnitTrend, follow_unit, gather_sizes, read_points
-from fdi.report.trend_report import build_trend_report
+from fdi.report.drawing import save_drawing
+from fdi.report.trend_report import build_trend_report, draw_trends
 from plant.errors import InputError
 from rig.cli.answer import Places, choose_file, give_answer
 from rig.cli.inputs import load_chosen_model
@@ -23,9 +24,7 @@ def run_command(args: argparse.Namespace) -> int:
     if out is not None:
         report = replace(report, files=[("written", str(out))])
         if out.suffix in (".png", ".svg"):
-            from fdi.report.trend_figure import save_trends  # here: it loads matplotlib
-
-            save_trends(unit, out)
+            save_drawing(draw_trends(unit), out, "--out")
     kind = "" if out is None else out.suffix
     places = Places(out if kind == ".html" else None, out if kind == ".json" else None)
     return give_answer(report, args, int(unit.level != 0), places)
