@@ -43,18 +43,14 @@ class SensorDynamics:
 
     def describe(self, period: float, unit: str = "") -> str:
         """In a few words, for a trace of this period and a signal in this SI unit."""
-        parts = []
-        if self.lag:
-            parts.append(f"lag {1e3 * self.lag:g} ms")
-        if self.moving_mean > 1.0:
-            kind = "centred mean" if self.centred else "moving mean"
-            span = 1e3 * self.moving_mean * (self.sample_period or period)
-            parts.append(f"{kind} of {self.moving_mean:g} samples ({span:g} ms)")
-        if self.delay:
-            parts.append(f"delay {1e3 * self.delay:.3g} ms")
-        if self.quantum:
-            parts.append(f"steps of {self.quantum:.4g} {unit}".rstrip() + " (in its noise floor alone)")
-        return ", ".join(parts)
+        kind = "centred mean" if self.centred else "moving mean"
+        span = 1e3 * self.moving_mean * (self.sample_period or period)
+        step = f"steps of {self.quantum:.4g} {unit}".rstrip()
+        parts = ((self.lag > 0.0, f"lag {1e3 * self.lag:g} ms"),
+                 (self.moving_mean > 1.0, f"{kind} of {self.moving_mean:g} samples ({span:g} ms)"),
+                 (self.delay != 0.0, f"delay {1e3 * self.delay:.3g} ms"),
+                 (self.quantum > 0.0, f"{step} (in its noise floor alone)"))
+        return ", ".join(text for is_there, text in parts if is_there)
 
     def apply(self, x: Floats, period: float) -> Floats:
         """The sensor's output for the true signal `x`, (.., n), one sample a `period`; it rests before the first.

@@ -6,6 +6,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -128,10 +129,8 @@ def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
     except InputError:  # some column holds texts
         channels = {}
         for name in measurement.units:
-            try:
+            with suppress(InputError):
                 channels |= measurement.read([name])
-            except InputError:
-                continue
     out = {}
     for name, channel in channels.items():
         x = channel.values[:SAMPLE]

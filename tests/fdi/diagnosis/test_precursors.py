@@ -5,6 +5,7 @@ import json
 import math
 import re
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -154,18 +155,12 @@ def test_words_and_units() -> None:
     assert smooth_spikes(np.array([[0.0, 0, 0, 9, 0, 0, 0]])).max() == 0.0
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """What `rig fdi TRACE --out page.html` writes."""
-    folder = tmp_path_factory.mktemp("page")
-    source = folder / "<b>run<b>.csv"
-    run(0.35, 60.0).write_csv(source)
-    assert main(["fdi", str(source), "--out", str(folder / "p.html"), "--quiet"]) == 1
-    return (folder / "p.html").read_text()
-
-
-def test_the_page(page: str) -> None:
+def test_the_page(tmp_path: Path) -> None:
     """One file without network: verdict, levels, pictures of bands and maps, precursors; a trace's name is text."""
+    source = tmp_path / "<b>run<b>.csv"
+    run(0.35, 60.0).write_csv(source)
+    assert main(["fdi", str(source), "--out", str(tmp_path / "p.html"), "--quiet"]) == 1
+    page = (tmp_path / "p.html").read_text()
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", page) and page.count("<script") == 1
     assert "&lt;b&gt;run&lt;b&gt;.csv" in page and "<b>run<b>" not in page
     for words in ("Response in its bands", "RMS maps", "Precursors", "MaxBand", "break-away", "command_hash"):
