@@ -157,21 +157,12 @@ def describe_verdict(d: Diagnosis) -> str:
         need = "requires maintenance" if d.levels[worst.name] == Level.MAINTENANCE else "is non-nominal"
         rest = "; ".join(f"{FAULT_NAMES[name]} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
                          for name, level in d.levels.items() if name != worst.name)
-        sentence = (f"{FAULT_NAMES[worst.name].capitalize()} {need}: {describe_size(worst, d.sizes[worst.name])}; "
-                    f"{rest}.")
+        middle, most = format_limits_of_fault(worst)
+        sentence = (f"{FAULT_NAMES[worst.name].capitalize()} {need}: {SIZE_SYMBOLS[worst.name]} "
+                    f"{format_size(worst, d.sizes[worst.name])}, MidBand {middle}, MaxBand {most}; {rest}.")
     if d.beside is not None and d.beside.is_explained and d.beside.effects:
         sentence += f" Beside the faults: {_join_alternatives(d.beside)}."
     return sentence + (f" Other deviations: {_list_others(d)}." if d.others else "")
-
-
-def describe_size(fault: Fault, size: Estimate) -> str:
-    """A fault size with its 95 % interval and the two limits.
-
-    >>> describe_size(CLOGGING, Estimate(0.2512, 0.204, 0.299))
-    'Kintas 0.25 (0.20 .. 0.30), MidBand 0.25, MaxBand 0.35'
-    """
-    middle, most = format_limits_of_fault(fault)
-    return f"{SIZE_SYMBOLS[fault.name]} {format_size(fault, size)}, MidBand {middle}, MaxBand {most}"
 
 
 def format_size(fault: Fault, size: Estimate) -> str:

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,10 +11,36 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.output import require_writable
+from fdi.report.drawing import (
+    AMBER,
+    BLUE,
+    COMMAND,
+    FAULT,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PINK,
+    RED,
+    TEAL,
+    Floats,
+    Mark,
+    Panel,
+    axes,
+    call,
+    dot,
+    draw_over_time,
+    draw_panels,
+    instant,
+    legend,
+    level,
+    line,
+    shade,
+    spans,
+)
 from fdi.report.html import write_html
-from fdi.report.numbers import list_first
+from fdi.report.numbers import attach_unit, list_first
 from fdi.report.report import Cell, Column, Figure, Item, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
-from fdi.report.run_figures import draw_failed_check, draw_signals, draw_timing
 from fdi.trace.trace import Check, Event, Trace
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
@@ -157,11 +183,11 @@ def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     failed = [check for check in trace.sequence_checks if not check.passed and not math.isnan(check.t0)]
     items: list[Item] = []
     for number, check in enumerate(failed[:most]):
-        unit = "" if check.unit == "1" else f" {check.unit}"
-        measured = check.detail if math.isnan(check.value) else f"{_format_value(check)}{unit} measured"
-        items.append(Figure(f"{check.name}: {_name_measure(check)}, {measured}, limit "
-                            f"{format_limits(check.low, check.high)}{unit}. Dashed: limits; red: what was measured.",
-                            partial(draw_failed_check, trace, check, f"check{number}")))
+        measured = f"{attach_unit(_format_value(check), check.unit)} measured"
+        items.append(Figure(f"{check.name}: {_name_measure(check)}, "
+                            f"{check.detail if math.isnan(check.value) else measured}, limit "
+                            f"{attach_unit(format_limits(check.low, check.high), check.unit)}. Dashed: limits; red: "
+                            "what was measured.", partial(draw_failed_check, trace, check, f"check{number}")))
     return items
 
 
@@ -243,3 +269,335 @@ def read_verdict(trace: Trace) -> Verdict:
     elif word == "FAIL" and not why:
         why = "the checks passed, but the run did not end as the sequence says"
     return Verdict(word, why)
+
+
+BRIDGED = 5  # cycles
+PANELS = (("xj", "position [mm]", 1e3, BLUE), ("error", "error [um]", 1e6, ORANGE),
+          ("close", "error, close up [um]", 1e6, ORANGE), ("cor", "current [mA]", 1e3, "#8250df"),
+          ("p12", "P12 [bar]", 1e-5, TEAL), ("xs", "XS [um]", 1e6, PINK), ("load", "load [kN]", 1e-3, GREY))
+
+
+def draw_signals(trace: Trace) -> str:
+    """Command and position, error, current, pressure and spool over one time axis, with sections and checks."""
+    t, error, half = trace.t, trace.com - trace.xj, _choose_close_up(trace)
+    values = {"xj": trace.xj, "error": error, "close": error if half else np.full_like(error, math.nan),
+              "cor": trace.cor, "p12": trace.p12, "xs": trace.xs,
+              "load": np.where(np.nan_to_num(trace.load).any(), trace.load, math.nan)}
+    faults = list_faults(trace)
+    panels = [[line(t, _bridge_short_gaps(values[name]) * scale, colour, "XJ, ram" if name == "xj" else None),
+               _mark_missing(trace, values[name]), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
+               axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if name == "close" else {})]
+              for name, label, scale, colour in PANELS if not np.isnan(values[name]).all()]
+    panels[0] = [line(t, trace.com * 1e3, COMMAND, "Com, command", 2.4), *panels[0], legend(2),
+                 *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
+                   for fault, t0, _ in faults)]
+    checks = trace.sequence_checks
+    heights = [1.7] * len(panels) + [0.15 * len(checks) + 0.25] * bool(checks)
+    return draw_over_time("signals", trace, [*panels, *([_draw_checks(trace)] if checks else [])], heights, gap=0.12,
+                          xlabel="time from the start of the main phase [s]")
+
+
+def list_faults(trace: Trace) -> list[tuple[str, float, float]]:
+    """The faults that the run injected: name, begin and end in s; one that never ends lasts to the end of the trace."""
+    begun: dict[str, float] = {}
+    found = []
+    for event in trace.events:
+        name, _, word = event.text.rpartition(" ")
+        if event.kind == "fault" and word == "begins":
+            begun[name] = event.t
+        elif event.kind == "fault" and name in begun:
+            found.append((name, begun.pop(name), event.t))
+    return found + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
+
+
+def draw_timing(trace: Trace) -> str:
+    """Histograms of lateness, response and work; "" for a trace without timing."""
+    columns = (("SYNC lateness", trace.timing.lateness, BLUE), ("controller's response", trace.timing.response, ORANGE),
+               ("bench's own work", trace.timing.work, GREY))
+    shortest_time = 0.1  # us, the left end of a histogram: the resolution of the clock
+    panels: list[Panel] = []
+    for name, values, colour in columns:
+        if (values > 0).any():
+            known = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
+            bins = np.logspace(math.log10(known.min()), math.log10(max(float(known.max()), 1.0)) + 0.02, 60)
+            panels.append([call("hist", known, bins=bins.tolist(), color=colour, log=True),
+                           instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
+                           axes(xscale="log", xlabel=f"{name} [us]",
+                                ylabel="" if panels else "cycles (dotted: p99)")])
+    if not panels:
+        return ""
+    return draw_panels("timing", [panels], 2.5, layout=None, gridspec_kw={
+        "left": 0.08, "right": 0.99, "top": 0.96, "bottom": 0.2, "wspace": 0.16})
+
+
+def _bridge_short_gaps(values: Floats) -> Floats:
+    """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
+    known = np.flatnonzero(~np.isnan(values))
+    rows = np.arange(len(values))
+    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
+    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
+    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
+    return np.where(near, np.interp(rows, known, values[known]), values)
+
+
+def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
+    """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
+    pieces = np.array_split(np.isnan(values), min(columns, len(values)))
+    lost = np.array([piece.any() for piece in pieces])
+    starts = np.cumsum([0, *map(len, pieces)])
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
+    ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period) for a, b in edges]
+    return spans(ends, RED, 0.04, lw=0.5, zorder=3)
+
+
+def _choose_close_up(trace: Trace) -> float:
+    """Half the height, in m, that shows the error on the ramps well; 0 without ramps. Steps dwarf it."""
+    ramps = [np.abs(trace.com - trace.xj)[s.start:s.stop] for s in trace.sections() if s.kind == "ramp"]
+    error = np.concatenate([np.empty(0), *ramps])
+    return 0.0 if np.isnan(error).all() else 2.0 * float(np.nanpercentile(error, 99))
+
+
+def _draw_checks(trace: Trace) -> Panel:
+    """A bar for each check over its window, green or red, with its name beside it; only a name where there is none."""
+    first, last = float(trace.t[0]), float(trace.t[-1])
+    room, far = 0.005 * (last - first), 0.25 * (last - first)
+    panel = [axes(ylim=(len(trace.sequence_checks) - 0.4, -0.6), yticks=[], ylabel="checks")]
+    for row, check in enumerate(trace.sequence_checks):
+        t0, t1 = (first, last) if math.isnan(check.t0) else (check.t0, check.t1)
+        name, x, side, colour = check.name, t0 + room, "left", "white"
+        if math.isnan(check.t0) and math.isnan(check.value):
+            name, colour = f"{check.name}: not measured", RED
+        else:
+            panel.append(call("barh", row, t1 - t0, left=t0, height=0.7, color=GREEN if check.passed else RED))
+            if last - t1 > far:
+                x, colour = t1 + room, INK
+            elif t0 - first > far:
+                x, side, colour = t0 - room, "right", INK
+        panel.append(call("text", x, row, name, va="center", ha=side, color=colour, fontsize=7, clip_on=True))
+    return panel
+
+
+UNIT_SIZES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "Pa": 1.0, "bar": 1e5, "MPa": 1e6, "N": 1.0,
+              "kN": 1e3, "A": 1.0, "mA": 1e-3, "s": 1.0, "ms": 1e-3}
+SHOWN_UNITS = {"com": "mm", "xj": "mm", "error": "um", "speed": "mm/s", "cor": "mA", "p12": "bar", "xs": "um",
+               "load": "kN"}
+BOTH = (1.0, -1.0)  # sides of zero
+
+
+class _View(NamedTuple):
+    """The rows of a check, which its close-up shows."""
+
+    trace: Trace
+    check: Check
+    rows: slice
+
+    @property
+    def t(self) -> Floats:
+        return self.trace.t[self.rows]
+
+    def read(self, name: str) -> Floats:
+        """A signal over the window; `error` is Com - XJ, `speed` that of the ram over 20 cycles. SI."""
+        trace = self.trace
+        if name == "speed":
+            return _compute_speed(trace.xj, trace.period)[self.rows]
+        return (trace.com - trace.xj if name == "error" else trace.column(name))[self.rows]
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Demand before the window, and what the step adds to it, m."""
+        before = float(self.trace.com[self.rows.start - 1] if self.rows.start else self.trace.xj[0])
+        return before, float(self.trace.com[self.rows.stop - 1]) - before
+
+    def compute_share(self) -> Floats:
+        """How much of the step XJ has done, %; filtered as the checks do it."""
+        before, size = self.step
+        return 100.0 * (_filter_median(self.read("xj")) - before) / size
+
+
+def draw_failed_check(trace: Trace, check: Check, salt: str = "check") -> str:
+    """The window of a check with its limits and what was measured; "" for a check without window or signal.
+
+    `salt` keeps the ids of the figure apart from those of other figures of the page.
+    """
+    draw = DRAWERS.get(check.kind)
+    if draw is None or math.isnan(check.t0):
+        return ""
+    first, stop = np.searchsorted(trace.t, [check.t0 - 0.5 * trace.period, check.t1 - 0.5 * trace.period])
+    view = _View(trace, check, slice(int(first), int(stop)))
+    if stop - first < 2:
+        return ""
+    if draw is not _draw_reaction and check.signal and (
+            check.signal not in SHOWN_UNITS or np.isnan(view.read(check.signal)).all()):
+        return ""
+    if draw in STEP_DRAWERS and (abs(view.step[1]) <= 1e-6 or (draw is _draw_overshoot and math.isnan(check.value))):
+        draw = _draw_response
+    return draw_panels(salt, [[[axes(xlim=(check.t0, check.t1), xlabel="time [s]"), *draw(view), legend(6)]]], 2.3)
+
+
+def _draw_overshoot(view: _View) -> Panel:
+    """Beyond the target, % of the step; from 20 ms before the step until four times the time to the peak."""
+    check, t, beyond = view.check, view.t, view.compute_share() - 100.0
+    peak = t[int(np.nanargmax(beyond))]
+    high = 1.5 * max(check.value, np.nan_to_num(check.high))
+    return [line(t, beyond, BLUE, "XJ beyond the target", 1.2), *_draw_limits(check),
+            dot(peak, check.value, RED, _name_value(check)),
+            axes(ylim=(-high, high), xlim=(t[0], min(t[-1], t[0] + max(0.06, 4.0 * (peak - t[0])))),
+                 ylabel="beyond the\ntarget [%]")]
+
+
+def _draw_rise_time(view: _View) -> Panel:
+    """Share of the step that is done, with the times of 10 % and 90 %."""
+    done = view.compute_share()
+    start = next(iter(view.t[done >= 10.0]), math.nan)
+    return [line(view.t, done, BLUE, "XJ, share of the step", 1.2),
+            *(level(share, COMMAND, width=0.8, style=":") for share in (10.0, 90.0)),
+            *([] if math.isnan(start) else [instant(start, COMMAND, width=0.8, style=":"), *_draw_times(view, start)]),
+            axes(ylim=(-10.0, 125.0), ylabel="done [%]")]
+
+
+def _draw_settling_time(view: _View) -> Panel:
+    """Distance from the target; the position has to stay near it after the time limit."""
+    check = view.check
+    beyond = math.copysign(1.0, view.step[1]) * (view.compute_share() - 100.0)
+    panel = [line(view.t, beyond, BLUE, "XJ less the target", 1.2), *_draw_times(view, float(view.t[0]))]
+    size = 110.0
+    if check.value > 0.0:
+        last_outside = round(_to_seconds(check, check.value) / view.trace.period) - 1
+        band = abs(float(beyond[min(max(last_outside, 0), len(beyond) - 1)]))
+        panel += _draw_sides(band, COMMAND, "band", BOTH, style=":", width=0.8)
+        size = min(6.0 * band, 110.0)
+    return [*panel, axes(ylim=(-size, size), ylabel="off the target\n[% of the step]")]
+
+
+def _draw_size(view: _View) -> Panel:
+    """Position error or a signal with its limits and the measured mean, RMS, band or largest size.
+
+    Limits stand on both sides of zero where the size counts; around the middle of the band at break-away.
+    """
+    check, is_error = view.check, view.check.kind != "never_exceeds"
+    name = "error" if is_error else check.signal
+    values = view.read(name) / UNIT_SIZES[check.unit]
+    filtered = _filter_median(values) if is_error else values
+    middle = 0.0
+    sides: tuple[float, ...] = BOTH
+    if check.kind == "break_away":
+        values, middle = filtered, 0.5 * float(np.nanpercentile(filtered, (1, 99)).sum())
+    elif check.kind in ("steady_error", "ramp_error"):
+        com = view.read("com")
+        sides = (float(np.sign(com[-1] - com[0] if check.kind == "ramp_error" else np.nanmean(values))),)
+    panel = [line(view.t, values, BLUE, "error, Com - XJ" if is_error else name, 0.9),
+             axes(ylabel=f"{name} [{check.unit}]"), *_draw_limits(check, sides, middle)]
+    if check.kind in ("max_error", "never_exceeds"):
+        row = int(np.nanargmax(np.abs(filtered)))
+        return [*panel, dot(view.t[row], filtered[row], RED, _name_value(check))]
+    return [*panel, *_draw_sides(check.value, RED, _name_value(check), sides, middle)]
+
+
+def _draw_response(view: _View) -> Panel:
+    """Demand and position; for a gain also the amplitudes that the limits allow."""
+    com, check = 1e3 * view.read("com"), view.check
+    middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
+    limits = (check.low, check.high) if check.kind == "amplitude_ratio" else ()
+    return [line(view.t, com, COMMAND, "Com", 1.6), line(view.t, 1e3 * view.read("xj"), BLUE, "XJ"),
+            *(mark for limit in limits
+              for mark in _draw_sides(limit * amplitude, AMBER, f"{limit:g} of Com", BOTH, middle, "--")),
+            _write_in_legend(_name_value(check)), axes(ylabel="position [mm]")]
+
+
+def _draw_reaction(view: _View) -> Panel:
+    """The signal, or the current where the check is about none, around the instant from which the reaction counts.
+
+    Vertical lines: that instant, the latest time that the limits allow, and when the reaction came. Of a log without
+    the instant, which earlier versions wrote, the window is drawn.
+    """
+    check = view.check
+    name = check.signal if check.signal in SHOWN_UNITS else "cor"
+    unit = SHOWN_UNITS[name]
+    if not math.isnan(check.after):
+        view = view._replace(rows=_find_reaction_rows(view))
+    panel = [line(view.t, view.read(name) / UNIT_SIZES[unit], BLUE, name, 1.2), axes(ylabel=f"{name} [{unit}]")]
+    if math.isnan(check.after):
+        return [*panel, _write_in_legend(f"{_name_value(check)}; limits in the table")]
+    unmeasured = [_write_in_legend(_name_value(check))] if math.isnan(check.value) else []
+    begin = "clean-up begins" if check.kind == "recovers" else f"from {check.after:g} s"
+    bounds = ((x / UNIT_SIZES[unit], word) for x, word in ((check.above, "above"), (check.below, "below")))
+    return [*panel, instant(check.after, COMMAND, begin, 1.2, ":"),
+            *(level(x, COMMAND, f"{word} {x:g} {unit}", 1.2, "--") for x, word in bounds if not math.isnan(x)),
+            *_draw_times(view, check.after), *unmeasured, axes(xlim=(view.t[0], view.t[-1]))]
+
+
+def _find_reaction_rows(view: _View, least: float = 0.02) -> slice:
+    """The rows around a reaction: from half its longest time before the instant to three times that after it.
+
+    Where it did not come, ten times the limit is shown. `least`: s after the instant.
+    """
+    check, trace = view.check, view.trace
+    times = [_to_seconds(check, x) for x in (check.value, check.high, check.low) if not math.isnan(x)]
+    longest = max([abs(t) for t in times], default=0.0)
+    after = max((10.0 if math.isnan(check.value) else 3.0) * longest, least)
+    first, stop = np.searchsorted(trace.t, [check.after - max(0.5 * longest, 0.5 * least), check.after + after])
+    return slice(int(first), int(stop)) if stop - first > 1 else view.rows
+
+
+def _draw_times(view: _View, start: float) -> list[Mark]:
+    """Vertical lines at the time limits and at the measured time, s after `start`.
+
+    The panel then shows three times the longest of these; the whole window if nothing was measured.
+    """
+    check = view.check
+    marks = [instant(start + _to_seconds(check, limit), AMBER, f"{word} {limit:g} {check.unit}", 1.4, "--")
+             for limit, word in ((check.low, "least"), (check.high, "most")) if not math.isnan(limit)]
+    if math.isnan(check.value):
+        return marks
+    longest = _to_seconds(check, float(np.nanmax([check.value, check.high, check.low])))
+    return [*marks, instant(start + _to_seconds(check, check.value), RED, _name_value(check), 1.4),
+            axes(xlim=(view.t[0], min(float(view.t[-1]), start + 3.0 * longest)))]
+
+
+def _to_seconds(check: Check, value: float) -> float:
+    return value * UNIT_SIZES.get(check.unit, 1.0)
+
+
+def _draw_sides(size: float, colour: str, label: str, sides: Sequence[float], middle: float = 0.0, style: str = "-",
+                width: float = 1.4) -> list[Mark]:
+    """A level on each of these sides of `middle`, with one label; none for NaN."""
+    return [level(middle + side * size, colour, label if side == sides[0] else None, width, style)
+            for side in sides if not math.isnan(size)]
+
+
+def _draw_limits(check: Check, sides: Sequence[float] = (1.0,), middle: float = 0.0) -> list[Mark]:
+    return [mark for limit, word in ((check.low, "least"), (check.high, "most"))
+            for mark in _draw_sides(limit, AMBER, attach_unit(f"{word} {limit:g}", check.unit), sides, middle, "--")]
+
+
+def _write_in_legend(text: str) -> Mark:
+    return line([], [], INK, text, ls="")
+
+
+def _name_value(check: Check) -> str:
+    if math.isnan(check.value):
+        return "not measurable"
+    return attach_unit(f"measured {check.value:.4g}", check.unit)
+
+
+def _filter_median(signal: Floats) -> Floats:
+    """Centred moving median of five samples, the ends repeated, as the checks take it (docs/sequences.md)."""
+    filtered: Floats = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(signal, 2, mode="edge"), 5), axis=1)
+    return filtered
+
+
+def _compute_speed(position: Floats, period: float, span: int = 20) -> Floats:
+    """Difference over `span` cycles, one-sided at the ends, m/s, as the checks take it."""
+    rows = np.arange(len(position))
+    ahead, behind = np.minimum(rows + span // 2, len(rows) - 1), np.maximum(rows - span // 2, 0)
+    speed: Floats = (position[ahead] - position[behind]) / (period * (ahead - behind))
+    return speed
+
+
+STEP_DRAWERS = (_draw_overshoot, _draw_rise_time, _draw_settling_time)
+DRAWERS: Mapping[str, Callable[[_View], Panel]] = {
+    "overshoot": _draw_overshoot, "rise_time": _draw_rise_time, "settling_time": _draw_settling_time,
+    **dict.fromkeys(("steady_error", "ramp_error", "max_error", "rms_error"), _draw_size),
+    **dict.fromkeys(("break_away", "never_exceeds"), _draw_size),
+    **dict.fromkeys(("amplitude_ratio", "phase_lag"), _draw_response),
+    **dict.fromkeys(("response_within", "shut_off", "recovers"), _draw_reaction)}

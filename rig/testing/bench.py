@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fdi.output import write_text
 from fdi.progress import ignore_progress
-from fdi.report.run_report import format_limits, write_run_page
+from fdi.report.run_report import draw_failed_check, draw_signals, format_limits, write_run_page
 from fdi.trace.trace import Trace
 from plant.errors import InputError
 from plant.segments import RATE
@@ -73,8 +73,6 @@ class BenchRun:
 
     def write_picture(self) -> Path:
         """Write signals.svg, the signals over time with the windows of the checks, into the folder of the run."""
-        from fdi.report.run_figures import draw_signals  # loads matplotlib
-
         picture = self.folder / "signals.svg"
         write_text(picture, draw_signals(Trace.read(self.folder / "trace.mcap", all=True)))
         return picture
@@ -85,8 +83,6 @@ class BenchRun:
         Returns:
             The SVG file; None for a check that has no window or no signal.
         """
-        from fdi.report.run_figures import draw_failed_check
-
         trace = Trace.read(self.folder / "trace.mcap", all=True)
         check = next(check for check in trace.checks if check.name == name)
         drawing = draw_failed_check(trace, check)

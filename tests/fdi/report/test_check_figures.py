@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdi.report import run_figures
+from fdi.report import run_report
 from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report
 from fdi.trace.trace import Check, Trace
@@ -33,7 +33,7 @@ def make_check(kind: str, value: float, unit: str, high: float, window: tuple[fl
 
 def draw(check: Check) -> Any:
     """Axes of the close-up of a check."""
-    return vars(run_figures.draw_failed_check(make_trace(), check))["figure"].axes[0]
+    return vars(run_report.draw_failed_check(make_trace(), check))["figure"].axes[0]
 
 
 def find_curve(ax: Any) -> Any:
@@ -93,13 +93,13 @@ def test_a_reaction_stands_between_its_begin_and_its_limit(kind: str, signal: st
     assert {"most 5 ms", label} <= {text.get_text() for text in ax.get_legend().get_texts()}
 
 
-@pytest.mark.parametrize("kind", sorted(run_figures.DRAWERS))
+@pytest.mark.parametrize("kind", sorted(run_report.DRAWERS))
 def test_every_kind_survives_a_value_that_could_not_be_measured(kind: str) -> None:
     unit = {"overshoot": "%", "amplitude_ratio": "1", "phase_lag": "deg"}.get(kind, "ms" if "time" in kind else "um")
     check = make_check(kind, NAN, unit, 5.0, (0.5, 1.5))
-    assert run_figures.draw_failed_check(make_trace(), check).startswith("<svg")
+    assert run_report.draw_failed_check(make_trace(), check).startswith("<svg")
     for other in (check._replace(t0=NAN, t1=NAN), check._replace(kind="event_never"), check._replace(t0=50.0, t1=51.0)):
-        assert not run_figures.draw_failed_check(make_trace(), other)
+        assert not run_report.draw_failed_check(make_trace(), other)
 
 
 def test_a_page_shows_each_failed_check_once() -> None:

@@ -14,7 +14,7 @@ from html_page import HtmlPage
 from rig_command import rig
 from synthetic_run import record_run
 
-from fdi.report import drawing, run_figures
+from fdi.report import drawing, run_report
 from fdi.report.html import render_html
 from fdi.report.run_report import build_run_report, read_verdict, write_run_page
 from fdi.trace.trace import Event, Trace
@@ -105,7 +105,7 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     holes[1::2] = np.nan  # every second one: a line through single samples would have no stroke at all
     holes[60:80] = np.nan
     columns = {"com": values, "xj": values, "cor": values}
-    sound, broken = (run_figures.draw_signals(Trace.from_columns({**columns, "xj": xj}, 1e-3, {}))
+    sound, broken = (run_report.draw_signals(Trace.from_columns({**columns, "xj": xj}, 1e-3, {}))
                      for xj in (values, holes))
     line = vars(broken)["figure"].axes[0].lines[1].get_ydata()
     assert np.isnan(line).sum() == 22 and np.isnan(line[59:80]).all()  # and the last
@@ -162,6 +162,6 @@ def test_injected_faults_are_shaded_from_begin_to_end(preflight: Path) -> None:
     events = (Event(1.0, "WARN", "fault", "lost drive begins"), Event(2.5, "INFO", "fault", "lost drive ends"),
               Event(3.0, "WARN", "fault", "parameter filter.clogging begins"))
     faulty = replace(trace, events=events)
-    assert run_figures.list_faults(faulty) == [
+    assert run_report.list_faults(faulty) == [
         ("lost drive", 1.0, 2.5), ("parameter filter.clogging", 3.0, trace.t[-1])]
-    assert "lost drive" in render_run(faulty) and run_figures.draw_signals(faulty) != run_figures.draw_signals(trace)
+    assert "lost drive" in render_run(faulty) and run_report.draw_signals(faulty) != run_report.draw_signals(trace)
