@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -35,17 +35,20 @@ class Finding(NamedTuple):
 
 def examine_machine(seconds: float = 1.0) -> list[Finding]:
     """Examine everything; each timer measurement takes `seconds`, 0 skips them."""
-    areas: list[Callable[[], Iterator[Finding]]] = [
-        examine_python, examine_buses, examine_viewer, examine_tools, examine_storage]
-    found = [finding for area in areas for finding in area()]
-    return found + list(examine_rights()) + list(measure_timers(seconds) if seconds > 0 else ())
+    return [*examine_python(), *examine_buses(), *examine_viewer(), *examine_tools(), *examine_storage(),
+            *examine_rights(), *(measure_timers(seconds) if seconds > 0 else ())]
 
 
-def _make_finding(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
+def _find(area: str, name: str, value: str, purpose: str, remedy: str, needed: bool = False) -> Finding:
     """A finding that is ok with its `value`, or missing if `value` is empty."""
     if value:
         return Finding(area, name, "ok", value, purpose, needed=needed)
     return Finding(area, name, "missing", "not found", purpose, remedy, needed)
+
+
+def _grade(area: str, name: str, is_enough: bool, value: str, purpose: str, remedy: str) -> Finding:
+    """A finding with its `value` that is ok or limited."""
+    return Finding(area, name, "ok" if is_enough else "limited", value, purpose, "" if is_enough else remedy)
 
 
 def _advise_apt(packages: str) -> str:
@@ -77,18 +80,16 @@ def read_versions(names: list[str]) -> dict[str, str]:
 def examine_python() -> Iterator[Finding]:
     """The interpreter and the packages of each extra."""
     version = f"{platform.python_implementation()} {platform.python_version()}"
-    new_enough = sys.version_info >= (3, 11)
-    yield _make_finding("python", "Python", version if new_enough else "", "runs everything",
-                        "Python 3.11 or newer", needed=True)
+    yield _find("python", "Python", version if sys.version_info >= (3, 11) else "", "runs everything",
+                "Python 3.11 or newer", needed=True)
     extras = {"": "the bench", "view": "the rerun viewer", "dev": "the tests", "fleet": "rig campaign",
               "learn": "comparators of rig fdi", "bench": "rivals of rig bench"}
     for extra, names in read_requirements().items():
         found = read_versions(names)
         absent = [name for name, installed in found.items() if not installed]
-        target = f"pip install 'eha-rig[{extra}]'" if extra else "pip install eha-rig"
         text = "" if absent else ", ".join(f"{name} {installed}" for name, installed in found.items())
-        label = f"packages: {extra}" if extra else "packages"
-        finding = _make_finding("python", label, text, extras.get(extra, extra), target, needed=not extra)
+        finding = _find("python", f"packages: {extra}" if extra else "packages", text, extras.get(extra, extra),
+                        f"pip install 'eha-rig[{extra}]'" if extra else "pip install eha-rig", needed=not extra)
         yield finding._replace(found="missing: " + ", ".join(absent)) if absent else finding
 
 
@@ -110,21 +111,20 @@ def is_multicast_working(group: str = "239.74.163.2", port: int = 43113) -> bool
         return False
 
 
-def examine_buses() -> Iterator[Finding]:
+def examine_buses() -> list[Finding]:
     """Every way to a bus: embedded needs nothing; between processes udp_multicast or a CAN interface."""
-    yield Finding("bus", "embedded", "ok", "always", "the bench in one process (rig run)", needed=True)
-    multicast = "multicast on lo" if is_multicast_working() else ""
-    remedy = "ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo"
-    yield _make_finding("bus", "udp_multicast", multicast, "nodes in processes of their own, without CAN", remedy)
-    yield _make_finding("bus", "CAN in the kernel", _describe_kernel_can(), "socketcan: real and virtual CAN",
-                        "a kernel with CONFIG_CAN")
-    up = ", ".join(bus.list_can_interfaces())
-    remedy = bus.explain_socketcan_problem("vcan0")
-    yield _make_finding("bus", "CAN interface", up, "rig run --bus socketcan:vcan0, or hardware", remedy)
-    absent = [package for tool, package in GUEST_TOOLS.items() if shutil.which(tool, path=_SEARCH_PATH) is None]
-    guest = "" if absent else "User-Mode Linux with a vcan0"
-    yield _make_finding("bus", "CAN guest", guest, "the socketcan tests on a kernel without CAN",
-                        _advise_apt(" ".join(absent)))
+    absent = [package for tool, package in GUEST_TOOLS.items() if not _find_tool(tool)]
+    return [
+        Finding("bus", "embedded", "ok", "always", "the bench in one process (rig run)", needed=True),
+        _find("bus", "udp_multicast", "multicast on lo" if is_multicast_working() else "",
+              "nodes in processes of their own, without CAN",
+              "ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo"),
+        _find("bus", "CAN in the kernel", _describe_kernel_can(), "socketcan: real and virtual CAN",
+              "a kernel with CONFIG_CAN"),
+        _find("bus", "CAN interface", ", ".join(bus.list_can_interfaces()),
+              "rig run --bus socketcan:vcan0, or hardware", bus.explain_socketcan_problem("vcan0")),
+        _find("bus", "CAN guest", "" if absent else "User-Mode Linux with a vcan0",
+              "the socketcan tests on a kernel without CAN", _advise_apt(" ".join(absent)))]
 
 
 def _describe_kernel_can() -> str:
@@ -139,24 +139,27 @@ _SEARCH_PATH = os.environ.get("PATH", "") + ":/usr/local/sbin:/usr/sbin:/sbin"  
 GUEST_TOOLS = {"linux.uml": "user-mode-linux", "insmod": "kmod", "ip": "iproute2"}
 
 
-def examine_viewer() -> Iterator[Finding]:
+def _find_tool(name: str) -> str:
+    """Path of a program; empty if there is none."""
+    return shutil.which(name, path=_SEARCH_PATH) or ""
+
+
+def examine_viewer() -> list[Finding]:
     """What `rig view` needs: the viewer, and something that draws."""
-    found = read_versions(["rerun-sdk"])["rerun-sdk"]
-    yield _make_finding("viewer", "rerun", found, "rig view TRACE", "pip install 'eha-rig[view]'")
-    screen = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or ""
-    yield _make_finding("viewer", "display", screen, "the viewer's window; screenshots need none", "a desktop session")
     drivers = [file for folder in ("/usr/share", "/etc") for file in Path(folder, "vulkan/icd.d").glob("*.json")]
-    library = ctypes.util.find_library("vulkan") or ""
-    text = f"{library}, {len(drivers)} drivers" if library and drivers else ""
-    yield _make_finding("viewer", "Vulkan", text, "draws it, also without a screen",
-                        _advise_apt("mesa-vulkan-drivers libvulkan1"))
+    library = ctypes.util.find_library("vulkan")
+    return [
+        _find("viewer", "rerun", read_versions(["rerun-sdk"])["rerun-sdk"], "rig view TRACE",
+              "pip install 'eha-rig[view]'"),
+        _find("viewer", "display", os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or "",
+              "the viewer's window; screenshots need none", "a desktop session"),
+        _find("viewer", "Vulkan", f"{library}, {len(drivers)} drivers" if library and drivers else "",
+              "draws it, also without a screen", _advise_apt("mesa-vulkan-drivers libvulkan1"))]
 
 
 def _read_version_line(*command: str) -> str:
     """First line a tool prints about its version; empty if there is no such tool."""
-    path = shutil.which(command[0], path=_SEARCH_PATH)
-    if path is None:
-        return ""
+    path = _find_tool(command[0])
     try:
         out = subprocess.run([path, *command[1:]], capture_output=True, text=True, timeout=20, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.TimeoutExpired):
@@ -164,33 +167,30 @@ def _read_version_line(*command: str) -> str:
     return next(iter((out.stdout + out.stderr).splitlines()), path)
 
 
-def examine_tools() -> Iterator[Finding]:
+def examine_tools() -> list[Finding]:
     """Programs of the system that some commands and tests use."""
     compiler = next((text for name in ("cc", "gcc", "clang") if (text := _read_version_line(name, "--version"))), "")
-    yield _make_finding("tools", "C compiler", compiler, "rig bench compares with C", _advise_apt("gcc libc6-dev"))
-    candump = shutil.which("candump", path=_SEARCH_PATH) or ""
-    yield _make_finding("tools", "candump", candump, "an independent log of a CAN interface", _advise_apt("can-utils"))
-    tshark = shutil.which("tshark", path=_SEARCH_PATH) or ""
-    yield _make_finding("tools", "tshark", tshark, "an independent CANopen decoding", _advise_apt("tshark"))
-    yield _make_finding("tools", "git", _read_version_line("git", "--version"), "the project's state in each log",
-                        _advise_apt("git"))
+    return [
+        _find("tools", "C compiler", compiler, "rig bench compares with C", _advise_apt("gcc libc6-dev")),
+        _find("tools", "candump", _find_tool("candump"), "an independent log of a CAN interface",
+              _advise_apt("can-utils")),
+        _find("tools", "tshark", _find_tool("tshark"), "an independent CANopen decoding", _advise_apt("tshark")),
+        _find("tools", "git", _read_version_line("git", "--version"), "the project's state in each log",
+              _advise_apt("git"))]
 
 
-def examine_storage() -> Iterator[Finding]:
+def examine_storage() -> list[Finding]:
     """Folders the software writes to."""
     from plant.compile import find_cache_folder  # here: it loads numba, which takes a second
 
     folder = find_cache_folder()
-    kept = not folder.is_relative_to(tempfile.gettempdir())
-    status: Status = "ok" if kept else "limited"
-    remedy = "" if kept else "a writable home folder, or EHA_RIG_CACHE=FOLDER"
-    yield Finding("storage", "compiled code", status, str(folder), "the plant starts in 0.2 s, not 10 s", remedy)
     free = shutil.disk_usage(Path.cwd()).free
     log_bytes_per_s = 500e3  # raw frames, signals and timing of a 1 kHz run, compressed
     hours = free / log_bytes_per_s / 3600
-    status = "ok" if hours > 1 else "limited"
-    remedy = "" if hours > 1 else "make room"
-    yield Finding("storage", "disk", status, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", remedy)
+    return [
+        _grade("storage", "compiled code", not folder.is_relative_to(tempfile.gettempdir()), str(folder),
+               "the plant starts in 0.2 s, not 10 s", "a writable home folder, or EHA_RIG_CACHE=FOLDER"),
+        _grade("storage", "disk", hours > 1, f"{free / 1e9:.1f} GB free", f"about {hours:.0f} h of logs", "make room")]
 
 
 def _read_text(path: str) -> str:
@@ -200,27 +200,24 @@ def _read_text(path: str) -> str:
         return ""
 
 
-def examine_rights() -> Iterator[Finding]:
+def examine_rights() -> list[Finding]:
     """Kernel and rights that decide how well `--pace realtime` can keep its cycle."""
-    preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
-    kernel = f"{platform.release()}, {'PREEMPT_RT' if preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
-    remedy = "" if preempt_rt else "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"
-    yield Finding("real time", "kernel", "ok" if preempt_rt else "limited", kernel, "bounds the worst lateness", remedy)
-    fifo = bool(priority.run_under_fifo(lambda: True))
-    limit = priority.read_priority_limit()
-    text = f"SCHED_FIFO up to priority {limit}" if fifo else ""
-    remedy = "as root: echo \"$USER - rtprio 90\" >> /etc/security/limits.d/rt.conf, then log in again"
-    yield _make_finding("real time", "priority", text, "other programs do not delay the loop", remedy)
-    locked = priority.read_memory_lock_limit()
-    enough = locked < 0 or locked >= 1 << 29
-    text = "unlimited" if locked < 0 else f"{locked / 1e6:.0f} MB"
-    remedy = "" if enough else "as root: echo \"$USER - memlock unlimited\" >> /etc/security/limits.d/rt.conf"
-    yield Finding("real time", "memory lock", "ok" if enough else "limited", text, "no page faults in the loop", remedy)
+    is_preempt_rt = _read_text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
+    kernel = f"{platform.release()}, {'PREEMPT_RT' if is_preempt_rt else 'not PREEMPT_RT'}, {os.cpu_count()} CPUs"
+    is_fifo, locked = bool(priority.run_under_fifo(lambda: True)), priority.read_memory_lock_limit()
+    resolution = priority.read_clock_resolution_ns()
     source = _read_text("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown source"
-    clock = f"{priority.read_clock_resolution_ns():.0f} ns, {source}"
-    fine = priority.read_clock_resolution_ns() <= 1e3
-    remedy = "" if fine else "a kernel with CONFIG_HIGH_RES_TIMERS"
-    yield Finding("real time", "clock", "ok" if fine else "limited", clock, "the cycle's due times", remedy)
+    return [
+        _grade("real time", "kernel", is_preempt_rt, kernel, "bounds the worst lateness",
+               "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"),
+        _find("real time", "priority", f"SCHED_FIFO up to priority {priority.read_priority_limit()}" if is_fifo else "",
+              "other programs do not delay the loop", "as root: echo \"$USER - rtprio 90\" >> "
+                                                      "/etc/security/limits.d/rt.conf, then log in again"),
+        _grade("real time", "memory lock", locked < 0 or locked >= 1 << 29,
+               "unlimited" if locked < 0 else f"{locked / 1e6:.0f} MB", "no page faults in the loop",
+               "as root: echo \"$USER - memlock unlimited\" >> /etc/security/limits.d/rt.conf"),
+        _grade("real time", "clock", resolution <= 1e3, f"{resolution:.0f} ns, {source}", "the cycle's due times",
+               "a kernel with CONFIG_HIGH_RES_TIMERS")]
 
 
 def measure_timers(seconds: float) -> Iterator[Finding]:
@@ -234,7 +231,6 @@ def measure_timers(seconds: float) -> Iterator[Finding]:
 
 def _make_timer_finding(name: str, late: priority.Lateness, purpose: str) -> Finding:
     text = f"late by {late.p50:.0f} us (p50), {late.p99:.0f} (p99), {late.p99_9:.0f} (p99.9), {late.max:.0f} (max)"
-    if late.missed == 0:
-        return Finding("real time", name, "ok", text, purpose)
-    text += f"; {late.missed} of {late.periods} periods missed"
-    return Finding("real time", name, "limited", text, purpose, "an idle machine, real-time priority, PREEMPT_RT")
+    missed = f"; {late.missed} of {late.periods} periods missed" if late.missed else ""
+    return _grade("real time", name, not late.missed, text + missed, purpose,
+                  "an idle machine, real-time priority, PREEMPT_RT")

@@ -3,14 +3,14 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import IO, cast
 
 from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Chunk, McapRecord, Metadata
 from mcap.stream_reader import StreamReader
 
 from fdi.output import require_writable
@@ -53,57 +53,56 @@ def recover_log(path: Path, out: Path) -> Salvage:
     except OSError as error:
         raise InputError(path, "", f"a readable file ({error.strerror})") from error
     with source:
-        reading = _IntactRecords(BoundedFile(source))
-        records = iter(reading)
+        damage = _Damage()
+        records = _list_intact_records(BoundedFile(source), damage)
         first = next(records, None)
         if first is None:
-            reason = reading.reason or "it is empty"
+            reason = damage.reason or "it is empty"
             raise InputError(path, "", f"an MCAP log with at least one intact record ({reason})")
         try:
-            return _write_salvage(chain([first], records), reading, require_writable(out, "--out", source=path))
+            return _write_salvage(chain([first], records), damage, require_writable(out, "--out", source=path))
         except OSError as error:
             raise InputError(out, "--out", f"a place that can be written ({error.strerror})") from error
 
 
-class _IntactRecords:
-    """Iterates over the sound records of a log up to where it ends; a damaged chunk in the middle is left out.
+@dataclass
+class _Damage:
+    """What a log has lost: why reading stopped, and bytes."""
+
+    reason: str = ""
+    lost: int = 0
+
+
+def _list_intact_records(file: BoundedFile, damage: _Damage) -> Iterator[McapRecord | bytes]:
+    """The sound records of a log up to where it ends; a damaged chunk in the middle is left out.
 
     A chunk is given as the records in it, unpacked.
     """
-
-    def __init__(self, file: BoundedFile) -> None:
-        self._file = file
-        self.reason = ""
-        self.lost = 0  # bytes
-
-    def __iter__(self) -> Iterator[McapRecord | bytes]:
-        at, left = 0, limit_unpacked_size(self._file.size)
-        stream = cast(IO[bytes], self._file)
-        try:
-            for record in StreamReader(stream, emit_chunks=True, record_size_limit=self._file.size).records:
-                start, at = at, self._file.tell()
-                if not isinstance(record, Chunk):
-                    yield record
-                    continue
-                left -= record.uncompressed_size
-                if left < 0:
-                    raise UnpackingError("the chunks declare too many bytes for a file of this size")
-                try:
-                    raw = unpack_chunk(record)
-                    _index_messages(raw)
-                    read_declarations(raw)
-                except _DAMAGE as error:
-                    self.reason, self.lost = f"damaged chunk: {error}", self.lost + at - start
-                else:
-                    yield raw
-        except _DAMAGE as error:
-            self.reason = self.reason or str(error) or "the file ends in mid run"
-            self.lost += self._file.size - at
+    at, left = 0, limit_unpacked_size(file.size)
+    try:
+        for record in StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=file.size).records:
+            start, at = at, file.tell()
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            left -= record.uncompressed_size
+            if left < 0:
+                raise UnpackingError("the chunks declare too many bytes for a file of this size")
+            try:
+                raw = unpack_chunk(record)
+                _index_messages(raw)
+                read_declarations(raw)
+            except _DAMAGE as error:
+                damage.reason, damage.lost = f"damaged chunk: {error}", damage.lost + at - start
+            else:
+                yield raw
+    except _DAMAGE as error:
+        damage.reason = damage.reason or str(error) or "the file ends in mid run"
+        damage.lost += file.size - at
 
 
-def _write_salvage(records: Iterator[McapRecord | bytes], reading: _IntactRecords, out: Path) -> Salvage:
-    file = McapFile(out, "eha-rig recover", [], [])
-    names = []
+def _write_salvage(records: Iterable[McapRecord | bytes], damage: _Damage, out: Path) -> Salvage:
+    file, names = McapFile(out, "eha-rig recover", []), []
     for record in records:
         if isinstance(record, Attachment):
             names.append(record.name)
@@ -111,29 +110,22 @@ def _write_salvage(records: Iterator[McapRecord | bytes], reading: _IntactRecord
         elif isinstance(record, Metadata):
             file.write_metadata(record.name, record.metadata)
         elif isinstance(record, bytes):
-            for item in read_declarations(record) if not file.channels else ():
-                _add_declaration(file, item)
+            if not file.channels:
+                file.declare(read_declarations(record))
             index = _index_messages(record)
             if index:
                 file.write_chunk(record, index)
         else:
-            _add_declaration(file, record)
-    if reading.reason:
-        file.write_metadata("recovered", {"reason": reading.reason, "lost_bytes": str(reading.lost)})
+            file.declare([record])
+    if damage.reason:
+        file.write_metadata("recovered", {"reason": damage.reason, "lost_bytes": str(damage.lost)})
     counts = file.build_statistics()
     cycles = sum(n for c, n in counts.channel_message_counts.items()
                  if c in file.channels and file.channels[c].topic == "/signals")
     file.finish()
-    return Salvage(out, not reading.reason, counts.message_count, cycles,
-                   (counts.message_end_time - counts.message_start_time) * 1e-9, tuple(names), reading.lost,
-                   reading.reason)
-
-
-def _add_declaration(file: McapFile, record: McapRecord) -> None:
-    if isinstance(record, Schema):
-        file.schemas[record.id] = record
-    elif isinstance(record, Channel):
-        file.channels[record.id] = record
+    return Salvage(out, not damage.reason, counts.message_count, cycles,
+                   (counts.message_end_time - counts.message_start_time) * 1e-9, tuple(names), damage.lost,
+                   damage.reason)
 
 
 def _index_messages(raw: bytes) -> dict[int, array[int]]:

@@ -64,14 +64,14 @@ class RecorderError(RigError):
     """The log cannot be written any more (disk full, folder gone, disk too slow). Raised once, to the loop."""
 
 
-def list_channels() -> tuple[list[Schema], list[Channel]]:
+def list_channels() -> list[McapRecord]:
     """Schemas and channels of a log of this rig; both have the number of the channel."""
     schemas = [Schema(id=CHANNELS[record], data=encode_schema(record), encoding="protobuf",
                       name=f"eha.{record.__name__}") for record in TOPICS.values()]
     channels = [Channel(id=CHANNELS[record], topic=topic, message_encoding="protobuf",
                         metadata=describe_channel(record), schema_id=CHANNELS[record])
                 for topic, record in TOPICS.items()]
-    return schemas, channels
+    return [*schemas, *channels]
 
 
 class Recorder:
@@ -98,7 +98,7 @@ class Recorder:
         self._stop = threading.Event()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = McapFile(path, LIBRARY, *list_channels())
+            self._file = McapFile(path, LIBRARY, list_channels())
             for name, (media_type, data) in attachments.items():
                 self._file.write_attachment(name, media_type, data, time.time_ns())
             self._file.write_metadata("run", metadata)
@@ -231,18 +231,27 @@ def encode_records(records: Iterable[McapRecord]) -> bytes:
 class McapFile:
     """Appends attachments, metadata and chunks; `finish` writes indexes and statistics. OSError is the disk's own."""
 
-    def __init__(self, path: Path, library: str, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
+    def __init__(self, path: Path, library: str, declarations: Iterable[McapRecord]) -> None:
         self.path = path
         self._file: BinaryIO = path.open("wb", buffering=0)
         self._offset = 0
-        self.schemas = {s.id: s for s in schemas}
-        self.channels = {c.id: c for c in channels}
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.declare(declarations)
         self._chunks: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._declared = False  # schemas and channels stand at the head of the first chunk
         self._write(MAGIC + encode_records([Header(profile="", library=library)]))
+
+    def declare(self, records: Iterable[McapRecord]) -> None:
+        """Take schemas and channels, which the first chunk and the summary repeat; other records are left out."""
+        for record in records:
+            if isinstance(record, Schema):
+                self.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record
 
     def _write(self, data: bytes) -> None:
         view = memoryview(data)

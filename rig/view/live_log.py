@@ -10,12 +10,12 @@ from typing import Any
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Chunk
+from mcap.records import Chunk, Schema
 from mcap_protobuf.decoder import DecoderFactory
 
 from fdi.trace.mcap_log import scan_messages, unpack_chunk
 from rig.recorder import CanFrame, Record
-from rig.recorder.schema import CHANNELS
+from rig.recorder.schema import TOPICS
 from rig.recorder.writer import MAGIC, list_channels
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -26,10 +26,11 @@ def follow_log(path: Path) -> Iterator[list[tuple[int, Record]]]:
 
     The writer closes a chunk at least every 0.2 s; what it has not written yet comes later.
     """
-    schemas = {schema.id: schema for schema in list_channels()[0]}
-    decoders: dict[int, Any] = {CHANNELS[kind]: (kind, [field.name for field in fields(kind)],
-                                 DecoderFactory().decoder_for("protobuf", schemas[CHANNELS[kind]]))
-                for kind in CHANNELS if kind is not CanFrame}
+    decoders: dict[int, Any] = {}
+    for kind, schema in zip(TOPICS.values(), list_channels(), strict=False):  # schemas come first
+        if kind is not CanFrame and isinstance(schema, Schema):
+            decode = DecoderFactory().decoder_for("protobuf", schema)
+            decoders[schema.id] = kind, [field.name for field in fields(kind)], decode
     done = len(MAGIC)  # bytes of the file
     while True:
         with path.open("rb") as file:

@@ -104,7 +104,7 @@ def _change_contents(rng: np.random.Generator, source: Path, out: Path) -> None:
         if rng.random() < 0.05:
             schema.data = _change_some(rng, schema.data)
     channels = [channel for channel in log.channels.values() if rng.random() > 0.02]
-    file = McapFile(out, "study", schemas, channels)
+    file = McapFile(out, "study", [*schemas, *channels])
     is_attachment, is_message = rng.random() < 0.3, rng.random() < 0.5
     for name, data in log.attachments.items():
         spoilt = is_attachment and rng.random() < 0.3

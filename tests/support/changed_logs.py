@@ -20,7 +20,7 @@ def change_log(source: Path, out: Path, attachments: Mapping[str, bytes] | None 
                settings: Mapping[str, str] | None = None) -> Path:
     """A copy of a log with more or other attachments, and other values in its record `run`."""
     log = open_log(source)
-    file = McapFile(out, "test", log.schemas.values(), log.channels.values())
+    file = McapFile(out, "test", [*log.schemas.values(), *log.channels.values()])
     for name, data in {**log.attachments, **(attachments or {})}.items():
         file.write_attachment(name, "text/plain", data)
     for name, values in log.metadata.items():
@@ -39,7 +39,7 @@ def change_log(source: Path, out: Path, attachments: Mapping[str, bytes] | None 
 
 def write_bomb(out: Path, kind: str) -> Path:
     """A log of less than 250 kB that would take gigabytes, each in another way."""
-    file = McapFile(out, "test", [], [])
+    file = McapFile(out, "test", [])
     size = 6 << 30  # what is declared
     if kind == "attachment":
         raw = encode_records([Attachment(0, 0, "model.toml", "text/plain", b"x" * 100)])
