@@ -1,4 +1,4 @@
-"""What a newcomer gets wrong: 80 command lines and files, and what the one line of the answer has to name."""
+"""What a newcomer gets wrong: 120 command lines and files, and what the one line of the answer has to name."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,6 +9,15 @@ from short_sequences import SHORT
 from fdi.trace.trace import Trace
 from plant import Model, simulate
 
+SLIP = """from typing import Annotated, NamedTuple
+from plant.effects import effect
+from plant.quantity import Quantity
+class Slip(NamedTuple):
+    size: Annotated[float, Quantity("N")] = 0.0
+@effect("load", Slip, law="")
+def slip(x, s, u, p):
+    return x + p.slip.size * s.jack_velocity
+"""
 HEADER = "t,com,xj,cor\n"
 ROWS = "".join(f"{k / 1000:.3f},{1e-3 * (k > 50):g},0,0\n" for k in range(200))
 FILES = {
@@ -40,6 +49,8 @@ FILES = {
         f'[signals.{name}]\nsource = "{source}"\nunit = "{unit}"\n'
         for name, source, unit in (("com", "Sollweg", "mm"), ("xj", "xj", "m"), ("cor", "cor", "A"))),
     "matrix.toml": '[[case]]\nfault = "gremlin"\nsizes = [1.0]\n',
+    "slip.py": SLIP, "raises.py": "1 / 0", "nocom.csv": "t,x\n0,1\n", "nan.csv": "t,com\n0,1\n0.001,nan\n",
+    "binary.toml": "\xff\xfe\0",
     "dates/dates.csv": "file,date\nrun.csv,yesterday\n",
 }
 
@@ -88,7 +99,39 @@ BAD_INPUTS = [
     bad("simulate --steps 0", "--steps", "0"),
     bad("compare run.csv --out page.pdf", "--out", "page.pdf", ".html"),
     bad("compare run.csv --out absent/page.html", "absent/page.html", "No such file"),
+    bad("run --fast", "rig run: unrecognized arguments: --fast (rig run --help)"),
+    bad("run --set spol.static_friction=1", "did you mean spool"),
+    bad("run --set controller.period=0.002", "controller.period"),
+    bad("run --set spool.mass=-1", "spool.mass: expected a number"),
+    bad("run --bus udp_multicast:10.0.0.1", "IPv4 multicast group"),
+    bad("run --bus token-ring", "socketcan:INTERFACE"),
+    bad("run --controller external", "external node"),
+    bad("run --controller external --bus udp_multicast:239.0.0.9 --set controller.proportional_gain=1",
+        "controller.proportional_gain"),
+    bad("run --effects raises.py", "ZeroDivisionError"),
+    bad("run --out notes.txt/x", "a folder that can be written"),
+    bad("run --from broken.mcap", "broken.mcap"),
+    bad("run --from absent.mcap --seed 3", "the log has them"),
+    bad("run --from run.csv", "only logs of `rig run`"),
+    bad("simulate --command absent.csv", "absent.csv"),
+    bad("simulate --command nocom.csv", "t and com"),
+    bad("simulate --command nan.csv", "line 3, com"),
+    bad("simulate --effects slip.py --set slip.size=1", "slip.py:8: slip: "),
+    bad("effects --out absent/x.json", "absent/x.json"),
+    bad("doctor --seconds 0 --out absent/x.json", "absent/x.json"),
+    bad("doctor --seconds=-1", "--seconds: expected between 0 and 3600 s"),
+    bad("doctor --seconds nan", "--seconds: expected between 0 and 3600 s"),
+    bad("node plant --bus udp_multicast --set spool.mass=-1", "spool.mass"),
+    bad("node plant --bus virtual", "a bus between programs"),
+    bad("campaign --fault filter_cloging=0.1", "did you mean filter_clogging?"),
+    bad("fdi none/", "none: expected a readable file or the folder of a run; it does not exist"),
+    bad("fdi folder.toml", "folder.toml: expected the folder of a run; it has no trace.mcap"),
+    bad("export absent.mcap --out x.csv", "absent.mcap"),
+    bad("import run.csv --dbc x.dbc", "a CSV of signals has no frames"),
+    bad("import absent.blf --out x.mcap", "absent.blf"),
     # sequences
+    bad("run folder.toml", "folder.toml"),
+    bad("run binary.toml", "UTF-8"),
     bad("run absent.toml", "absent.toml", "No such file"),
     bad("check", "SEQUENCE", "required"),
     bad("check absent.toml", "absent.toml", "No such file"),
@@ -155,6 +198,7 @@ BAD_INPUTS = [
 def write_bad_files(folder: Path) -> None:
     """Write the files of these command lines, and run.csv and other.csv, which are right, into a folder."""
     (folder / "dates").mkdir()
+    (folder / "folder.toml").mkdir()
     for name, text in FILES.items():
         (folder / name).write_text(text, encoding="latin-1")
     for name, size in (("run.csv", 1e-3), ("other.csv", -2e-3), ("dates/run.csv", 1e-3)):

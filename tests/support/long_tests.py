@@ -47,7 +47,7 @@ LONG_TESTS = (
     "rig/cli/test_explain_command.py",
     "rig/cli/test_fdi_command.py",
     "rig/cli/test_trust.py",
-    "rig/cli/test_whole_files.py",
+    "rig/cli/test_output.py",
     "rig/conformance/test_broken_devices.py",
     "rig/conformance/test_conformance_command.py",
     "rig/firmware/test_c_run.py",

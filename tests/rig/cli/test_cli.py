@@ -14,7 +14,6 @@ from rig_command import finished, grown, rig, started
 from short_sequences import SHORT
 
 from fdi.trace.trace import CLEANUP, Trace
-from plant.effects import CATALOGUE
 from rig.cli import commands
 from rig.cli.command_list import COMMANDS, find_work
 
@@ -63,85 +62,6 @@ def test_version() -> None:
     assert rig("--version").out.startswith("eha-rig ")
 
 
-SLIP = """from typing import Annotated, NamedTuple
-from plant.effects import effect
-from plant.quantity import Quantity
-class Slip(NamedTuple):
-    size: Annotated[float, Quantity("N")] = 0.0
-@effect("load", Slip, law="")
-def slip(x, s, u, p):
-    return x + p.slip.size * s.jack_velocity
-"""
-FILES = {
-    "slip.py": SLIP,
-    "notes.toml": "to be done", "empty.py": "", "raises.py": "1 / 0", "nocom.csv": "t,x\n0,1\n",
-    "wrong.toml": 'title = "x"\nmain = [\n  { kind = "hold", tme = 1.0 },\n]\n',
-    "type.toml": 'title = "x"\nmain = [{ kind = "hold", time = "long" }]\n',
-    "nan.csv": "t,com\n0,1\n0.001,nan\n", "trace.csv": "t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n",
-}
-BAD = {
-    "unknown command": (["fly"], "'fly'"),
-    "unknown option": (["run", "--fast"], "rig run: unrecognized arguments: --fast (rig run --help)"),
-    "unknown sequence": (["run", "prefligth"], "'preflight'"),
-    "no such file": (["run", "none.toml"], "none.toml"),
-    "sequence is a folder": (["run", "folder.toml"], "folder.toml"),
-    "not text": (["run", "binary.toml"], "UTF-8"),
-    "not TOML": (["run", "notes.toml"], "notes.toml:1"),
-    "wrong key": (["run", "wrong.toml"], "wrong.toml:3: main[0].tme"),
-    "wrong type": (["run", "type.toml"], "type.toml:2: main[0].time: expected a number in s, not 'long'"),
-    "misspelt --set": (["run", "--set", "spool.static_fricton=1"], "did you mean static_friction"),
-    "unknown group": (["run", "--set", "spol.static_friction=1"], "did you mean spool"),
-    "--set without value": (["run", "--set", "spool.static_friction"], "GROUP.FIELD=VALUE"),
-    "--set no number": (["run", "--set", "spool.static_friction=many"], "'many'"),
-    "impossible value": (["run", "--set", "spool.mass=-1"], "spool.mass: expected a number"),
-    "not finite": (["run", "--set", "spool.mass=nan"], "spool.mass"),
-    "another cycle": (["run", "--set", "controller.period=0.002"], "controller.period"),
-    "bad bus": (["run", "--bus", "token-ring"], "socketcan:INTERFACE"),
-    "bad group": (["run", "--bus", "udp_multicast:10.0.0.1"], "IPv4 multicast group"),
-    "CAN that is not there": (["run", "--bus", "socketcan:nocan7"], "nocan7"),
-    "nobody outside": (["run", "--controller", "external"], "external node"),
-    "gains of foreign firmware": (["run", "--controller", "external", "--bus", "udp_multicast:239.0.0.9", "--set",
-                                   "controller.proportional_gain=1"], "controller.proportional_gain"),
-    "bad pace": (["run", "--pace", "warp"], "'warp'"),
-    "bad seed": (["run", "--seed", "-1"], "whole number from 0"),
-    "seed no number": (["run", "--seed", "x"], "argument --seed: expected a whole number from 0, not 'x'"),
-    "impossible overruns": (["run", "--max-overruns", "2"], "fraction from 0 to 1"),
-    "no such model": (["run", "--model", "none.toml"], "none.toml"),
-    "no such effects": (["run", "--effects", "none.py"], "none.py"),
-    "effects without effect": (["run", "--effects", "empty.py"], "@effect"),
-    "effects that raise": (["run", "--effects", "raises.py"], "ZeroDivisionError"),
-    "out is a file": (["run", "--out", "notes.toml"], "a folder that can be written"),
-    "out below a file": (["run", "--out", "notes.toml/x"], "a folder that can be written"),
-    "repeat nothing": (["run", "--from", "none.mcap"], "none.mcap"),
-    "repeat no log": (["run", "--from", "binary.toml"], "binary.toml"),
-    "repeat and change": (["run", "--from", "none.mcap", "--seed", "3"], "the log has them"),
-    "repeat a CSV": (["run", "--from", "trace.csv"], "only logs of `rig run`"),
-    "no such command file": (["simulate", "--command", "none.csv"], "none.csv"),
-    "command without com": (["simulate", "--command", "nocom.csv"], "t and com"),
-    "command no number": (["simulate", "--command", "nan.csv"], "line 3, com"),
-    "simulate to somewhere": (["simulate", "--out", "x.xlsx"], ".mcap"),
-    "simulate to nowhere": (["simulate", "--out", "none/x.csv"], "none/x.csv"),
-    "no steps": (["simulate", "--steps", "0"], "at least 1"),
-    "a law with a slip": (["simulate", "--effects", "slip.py", "--set", "slip.size=1"], "slip.py:8: slip: "),
-    "unknown effect": (["effects", "gremlins"], "gremlins"),
-    "misspelt effect": (["effects", "spol_friction"], "did you mean spool_friction?"),
-    "misspelt fault": (["campaign", "--fault", "filter_cloging=0.1"], "did you mean filter_clogging?"),
-    "no such folder": (["fdi", "none/"], "none: expected a readable file or the folder of a run; it does not exist"),
-    "folder without a log": (["fdi", "folder.toml"], "folder.toml: expected the folder of a run; it has no trace.mcap"),
-    "effects to nowhere": (["effects", "--out", "none/x.json"], "none/x.json"),
-    "doctor to nowhere": (["doctor", "--seconds", "0", "--out", "none/x.json"], "none/x.json"),
-    "no such node": (["node", "pilot"], "'pilot'"),
-    "node with a slip": (["node", "plant", "--bus", "udp_multicast", "--set", "spool.mass=-1"], "spool.mass"),
-    "node in itself": (["node", "plant", "--bus", "virtual"], "a bus between programs"),
-    "nothing to recover": (["recover", "none.mcap"], "none.mcap"),
-    "nothing to report": (["report", "none.mcap"], "none.mcap"),
-    "nothing to view": (["view", "none.mcap"], "none.mcap"),
-    "nothing to export": (["export", "none.mcap", "--out", "x.csv"], "none.mcap"),
-    "no frames to decode": (["import", "trace.csv", "--dbc", "x.dbc"], "a CSV of signals has no frames"),
-    "nothing to import": (["import", "none.blf", "--out", "x.mcap"], "none.blf"),
-}
-
-
 def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> None:
     """Neither a bus without its nodes nor a repeat into its own folder costs the results that lie there."""
     folder = tmp_path / "done"
@@ -151,22 +71,6 @@ def test_results_stay_where_no_run_comes_about(short: Path, tmp_path: Path) -> N
     itself = rig("run", "--from", folder / "trace.mcap", "--out", folder)
     assert (nobody.status, itself.status) == (2, 2) and "overwritten" in itself.err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-@pytest.mark.parametrize("what", BAD)
-def test_bad_input_is_told_in_one_line(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit status 2, nothing on standard output, one line that names what is wrong."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder.toml").mkdir()
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    for name, text in FILES.items():
-        written(tmp_path / name, text)
-    words, hint = BAD[what]
-    said = rig(*words)
-    CATALOGUE.pop("slip", None)
-    assert (said.status, said.out) == (2, ""), said
-    assert len(said.err.splitlines()) == 1 and said.err.startswith("rig") and hint in said.err, said.err
-    assert "Traceback" not in said.err
 
 
 def test_a_run_that_passes(short: Path, tmp_path: Path) -> None:
@@ -274,3 +178,13 @@ def test_output_that_nobody_reads_changes_no_verdict(how: str, short: Path, tmp_
 def test_the_installed_command_is_this_one() -> None:
     done = subprocess.run([Path(sys.executable).parent / "rig", "effects", "--json"], capture_output=True, text=True)
     assert done.returncode == 0 and '"spool_friction"' in done.stdout
+
+
+@pytest.mark.parametrize(("words", "is_loaded"), [(["list"], False), (["import"], True)])
+def test_only_import_loads_the_reader_of_mf4_files(words: list[str], is_loaded: bool) -> None:
+    """python-can would load it, and pandas with it, at every start."""
+    pytest.importorskip("asammdf")
+    program = ("import sys; from rig.cli.main import leave_out_reader; leave_out_reader(sys.argv[1:]); "
+               "import can; print('pandas' in sys.modules)")
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(is_loaded)

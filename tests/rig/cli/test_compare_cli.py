@@ -1,4 +1,4 @@
-"""`rig compare` as it is typed: what it says, its JSON, exit statuses, its page, and what it refuses in one line."""
+"""`rig compare` and `rig diff` as typed: words, JSON, exit statuses, pages, and what they refuse in one line."""
 from __future__ import annotations
 
 import json
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from noisy_traces import record_healthy, record_plant
 from rig_command import Said, rig
+from synthetic_run import record_run
 
 from fdi.trace.csv_table import write_csv
 from fdi.trace.trace import Trace
@@ -139,3 +140,17 @@ def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
     Trace.from_columns(short, 1e-3, {}).write_csv(tmp_path / "short.csv")
     said = rig("compare", tmp_path / "short.csv", "--out", tmp_path / "short.html")
     assert said.status in (0, 1) and (tmp_path / "short.html").exists(), said.err
+
+
+def test_a_run_is_the_same_as_itself_in_any_format_and_another_differs(tmp_path: Path) -> None:
+    log, csv, other = record_run(tmp_path / "trace.mcap", stop=2000), tmp_path / "run.csv", tmp_path / "other.csv"
+    Trace.read(log, all=True).write_csv(csv)
+    same = rig("diff", log, csv, "--json")
+    assert same.status == 0 and same.json["verdict"] == "SAME" and same.json["pairs"][0]["same_command"]
+    assert same.json["runs"][1]["source"] == str(csv) and not any(check["changed"] for check in same.json["checks"])
+    trace = Trace.read(csv)
+    write_csv(other, {"t": trace.t, "com": trace.com, "xj": trace.xj + 1e-4 * (trace.t > 1.0), "cor": trace.cor})
+    said = rig("diff", csv, other, "--report")
+    page = (tmp_path / "diff.html").read_text(encoding="utf-8")
+    assert said.status == 1 and said.out.startswith("DIFFERENT") and "P12 of B: only A has it" in said.out
+    assert "B - A" in page and page.count("<svg") == 1

@@ -73,12 +73,6 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
     assert rig("doctor", "--seconds", "0", "--quiet") == (0, "", "")
 
 
-@pytest.mark.parametrize("seconds", ["-1", "4000", "nan"])
-def test_bad_seconds_are_refused(seconds: str) -> None:
-    said = rig("doctor", f"--seconds={seconds}")
-    assert said.status == 2 and "--seconds: expected between 0 and 3600 s" in said.err
-
-
 def test_percentiles_of_known_wake_ups() -> None:
     late = np.arange(1001) * 2000  # 0 to 2 ms in steps of 2 us
     assert priority.summarise_lateness(late, 1_000_000) == pytest.approx((1000, 1980, 1998, 2000, 1001, 501))

@@ -12,7 +12,6 @@ from synthetic_run import record_run
 
 import dbc
 from fdi.trace.trace import Trace
-from plant.errors import InputError
 from rig.recorder.convert import RAW_SUFFIXES, export_trace, import_csv, import_frames, read_raw_frames
 
 
@@ -80,31 +79,23 @@ def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(before.t, after.t)
 
 
-def test_refusals(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"ends in \.csv"):
-        export_trace(log, tmp_path / "x.xlsx")
-    (tmp_path / "x.csv").write_text("t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n")
-    with pytest.raises(InputError, match="raw frames"):
-        export_trace(tmp_path / "x.csv", tmp_path / "x.blf")
-    import_csv(tmp_path / "x.csv", tmp_path / "x.mcap")
-    with pytest.raises(InputError, match="at least one raw frame"):
-        export_trace(tmp_path / "x.mcap", tmp_path / "x.blf")
-    assert not (tmp_path / "x.blf").exists()
-    (tmp_path / "bad.log").write_text("hello\n")
-    with pytest.raises(InputError, match=r"CAN frames as \.log"):
-        import_frames(tmp_path / "bad.log", tmp_path / "y.mcap", dbc.DBC)
-    (tmp_path / "bad.blf").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match=r"CAN frames as \.blf"):
-        import_frames(tmp_path / "bad.blf", tmp_path / "y.mcap", dbc.DBC)
-    (tmp_path / "silent.log").write_text("(0.000000) can0 702#05\n")
-    with pytest.raises(InputError, match="SYNC"):
-        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", dbc.DBC)
-    (tmp_path / "bad.dbc").write_text("BO_ nonsense")
-    with pytest.raises(InputError, match="a DBC file"):
-        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", tmp_path / "bad.dbc")
-    (tmp_path / "other.dbc").write_text('VERSION ""\n')
-    with pytest.raises(InputError, match="frame 0x202"):
-        import_frames(tmp_path / "silent.log", tmp_path / "y.mcap", tmp_path / "other.dbc")
+FILES = {"x.csv": b"t,com,xj,cor\n0,0,0,0\n0.001,0,0,0\n", "bad.log": b"hello\n", "bad.blf": bytes(range(256)),
+         "silent.log": b"(0.000000) can0 702#05\n", "bad.dbc": b"BO_ nonsense", "other.dbc": b'VERSION ""\n'}
+
+
+@pytest.mark.parametrize(("words", "reason"), [
+    ("export {log} --out x.xlsx", "ends in .csv"), ("export x.csv --out x.blf", "raw frames"),
+    ("export x.mcap --out x.blf", "at least one raw frame"), ("import bad.log", "CAN frames as .log"),
+    ("import bad.blf", "CAN frames as .blf"), ("import silent.log", "SYNC"),
+    ("import silent.log --dbc bad.dbc", "a DBC file"), ("import silent.log --dbc other.dbc", "frame 0x202")])
+def test_refusals(log: Path, words: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, content in FILES.items():
+        Path(name).write_bytes(content)
+    import_csv(Path("x.csv"), Path("x.mcap"))
+    said = rig(*words.format(log=log).split())
+    assert said.status == 2 and said.err.count("\n") == 1 and reason in said.err
+    assert not {"x.blf", "bad.mcap", "silent.mcap"} & {path.name for path in tmp_path.iterdir()}
 
 
 def test_commands(log: Path, tmp_path: Path) -> None:
