@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import importlib
 import itertools
 import json
 import logging
@@ -194,17 +195,18 @@ def _wait_for_futures(finished: Any, client: Any, patience: float = 30.0) -> Ite
 
 
 def _import_distributed() -> Any:
-    """The module `distributed`, with its log silenced: errors are reported once, in one line.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import distributed
-    except ImportError:
-        raise InputError("distributed", "", "the extra: pip install 'eha-rig[fleet]'") from None
+    """The module `distributed`, with its log silenced: errors are reported once, in one line."""
+    distributed = import_extra("distributed")  # which sets the level of its log
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     return distributed
+
+
+def import_extra(name: str) -> Any:
+    """A module of the extra `fleet`; raises InputError if it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(name, "", "the extra: pip install 'eha-rig[fleet]'") from None
 
 
 Row = dict[str, Any]

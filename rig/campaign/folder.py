@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from plant.errors import InputError
-from rig.campaign.batch import Row, RowFile, read_rows
+from rig.campaign.batch import Row, RowFile, import_extra, read_rows
 from rig.campaign.matrix import Matrix, restore_matrix
 
 MATRIX, ROWS, RESULTS = "campaign.json", "finished.jsonl", "results.parquet"
@@ -70,7 +70,7 @@ def read_campaign_rows(source: str | Path) -> list[Row]:
         return select_newest(read_rows(path / ROWS))
     if path.suffix != ".parquet" or not path.is_file():
         raise InputError(source, "", f"the folder of a campaign, or its {RESULTS}")
-    parquet = import_pyarrow()[1]
+    parquet = import_extra("pyarrow.parquet")
     try:
         rows: list[Row] = parquet.read_table(path).to_pylist()
     except (OSError, ValueError) as error:
@@ -80,7 +80,7 @@ def read_campaign_rows(source: str | Path) -> list[Row]:
 
 def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
     """Replace results.parquet by one with the newest row of each case; the matrix goes into its schema."""
-    pa, parquet = import_pyarrow()
+    pa, parquet = import_extra("pyarrow"), import_extra("pyarrow.parquet")
     path, newest = Path(folder) / RESULTS, select_newest(rows)
     names = list(dict.fromkeys(name for row in newest for name in row))
     table = pa.table({name: pa.array([row.get(name) for row in newest]) for name in names})
@@ -88,20 +88,6 @@ def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
     part = path.with_name(path.name + PART)
     parquet.write_table(table, part)
     part.replace(path)
-
-
-def import_pyarrow() -> tuple[Any, Any]:
-    """The modules pyarrow and pyarrow.parquet.
-
-    Raises:
-        InputError: they are not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InputError("pyarrow", "", "the extra: pip install 'eha-rig[fleet]'") from None
-    return pyarrow, pyarrow.parquet
 
 
 def replace_file(path: Path, data: bytes) -> None:

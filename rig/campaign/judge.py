@@ -18,8 +18,8 @@ from plant import Model
 from plant.errors import RigError
 from plant.model import parse_model
 from plant.threads import count_threads
-from rig.campaign.batch import Batch, BatchProgress, Row, Workers, run_batch
-from rig.campaign.folder import import_pyarrow, open_campaign, select_newest, write_results
+from rig.campaign.batch import Batch, BatchProgress, Row, Workers, import_extra, run_batch
+from rig.campaign.folder import open_campaign, select_newest, write_results
 from rig.campaign.matrix import Case, Matrix
 from rig.campaign.units import simulate_case
 from rig.network.clock import WallClock
@@ -134,7 +134,7 @@ def run_campaign(matrix: Matrix, folder: str | Path, workers: Workers,
         RigError: the cluster is gone.
     """
     _load_judgement(matrix.spec)
-    import_pyarrow()
+    import_extra("pyarrow")
     sources = hash_campaign_sources()
     with open_campaign(folder, matrix, sources) as file:
         try:

@@ -172,14 +172,7 @@ class Sequence:
                 raise InputError("bundle", name, "to be part of the bundle")
             return bundle[name]
 
-        return parse_sequence(_decode(bundle[sources[0]], sources[0]), sources[0], read_file)
-
-
-def _decode(data: bytes, name: str) -> str:
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(name, "", "text in UTF-8") from error
+        return parse_sequence(tables.decode_text(bundle[sources[0]], sources[0]), sources[0], read_file)
 
 
 def load_sequence(name_or_path: str | Path) -> Sequence:
@@ -195,22 +188,12 @@ def load_sequence(name_or_path: str | Path) -> Sequence:
     shipped = {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
     if str(name_or_path) in shipped:
         entry = shipped[str(name_or_path)]
-        return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, _read_beside(Path()))
+        return parse_sequence(entry.read_text(encoding="utf-8"), entry.name, lambda name: tables.read_file(Path(name)))
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(name_or_path, "", f"a .toml file, or {tables.list_choices(str(name_or_path), shipped)}")
-    read_file = _read_beside(path.parent)
-    return parse_sequence(_decode(read_file(path.name), str(path)), str(path), read_file)
-
-
-def _read_beside(folder: Path) -> ReadFile:
-    def read_file(name: str) -> bytes:
-        try:
-            return (folder / name).read_bytes()
-        except OSError as error:
-            raise InputError(folder / name, "", f"a file that can be read ({error.strerror})") from error
-
-    return read_file
+    return parse_sequence(tables.decode_text(tables.read_file(path), path), str(path),
+                          lambda name: tables.read_file(path.parent / name))
 
 
 def parse_sequence(text: str, name: str, read_file: ReadFile) -> Sequence:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
 from math import inf, isfinite
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -81,6 +82,22 @@ class Place:
 
 def _join_keys(path: str, keys: Iterable[str | int]) -> str:
     return (path + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)).lstrip(".")
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a file; raises InputError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"a file that can be read ({error.strerror})") from error
+
+
+def decode_text(data: bytes, name: object) -> str:
+    """The text of a file; raises InputError if it is not UTF-8."""
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(name, "", "text in UTF-8") from error
 
 
 def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:

@@ -25,7 +25,7 @@ from rig.run.participants import EMBEDDED_NAMES
 from rig.run.runner import run_job
 from rig.sequences.checks import CheckResult
 from rig.sequences.sequence import load_sequence
-from rig.sequences.tables import Range, build_dataclass, parse_table
+from rig.sequences.tables import Range, build_dataclass, decode_text, parse_table, read_file
 
 Value = float | str
 Seed = Annotated[int, Range("1", low=0)]
@@ -100,13 +100,7 @@ def read_suite_file(path: Path, base: JobChoice) -> tuple[SuiteFile, list[Varian
     Raises:
         InputError: the file, line and key that cannot be used.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(path, "", f"a file that can be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "", "text in UTF-8") from error
-    table, place = parse_table(text, str(path))
+    table, place = parse_table(decode_text(read_file(path), path), str(path))
     suite = build_dataclass(SuiteFile, table, place)
     if not suite.case:
         raise place.at("case").refuse("at least one case")

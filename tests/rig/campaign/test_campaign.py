@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -26,7 +25,7 @@ from plant.effects import CATALOGUE
 from rig.campaign import batch, folder, matrix, units
 from rig.campaign import judge as cases
 from rig.campaign import summary as campaign_summary
-from rig.campaign.batch import BatchProgress, Workers, run_jobs
+from rig.campaign.batch import BatchProgress, Workers
 from rig.campaign.judge import plan_batch, run_campaign
 from studies.hidden_effects.truth import SYMBOLS, has_compiler
 
@@ -138,47 +137,23 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
         assert again[f"{row['label']} {row['seed']}"] == 1
 
 
-class KilledWorker(Exception):
-    """As Dask raises it."""
-
-
 class Dead:
     """The future of a case that kills whoever tries it."""
 
     status = "error"
 
     def result(self) -> None:
-        raise KilledWorker("Attempted to run task on 4 different workers")
+        raise type("KilledWorker", (Exception,), {})("Attempted to run task on 4 different workers")  # as Dask does
 
     def cancelled(self) -> bool:
         return False
 
 
-def open_gate(gate: Path, environment: Path, workers: int, seconds: float = 600.0) -> None:
-    """Let the cases go on when so many workers have begun one; `seconds` only ends a test that hangs."""
-    end = time.monotonic() + seconds
-    while len({pid for pid, _ in calls(environment)}) < workers and time.monotonic() < end:
-        time.sleep(0.02)
-    gate.unlink()
-
-
-def test_processes_listen_to_no_port_and_give_the_same_rows(environment: Path, gate: Path, local: Path) -> None:
-    import psutil
-
-    threading.Thread(target=open_gate, args=(gate, environment, 2), daemon=True).start()
+def test_processes_give_the_same_rows(environment: Path, local: Path, tmp_path: Path) -> None:
     whole = folder.read_matrix_of_folder(local)
-    plan, sockets = plan_batch(whole, cases.hash_campaign_sources(), 4), []
-    found: dict[int, dict[str, Any]] = {}
-    workers = Workers(2, single_threaded=True)
-    for case, row in run_jobs(plan.work, list(plan.jobs.values()), workers, plan.describe_failure):
-        assert row["case"] == case.number
-        found[case.number] = row
-        me = psutil.Process()
-        sockets += [s for p in (me, *me.children(recursive=True)) for s in p.net_connections("inet")]
-    assert not [s for s in sockets if s.status == psutil.CONN_LISTEN]
-    kept = [{key: value for key, value in found[i].items() if key not in TAKES} for i in range(4)]
-    assert kept == rows(local)[:4]
-    assert len({pid for pid, _ in calls(environment)} - {os.getpid()}) == 2
+    run_campaign(whole, tmp_path / "there", Workers(2, single_threaded=True), count=4)
+    assert rows(tmp_path / "there") == rows(local)[:4]
+    assert os.getpid() not in {pid for pid, _ in calls(environment)}
 
 
 def test_a_case_that_kills_every_worker_of_a_cluster_has_failed(local: Path) -> None:

@@ -193,6 +193,13 @@ BAD = [  # text, then what the user reads
      "faults[0].start: expected a time within main's 1 s, not 2"),
     (HEAD + 'faults = [{ kind = "stuck", signal = "xj", start = 0.5, end = 0.5 }]\n',
      "faults[0].end: expected after the start at 0.5 s"),
+    (HEAD + 'faults = [{ kind = "lost", frame = "drive", start = 0.9999 }]\n',
+     "faults[0].start: expected a fault that acts in a cycle of 0.001 s of main or more"),
+    (HEAD + 'faults = [{ kind = "lost", frame = "drive", start = 0.1, end = 0.1001 }]\n',
+     "faults[0].end: expected a fault that acts in a cycle of 0.001 s of main or more"),
+    (HEAD + 'faults = [{ kind = "offset", signal = "xk", value = 1.0, start = 0.1 }]\n',
+     "faults[0].signal: expected 'p12', 'xj' or 'xs', not 'xk'"),
+    (HEAD + 'faults = [{ kind = "gone", start = 0.1 }]\n', "faults[0].kind: expected a kind: 'bus_off'"),
     (HEAD + 'faults = [\n{ kind = "parameter", parameter = "filter.clogging", value = 0.1, start = 0 },\n'
      '{ kind = "parameter", parameter = "filter.clogging", value = 0.2, start = 0.5 }]\n',
      "mine.toml:5: faults[1].start: expected a time when no other fault changes filter.clogging"),

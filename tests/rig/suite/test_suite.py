@@ -102,14 +102,13 @@ def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tup
 
 
 def test_a_line_for_each_case_and_a_table(suite: tuple[Path, Said]) -> None:
-    _, said = suite
-    lines = said.out.splitlines()
+    lines = suite[1].out.splitlines()
     assert lines[0] == "All kinds: 7 cases, 2 at a time"
     ended = [line.split() for line in lines[1:8]]
     assert sorted(words[0] for words in ended) == ["ERROR"] * 3 + ["FAIL"] * 2 + ["PASS"] * 2
     assert {word for words in ended for word in words if word.endswith("/7")} == {f"{n}/7" for n in range(1, 8)}
     assert lines[8] == "ERROR  5 of 7 cases did not pass: weak, jack.mass=90, weak, jack.mass=110, crash and 2 more."
-    assert "Traceback" not in said.err
+    assert "Traceback" not in suite[1].err
 
 
 def test_folders_and_page(suite: tuple[Path, Said]) -> None:
@@ -150,24 +149,18 @@ def test_junit_is_valid_and_complete(suite: tuple[Path, Said]) -> None:
     assert "R-1: overshoot" in values and "R-2: whole run" in values
 
 
-def test_several_sequences_on_the_command_line(tmp_path: Path) -> None:
+def test_several_sequences_on_the_command_line_and_junit_of_one(tmp_path: Path) -> None:
     write_sequences(tmp_path)
     said = rig("run", tmp_path / "short.toml", tmp_path / "short.toml", "--seed", 3, "--json", "--jobs", 1,
                "--out", tmp_path / "out")
     assert said.status == 0, said.err
     assert [(case["name"], Path(case["folder"]).name, case["seed"]) for case in said.json["cases"]] == [
         ("short", "short", 3), ("short (2)", "short-2", 3)]
-    a, b = (case["checks"] for case in said.json["cases"])
-    assert a == b
-
-
-def test_junit_of_one_sequence(tmp_path: Path) -> None:
-    write_sequences(tmp_path)
+    assert said.json["cases"][0]["checks"] == said.json["cases"][1]["checks"]
     assert rig("run", tmp_path / "short.toml", "--out", tmp_path, "--junit", tmp_path / "j.xml", "--quiet").status == 0
     root = read_valid_junit(tmp_path / "j.xml")
-    names = [case.get("name") for case in root[0].findall("testcase")]
-    assert names[:3] == ["run", "overshoot", "no emergency"] and "R-1: overshoot" in [
-        each.get("value") for each in root[0].findall("properties/property")]
+    assert [case.get("name") for case in root[0].findall("testcase")][:3] == ["run", "overshoot", "no emergency"]
+    assert "R-1: overshoot" in [each.get("value") for each in root[0].findall("properties/property")]
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
@@ -191,15 +184,16 @@ def test_bad_input_is_one_line_before_anything_runs(tmp_path: Path, old: str, ne
     assert not (tmp_path / "out").exists()
 
 
-def test_options_that_do_not_go_together(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("words", "line"), [
+    (["suite.toml", "--seed", 1], "--seed: expected in the suite file"),
+    (["short.toml", "short.toml", "--junit", "x.txt"], "expected FILE.xml"),
+    (["short.toml", "short.toml", "--pace", "realtime", "--jobs", 2], "--jobs: 2: expected 1 in")])
+def test_options_that_do_not_go_together(tmp_path: Path, words: list[object], line: str) -> None:
     write_sequences(tmp_path)
     (tmp_path / "suite.toml").write_text(SUITE)
-    for words, line in ((["suite.toml", "--seed", 1], "--seed: expected in the suite file"),
-                        (["short.toml", "short.toml", "--junit", "x.txt"], "expected FILE.xml"),
-                        (["short.toml", "short.toml", "--pace", "realtime", "--jobs", 2], "--jobs: 2: expected 1 in")):
-        paths = [tmp_path / word if str(word).endswith(".toml") else word for word in words]
-        said = rig("run", *paths, "--out", tmp_path / "out")
-        assert said.status == 2 and said.err.count("\n") == 1 and line in said.err, said
+    said = rig("run", *(tmp_path / word if str(word).endswith(".toml") else word for word in words), "--out",
+               tmp_path / "out")
+    assert said.status == 2 and said.err.count("\n") == 1 and line in said.err, said
 
 
 def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
