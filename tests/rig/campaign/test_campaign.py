@@ -208,7 +208,7 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (("--fault", "healthy", "--seeds", "0"), "seeds: expected a whole number from 1"),
     (("--fault", "healthy", "--model", "ehs"), "--model: ehs: expected eha"),
     (("--fault", "healthy", "--set", "controller.period=2e-3"), "--set: controller.period: expected 0.001 s"),
-    (("--fault", "healthy", "--jobs", "0"), "--jobs: 0: expected 1 or more"),
+    (("--fault", "healthy", "--jobs", "0"), "--jobs: expected a whole number from 1"),
     (("--fault", "healthy", "--work", "nothing:here"), "--work: nothing:here: expected module:function"),
     (("--fault", "healthy", "--work", ".:x"), "--work: .:x: expected module:function"),
     (("--fault", "healthy", "--work", "math:pi"), "--work: math:pi: expected module:function"),

@@ -81,7 +81,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Said]:
     (folder / "suite.toml").write_text(SUITE)
     process = started("run", folder / "suite.toml", "--out", folder / "out", "--junit", folder / "out" / "junit.xml",
                       "--jobs", 2)
-    return folder / "out", finished(process, 120)
+    return folder / "out", finished(process)
 
 
 def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, Said]) -> None:
