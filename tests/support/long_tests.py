@@ -57,6 +57,7 @@ LONG_TESTS = (
     "rig/network/test_can_interface.py",
     "rig/network/test_master.py",
     "rig/network/test_raw_bus.py",
+    "rig/network/test_turn.py",
     "rig/recorder/test_recover.py",
     "rig/run/test_hard_loop.py",
     "rig/run/test_job.py",
